@@ -1,7 +1,7 @@
 """Every VLM run of a table joined with every acting one that began with the same frames."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 from probe_kit.errors import OtherFramesError, UsageError
@@ -24,18 +24,22 @@ class Joins:
 def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
     """Answered, encoded, acted on of every pair of a VLM run and a policy run.
 
-    runs: those that the table is made of, as it reads them; probes and outcome rule are the table's. Tests are
-    corrected over all pairs.
+    runs: those that the table is made of, as it reads them; probes, outcome rule and names are the table's. Tests
+    are corrected over all pairs.
     """
+    names = {row.run.location: row.run.label for row in table.rows}
     asked = [run for run in runs if ask_of(run) is not None]
     acted = [run for run in runs if ask_of(run) is None and _judged(run, table)]
     found, refused = [], []
     for vlm, policy in product(asked, acted):
         own = under_rule(policy, table.rule, table.last_steps)
         try:
-            found.append(match_runs(vlm, own, table.results.get(str(policy.location))))
+            joined = match_runs(vlm, own, table.results.get(str(policy.location)))
         except (UsageError, OtherFramesError) as error:
             refused.append(f"Not joined: {error}.")
+            continue
+        asked_as, acted_as = (names.get(str(run.location), run.label) for run in (vlm, policy))
+        found.append(replace(joined, asked=asked_as, acted=acted_as))
     return Joins(tuple(correct_joins(found)), tuple(refused))
 
 

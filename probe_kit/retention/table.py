@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Literal, get_args
 
 from probe_kit._system.csv_text import csv_of_frame
@@ -17,10 +18,11 @@ from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import averaged_fields
 from probe_kit.retention.columns.summary import RunSummary, summarise_runs
 from probe_kit.retention.columns.text_table import TextTable, size_table, vlm_vla_tables
-from probe_kit.retention.compare.differences import Difference, group_differences
-from probe_kit.retention.compare.pairing import PairedRuns, compare_runs
+from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.pairing import PairedRuns, compare_groups, compare_runs
 from probe_kit.retention.compare.vlm_vla import VlmVlaDifference, vlm_vla_differences
-from probe_kit.retention.estimators.retention import Iterations
+from probe_kit.retention.estimators.retention import Iterations, curve_scores
+from probe_kit.retention.estimators.stream_scores import StreamScores
 from probe_kit.retention.formats.dataframe import frame_of, part_frame, peak_frame
 from probe_kit.retention.formats.json import table_json
 from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
@@ -42,7 +44,7 @@ class RetentionTable:
     """Rows per run, category and view, and per run and view their category mean.
 
     Runs are never averaged with each other, so no mean mixes suites. differences: between runs, or groups of runs.
-    unpaired: which runs of several have none, and why, a sentence each.
+    unpaired: which runs of several have none, or leave items out, and why, a sentence each.
     results: the probes that the rows were made of, by `row.run.location`; figures and
     reports of the table draw these.
     wordings: of runs that were asked in several, every two against each other.
@@ -212,6 +214,7 @@ def retention_table(
     last_steps: int = 1,
     absent_below: float = ABSENT_BELOW,
     against: str | None = None,
+    labels: Mapping[str, str] | None = None,
 ) -> RetentionTable:
     """Success rates, probe peaks and retention of several runs, per category and view.
 
@@ -225,7 +228,8 @@ def retention_table(
     absent. A run that keeps no trajectories has no success rate by another rule than `disc`. A run without
     activations or probes shows success rates only. score: by which VLM runs are read, `text`, `logits` or
     `order-balanced`; they stand first. with_side_words: count their items in whose name a side stands. vlm_vla:
-    compare every VLM run with every acting one, see `vlm_vla_differences`. Raises UnknownSiteError for a view
+    compare every VLM run with every acting one, see `vlm_vla_differences`. labels: names of runs in tables and
+    figures by their location, instead of their own. Raises UnknownSiteError for a view
     that was not probed, UsageError for an unknown key or a number of keys that is not that of the runs, for a
     run that is given twice, or for `against` where it is none of them; SceneError for overlapping zones.
     """
@@ -251,13 +255,14 @@ def retention_table(
         drawn += found
         shown = dict.fromkeys(one.row.view for one in found)
         means += [mean_row([one for one in found if one.row.view == view], averaged_fields()) for view in shown]
-    names = distinct_labels([run for _, run in listed])
-    compared = PairedRuns([], ())
+    names = distinct_labels([run for _, run in listed], labels)
+    results = {place: replace(own, label=(labels or {}).get(place, own.label)) for place, own in results.items()}
+    rescore, compared = partial(_rescored, results, iterations), PairedRuns([], ())
     if isinstance(runs, Mapping):
-        by_group = {name: [one for one in drawn if one.row.group == name] for name in runs}
-        compared = PairedRuns(group_differences(by_group, against), ())
+        by_group = {name: [run for group, run in listed if group == name] for name in runs}
+        compared = compare_groups(by_group, drawn, rescore, against)
     elif len(listed) > 1 or against is not None:
-        compared = compare_runs([run for _, run in listed], drawn, names, against, vlm_vla)
+        compared = compare_runs([run for _, run in listed], drawn, names, rescore, against, vlm_vla)
     notes += [
         f"{run.location} captured activations only and did not act: SR is n/a." for _, run in listed if _heard(run)
     ]
@@ -286,6 +291,22 @@ def retention_table(
         found_differences,
         compared.unpaired,
     )
+
+
+def _rescored(
+    results: Mapping[str, ProbeResults], iterations: Iterations, one: RowWithEstimates, suite: str
+) -> StreamScores | None:
+    """A row's scores on the halvings of its groups in another suite, which items in common may come from.
+
+    The scores stay those of the row; only what is measured on halvings, the covariance, is that of `suite`.
+    """
+    own, row = one.estimates.streams, one.row
+    if own is None or row.view is None:
+        return None
+    found = curve_scores(results[row.run.location].curves[row.category, row.view], iterations, suite)
+    if found is None:
+        return None
+    return replace(own, fit=replace(own.fit, differences=found.fit.differences, seed=found.fit.seed))
 
 
 def _wordings(run: RunReader, label: str) -> list[WordingPair]:

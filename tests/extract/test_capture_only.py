@@ -14,7 +14,7 @@ from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepare, verify_run
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.success_rate import success_rate
-from probe_kit.retention.compare.differences import group_differences
+from probe_kit.retention.compare.differences import ComparedSides, Side, pair_differences
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.report import write_report
@@ -99,7 +99,7 @@ def test_groups_of_which_one_did_not_act_are_compared_in_what_both_have(
     both = retention_table({"capture_run": [capture_run], "acting": [recorded_run]})
     assert both.differences == []  # the acting run was not probed, and the other has no success rate
     rows = run_rows(capture_run, load_results(capture_run), RowSettings(None, "all", ()))
-    same = group_differences({"one": rows, "other": rows})
+    same = pair_differences([ComparedSides(Side("one", rows), Side("other", rows))])
     assert {row.category for row in same} == {"color", "mean"}
     assert all(row.sr is None and row.paired and row.backbone == 0 for row in same)
 

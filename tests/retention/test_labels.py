@@ -4,7 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from probe_kit.errors import UsageError
 from probe_kit.retention import retention_table
 from probe_kit.train import ArrayRun
 
@@ -24,3 +26,18 @@ def test_runs_of_one_name_are_told_apart(probed_run: Callable[..., ArrayRun], tm
 def test_a_run_alone_keeps_its_name(probed_run: Callable[..., ArrayRun]) -> None:
     table = retention_table([probed_run({"color": ([0.5, 0.8], [[0.6]])})])
     assert {row.run.label for row in (*table.rows, *table.means)} == {"pi0"}
+
+
+def test_labels_that_are_given_name_runs_in_tables_figures_and_differences(
+    probed_run: Callable[..., ArrayRun],
+) -> None:
+    one, other = (probed_run({"color": ([0.5, 0.8], [[0.6]])}, name) for name in ("one", "other"))
+    table = retention_table([one, other], labels={str(one.location): "π0", str(other.location): "π0 (SFT)"})
+    assert [row.run.label for row in table.rows] == ["π0", "π0 (SFT)"]
+    assert {(row.group, row.minus) for row in table.differences} == {("π0", "π0 (SFT)")}
+    assert {own.label for own in table.results.values()} == {"π0", "π0 (SFT)"}
+    assert one.label == "one"
+    alike = retention_table([one, other], labels={str(other.location): "one"})
+    assert len({row.run.label for row in alike.rows}) == 2
+    with pytest.raises(UsageError, match="labels are given for elsewhere; the runs are"):
+        retention_table([one], labels={"elsewhere": "π0"})

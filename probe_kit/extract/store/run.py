@@ -1,7 +1,7 @@
 """Reading of a run: episodes, pooled columns, tokens. Needs neither a simulator nor a model."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from functools import cached_property
 from pathlib import Path
@@ -44,6 +44,7 @@ from probe_kit.extract.store.locations.summary import run_html, run_text
 from probe_kit.extract.store.outcomes_by_rule import Watched, judged, watch, with_outcomes
 from probe_kit.extract.store.provenance import Provenance, differences, read_provenances
 from probe_kit.extract.store.seconds import Seconds, read_seconds
+from probe_kit.extract.store.selection import select_items
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.views import resolve_view
 
@@ -85,14 +86,17 @@ class Run:
     """A stored run. Rows of every array follow `episodes`, which lists the committed ones in plan order.
 
     rule, last_steps: by which outcomes are given, see `under`; `disc` at the last step is what was stored.
-    wording: the only one whose episodes are shown, None for all; see `in_wording`.
+    wording: the only one whose episodes are shown, None for all; see `in_wording`. item_ids: the only items whose
+    episodes are shown, None for all; see `only`.
     """
 
     rule: str = DEFAULT_RULE
     last_steps: int = 1
 
-    def __init__(self, location: Location, wording: str | None = None) -> None:
-        self.location, self.wording = location, wording
+    def __init__(
+        self, location: Location, wording: str | None = None, item_ids: frozenset[str] | None = None
+    ) -> None:
+        self.location, self.wording, self.item_ids = location, wording, item_ids
         self.root = read_root(location)
         self.root.check()
         self.settings: dict[str, Any] = self.root.settings
@@ -171,7 +175,7 @@ class Run:
         """
         names = {name: name for name in ("item_id", "category", "group_id", "pair_id")}
         names["item_content_sha256"] = "content_sha256"
-        rows = {one["item_id"]: [one.get(name) for name in names] for one in self.root.plan}
+        rows = {one["item_id"]: [one.get(name) for name in names] for one in self._plan_of_items}
         return pd.DataFrame(list(rows.values()), columns=list(names.values()))
 
     @cached_property
@@ -232,12 +236,29 @@ class Run:
         if chosen not in self.wordings:
             there = ", ".join(self.wordings) or "the items' own words only (it was extracted without --wordings)"
             raise UsageError(f"{self.location} has no wording {chosen!r}; it has {there}")
-        return Run(self.location, chosen).under(self.rule, self.last_steps)
+        return self._showing(chosen, self.item_ids)
 
     @property
     def whole(self) -> "Run":
         """The same run with the episodes of all wordings."""
-        return self if self.wording is None else Run(self.location).under(self.rule, self.last_steps)
+        return self if self.wording is None else self._showing(None, self.item_ids)
+
+    def only(self, categories: Sequence[str] | None = None, items: int | None = None) -> "Run":
+        """The same run with the first items of some categories only, in the order of the plan.
+
+        A run of more items thereby serves where fewer are wanted: seeds depend on the run's seed and the item
+        alone. Probes are fitted to the episodes that are shown, and stored with the run under a key of their own.
+        categories: slugs, all by default. items: per category, all by default.
+        Raises UnknownCategoryError for a category the run lacks, and UsageError for a number that is not positive,
+        exceeds what a category has, or would separate role-exchanged twins.
+        """
+        if categories is None and items is None:
+            return self
+        chosen = select_items(self.items, categories, items, str(self.location))
+        return self._showing(self.wording, frozenset(chosen))
+
+    def _showing(self, wording: str | None, item_ids: frozenset[str] | None) -> "Run":
+        return Run(self.location, wording, item_ids).under(self.rule, self.last_steps)
 
     @cached_property
     def _commits(self) -> dict[int, Commit]:
@@ -269,16 +290,21 @@ class Run:
     @cached_property
     def planned_items(self) -> Mapping[str, str]:
         """Category of every item of the plan by its id, in whatever wording it was asked."""
-        return {str(one["item_id"]): str(one["category"]) for one in self.root.plan}
+        return {str(one["item_id"]): str(one["category"]) for one in self._plan_of_items}
+
+    @cached_property
+    def _plan_of_items(self) -> list[dict[str, Any]]:
+        """The plan of the items that are shown, in all wordings."""
+        return [e for e in self.root.plan if self.item_ids is None or e["item_id"] in self.item_ids]
 
     @cached_property
     def _plan(self) -> list[dict[str, Any]]:
-        return [e for e in self.root.plan if self.wording is None or e["wording"] == self.wording]
+        return [e for e in self._plan_of_items if self.wording is None or e["wording"] == self.wording]
 
     @cached_property
     def _columns_rows(self) -> NDArray[np.intp] | slice:
         """Which rows of the columns, which hold every committed episode, are those of `episodes`."""
-        if self.wording is None:
+        if self.wording is None and self.item_ids is None:
             return slice(None)
         sealed = [planned["episode"] for planned in self.root.plan if planned["episode"] in self._commits]
         return np.flatnonzero(np.isin(sealed, self._numbers))

@@ -137,8 +137,18 @@ def baseline(name: str) -> Callable[[RetentionRow], str]:
 
 
 def difference_name(row: Difference) -> str:
-    """Minuend and subtrahend, and whether they ran other items."""
-    return f"{row.group} − {row.minus}" + ("" if row.paired else " (other items)")
+    """Minuend and subtrahend, and what is unusual about their items."""
+    mark = difference_items(row)
+    return f"{row.group} − {row.minus}" + (f" ({mark})" if mark else "")
+
+
+def difference_items(row: Difference) -> str:
+    """How many items both sides have, or that they ran other ones; empty where all are in common."""
+    if not row.paired:
+        return "other items"
+    if row.n_items is None or row.n_items == row.of_items:
+        return ""
+    return f"{row.n_items} of {row.of_items} items"
 
 
 def difference_interval(value: float | None, limits: Limits | None, scale: float = 100.0, digits: int = 1) -> str:

@@ -62,8 +62,14 @@ _GAPS: Sequence[tuple[str, Callable[[VlmVlaDifference], str]]] = [
     ("VLM − VLA [95 %]", lambda gap: with_limits(percent(gap.difference), gap.difference_ci, percent)),
     ("p", lambda gap: number(gap.p, 4)),
     ("p (Holm)", lambda gap: number(gap.p_holm, 4)),
-    ("items", lambda gap: str(gap.n_items)),
+    ("items", lambda gap: _items(gap)),
 ]
+
+
+def _items(gap: VlmVlaDifference) -> str:
+    """How many are compared, and of how many where some are left out."""
+    all_in_common = gap.of_items is None or gap.of_items == gap.n_items
+    return str(gap.n_items) if all_in_common else f"{gap.n_items} of {gap.of_items}"
 
 
 _SOURCES: Mapping[Relation, str] = {

@@ -10,6 +10,7 @@ import numpy as np
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.paired_gains import gains_p
+from probe_kit.retention.compare.common_items import CommonItems
 from probe_kit.retention.estimators.stream_scores import (
     ACTION,
     BACKBONE,
@@ -67,8 +68,9 @@ class Difference:
     once; None unless paired. p_holm: over the categories of all pairs of the table, or over the pairs in rows
     `mean`. Intervals and p are of these models on other items. sr_models, retention_models: of other models,
     where a side is a group of several. call: the captured inference that both were probed at, None without
-    probes or where they differ. mode: what the models of both did. In a row of category `mean`, numbers are
-    averages over the `categories` that both groups have.
+    probes or where they differ. mode: what the models of both did. n_items: items that all runs of both sides have
+    and that the numbers are of; of_items: items that any of them has. None where that is not known. In a row of
+    category `mean`, numbers are averages over the `categories` that both groups have.
     """
 
     group: str
@@ -93,6 +95,8 @@ class Difference:
     minus_run: str | None = None
     mode: Mode = "acts"
     categories: tuple[str, ...] = ()
+    n_items: int | None = None
+    of_items: int | None = None
 
 
 @dataclass(frozen=True)
@@ -103,31 +107,43 @@ class Side:
     drawn: Sequence[RowWithEstimates]
     run: str | None = None
 
-    def only(self, categories: Sequence[str]) -> "Side":
-        """The same with some of its categories."""
-        return replace(self, drawn=[one for one in self.drawn if one.row.category in categories])
+
+@dataclass(frozen=True)
+class ComparedSides:
+    """The first side minus the second. items: by category, what both have in common, as far as that is known."""
+
+    here: Side
+    there: Side
+    items: Mapping[str, CommonItems] = field(default_factory=dict)
+
+    def counts(self, row: Difference) -> tuple[int | None, int | None]:
+        """`n_items` and `of_items` of a row."""
+        names = row.categories or (row.category,)
+        if not all(name in self.items for name in names):
+            return None, None
+        found = [self.items[name] for name in names]
+        return sum(one.n_items for one in found), sum(one.of_items for one in found)
 
 
-def group_differences(
-    groups: Mapping[str, Sequence[RowWithEstimates]], against: str | None = None
-) -> list[Difference]:
-    """Every group minus every later one, or minus the group `against`, per view and category and over all.
+def group_pairs(groups: Sequence[str], against: str | None = None) -> list[tuple[str, str]]:
+    """Every group and every later one, or every other group and `against`.
 
     Raises UsageError for a group that is none of them.
     """
-    if against is not None and against not in groups:
+    if against is None:
+        return list(combinations(groups, 2))
+    if against not in groups:
         raise UsageError(f"there is no group {against!r} to compare with; there are {', '.join(groups)}")
-    names = [name for name in groups if name != against]
-    chosen = combinations(groups, 2) if against is None else ((name, against) for name in names)
-    return pair_differences([(Side(one, groups[one]), Side(other, groups[other])) for one, other in chosen])
+    return [(name, against) for name in groups if name != against]
 
 
-def pair_differences(pairs: Sequence[tuple[Side, Side]]) -> list[Difference]:
+def pair_differences(pairs: Sequence[ComparedSides]) -> list[Difference]:
     """The first of each pair minus the second, per view and category and over all, with Holm's p over the lot."""
-    return _with_holm([row for here, there in pairs for row in _compare_sides(here, there)])
+    return _with_holm([row for pair in pairs for row in _compare_sides(pair)])
 
 
-def _compare_sides(here: Side, there: Side) -> list[Difference]:
+def _compare_sides(pair: ComparedSides) -> list[Difference]:
+    here, there = pair.here, pair.there
     calls = {one.row.run.call for one in (*here.drawn, *there.drawn)}
     call = calls.pop() if len(calls) == 1 else None
     mine, theirs = _by_view(here.drawn), _by_view(there.drawn)
@@ -137,7 +153,9 @@ def _compare_sides(here: Side, there: Side) -> list[Difference]:
     outcomes = _outcomes(here.drawn), _outcomes(there.drawn)
     found = [row for view in shared for row in _compare((here, there), view, mine[view], theirs[view], outcomes)]
     mode = here.drawn[0].row.run.mode
-    return [replace(row, call=call, run=here.run, minus_run=there.run, mode=mode) for row in found]
+    found = [replace(row, call=call, run=here.run, minus_run=there.run, mode=mode) for row in found]
+    counts = [pair.counts(row) for row in found]
+    return [replace(row, n_items=n, of_items=of) for row, (n, of) in zip(found, counts, strict=True)]
 
 
 Outcomes = Mapping[str, Sequence["pd.DataFrame"]]

@@ -1,35 +1,53 @@
 """Which of several runs are compared with which, and why some are not."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.run_labels import full_names
+from probe_kit.retention.behaviour.success_rate import success_share
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.compare.differences import Difference, Side, pair_differences
+from probe_kit.retention.compare.common_items import (
+    CommonItems,
+    common_items,
+    has_item_content,
+    wording_of,
+)
+from probe_kit.retention.compare.differences import (
+    ComparedSides,
+    Difference,
+    Side,
+    group_pairs,
+    pair_differences,
+)
+from probe_kit.retention.estimators.stream_scores import RowEstimates, StreamScores
 from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.train.data.run_reader import RunReader
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-OWN_WORDS = "knowledge"
-"""The wording of a run in the items' own words."""
 
 
 @dataclass(frozen=True)
 class PairedRuns:
-    """differences: of every two runs on the same questions. unpaired: why others have none, a sentence each."""
+    """differences: of runs or groups on the items that they have in common. unpaired: why others have none, and
+    which items were left out, a sentence each.
+    """
 
     differences: list[Difference]
     unpaired: tuple[str, ...]
+
+
+class Rescore(Protocol):
+    """Scores of a row's streams, on the halvings that groups of another suite's name have."""
+
+    def __call__(self, one: RowWithEstimates, suite: str) -> StreamScores | None:
+        """The row's own scores with halvings of `suite`; None without probes."""
 
 
 def compare_runs(
     runs: Sequence[RunReader],
     drawn: Sequence[RowWithEstimates],
     labels: Mapping[str, str],
+    rescore: Rescore,
     against: str | None = None,
     vlm_vla: bool = False,
 ) -> PairedRuns:
@@ -37,33 +55,94 @@ def compare_runs(
 
     runs: in the order in which they were named. drawn: their rows. labels: what runs are called, by location.
     against: a run's name in tables, its folder's name or its location. vlm_vla: whether VLM runs are compared with
-    policy runs elsewhere. Only runs on the same suite, items, seed and wording are compared.
+    policy runs elsewhere. Runs of one seed and wording are compared, on the items that both have: success rates on
+    these alone, probes where no run has other items.
     Raises UsageError for a name that is none of the runs, or several.
     """
     if against is not None and len(runs) < 2:
         raise UsageError(f"--against {against} needs a second run to compare with it")
     names = dict(zip(map(_place, runs), full_names(runs, labels), strict=True))
     chosen = None if against is None else _run_called(against, runs, names)
-    pairs: list[tuple[Side, Side]] = []
+    pairs: list[ComparedSides] = []
     unpaired: list[str] = []
     for here, there in _pairs(runs, chosen):
         both = f"{names[_place(here)]} and {names[_place(there)]}"
-        if why := _why_not(here, there):
+        items = common_items([here, there])
+        if why := _why_not(here, there, items):
             unpaired.append(f"{both} are not compared: {why}.")
             continue
-        alike, others = _same_episodes(here, there)
-        if others:
-            unpaired.append(f"{both} are not compared in {', '.join(others)}: other episodes.")
         sides = [
-            Side(names[_place(run)], [d for d in drawn if d.row.run.location == _place(run)], _place(run)).only(
-                alike
-            )
+            Side(names[_place(run)], [d for d in drawn if d.row.run.location == _place(run)], _place(run))
             for run in (here, there)
         ]
-        pairs.append((sides[0], sides[1]))
+        unpaired += _left_out(both, items)
+        pairs.append(_on_common_items((sides[0], sides[1]), items, here.suite, rescore))
     if not vlm_vla and len({ask_of(run) is None for run in runs}) == 2:
         unpaired.append("VLM runs and policy runs are not compared with each other here; --vlm-vla does that.")
     return PairedRuns(pair_differences(pairs), tuple(unpaired))
+
+
+def compare_groups(
+    groups: Mapping[str, Sequence[RunReader]],
+    drawn: Sequence[RowWithEstimates],
+    rescore: Rescore,
+    against: str | None = None,
+) -> PairedRuns:
+    """Every group of runs minus every later one, or minus the group `against`; see `compare_runs`.
+
+    Two groups count as pairs in categories in which all of their runs have at least 80 % of the items in common,
+    and then on these items alone. In other categories each group has its own items.
+    Raises UsageError for a group that is none of them.
+    """
+    pairs, notes = [], []
+    for names in group_pairs(list(groups), against):
+        runs = [run for name in names for run in groups[name]]
+        items = {name: one for name, one in common_items(runs).items() if one.is_many}
+        sides = [Side(name, [one for one in drawn if one.row.group == name]) for name in names]
+        notes += _left_out(" and ".join(names), items)
+        pairs.append(_on_common_items((sides[0], sides[1]), items, runs[0].suite, rescore, others_too=True))
+    return PairedRuns(pair_differences(pairs), tuple(notes))
+
+
+def _on_common_items(
+    sides: tuple[Side, Side],
+    items: Mapping[str, CommonItems],
+    suite: str,
+    rescore: Rescore,
+    others_too: bool = False,
+) -> ComparedSides:
+    """Both sides on the same items, which are then of one name. others_too: keep categories without such items."""
+
+    def common(one: RowWithEstimates) -> RowWithEstimates:
+        own = items.get(one.row.category)
+        if own is None or (own.whole and one.row.run.suite == suite):
+            return one
+        outcomes = None if one.outcomes is None else own.select(one.outcomes)
+        rates = {} if outcomes is None else {"sr": success_share(outcomes, suite)}
+        return replace(
+            one, estimates=RowEstimates(rates, rescore(one, suite) if own.whole else None), outcomes=outcomes
+        )
+
+    kept = {name for name, own in items.items() if own.n_items}
+    here, there = (
+        replace(side, drawn=[common(one) for one in side.drawn if others_too or one.row.category in kept])
+        for side in sides
+    )
+    return ComparedSides(here, there, items)
+
+
+def _left_out(both: str, items: Mapping[str, CommonItems]) -> list[str]:
+    """What a comparison leaves out, a sentence or two."""
+    none = [name for name, own in items.items() if not own.n_items]
+    part = {name: own for name, own in items.items() if own.n_items and not own.whole}
+    some = [f"{own.n_items} of {own.of_items} in {name}" for name, own in part.items()]
+    found = [f"{both} are not compared in {', '.join(none)}: no item in common."] if none else []
+    if some:
+        found.append(
+            f"{both} are compared on the items in common: {', '.join(some)}. Probes are not compared there: they "
+            "were fitted on other items."
+        )
+    return found
 
 
 def _place(run: RunReader) -> str:
@@ -93,42 +172,24 @@ def _run_called(name: str, runs: Sequence[RunReader], names: Mapping[str, str]) 
     raise UsageError(f"--against {name!r} is {'several' if found else 'none'} of the runs {there}")
 
 
-def _why_not(here: RunReader, there: RunReader) -> str:
+def _why_not(here: RunReader, there: RunReader, items: Mapping[str, CommonItems]) -> str:
     """Why two runs cannot be paired, in words that follow a colon; empty if they can."""
-    if here.suite != there.suite:
-        return f"other suites ({here.suite} and {there.suite})"
     for what, read in _SAME.items():
         one, other = read(here), read(there)
         if None not in (one, other) and one != other:
             return f"other {what} ({one} and {other})"
-    if not set(here.episodes["category"]) & set(there.episodes["category"]):
-        return "no category in common"
-    return "" if _same_episodes(here, there)[0] else "other episodes in every category"
+    if any(own.n_items for own in items.values()):
+        return ""
+    if here.suite != there.suite:
+        hashed = has_item_content(here) and has_item_content(there)
+        unknown = "" if hashed else ", without item hashes in both runs to pair items by"
+        return f"other suites ({here.suite} and {there.suite}){unknown}"
+    return "no item in common in any category" if items else "no category in common"
 
 
 def _seed(run: RunReader) -> Any:
     return getattr(run, "settings", {}).get("seed")
 
 
-def _wording(run: RunReader) -> str:
-    named = run.episodes["wording"].unique() if "wording" in run.episodes else [OWN_WORDS]
-    return ", ".join(map(str, named))
-
-
-_SAME = {"seeds": _seed, "wordings": _wording}
-"""What two runs must share beside the suite for their episodes to be the same questions; None where unknown."""
-
-
-def _same_episodes(here: RunReader, there: RunReader) -> tuple[list[str], list[str]]:
-    """Categories of both in which they have the same items and layouts, and those in which they have not."""
-    mine, theirs = (_episodes(run.episodes) for run in (here, there))
-    common = [category for category in mine if category in theirs]
-    alike = [category for category in common if mine[category] == theirs[category]]
-    return alike, [category for category in common if category not in alike]
-
-
-def _episodes(episodes: "pd.DataFrame") -> dict[str, set[tuple[str, str]]]:
-    return {
-        str(name): set(zip(table["item_id"].astype(str), table["layout"].astype(str), strict=True))
-        for name, table in episodes.groupby("category", sort=False)
-    }
+_SAME = {"seeds": _seed, "wordings": wording_of}
+"""What two runs must share for the episodes of an item to be the same questions; None where unknown."""

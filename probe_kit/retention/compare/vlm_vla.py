@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit.retention.behaviour.success_rate import success_share, units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.compare.common_items import CommonItems, common_items, wording_of
 from probe_kit.retention.compare.source_weights import Relation, grew_from
 from probe_kit.retention.estimators.stream_scores import Limits, Rate, limits
 from probe_kit.retention.rows.row import MEAN
@@ -22,8 +23,9 @@ if TYPE_CHECKING:
 class VlmVlaDifference:
     """Share right of a VLM run minus success rate of a policy run, in one category or over all (`mean`).
 
-    paired: whether both are of the same episodes, whose groups are then drawn together. same_frames: whether every
-    one of these began with the same frame; None where a run has no hashes. p: exact, signs of whole groups
+    paired: whether both are of the same episodes, those that the two runs have in common, whose groups are then
+    drawn together. n_items: items of these, of of_items that either run has. same_frames: whether every one of
+    these began with the same frame; None where a run has no hashes. p: exact, signs of whole groups
     flipped, of all items at once in the row `mean`; None unless paired. p_holm: over the categories of all pairs
     of the table, or over the pairs in rows `mean`. source: whether the policy's network grew from the weights that
     were asked; `unknown` where cards do not say.
@@ -42,6 +44,7 @@ class VlmVlaDifference:
     p: float | None = None
     p_holm: float | None = None
     source: Relation = "unknown"
+    of_items: int | None = None
 
 
 def vlm_vla_differences(
@@ -71,43 +74,63 @@ def _chosen(asked: Sequence[RunReader], acted: Sequence[RunReader]) -> list[tupl
 
 def _pair(vlm: RunReader, policy: RunReader, called: Mapping[str, str]) -> list[VlmVlaDifference]:
     there = dict(list(policy.episodes.groupby("category", sort=False)))
-    rows, gaps = [], []
-    for category, here in vlm.episodes.groupby("category", sort=False):
-        if category not in there:
-            continue
-        row, gap = _compare(str(category), here, there[category], (vlm, policy), called)
-        rows.append(row)
-        gaps.append(gap)
-    if not rows:
+    items = common_items([vlm, policy]) if wording_of(vlm) == wording_of(policy) else {}
+    pairs = [
+        _Episodes.of(str(category), here, there[category], items.get(str(category)))
+        for category, here in vlm.episodes.groupby("category", sort=False)
+        if category in there
+    ]
+    if not pairs:
         return []
-    return [*rows, _mean(rows, gaps, vlm, policy)]
+    found = [_compare(pair, (vlm, policy), called) for pair in pairs]
+    return [*(row for row, _ in found), _mean(pairs, [row for row, _ in found], [gap for _, gap in found])]
+
+
+@dataclass(frozen=True)
+class _Episodes:
+    """The episodes of a category that are compared: those in common, or all of both where there are none."""
+
+    category: str
+    here: "pd.DataFrame"
+    there: "pd.DataFrame"
+    of_items: int | None
+
+    @classmethod
+    def of(
+        cls, category: str, here: "pd.DataFrame", there: "pd.DataFrame", common: CommonItems | None
+    ) -> "_Episodes":
+        if common is None or not common.n_items:
+            return cls(category, here, there, None)
+        return cls(category, common.select(here), common.select(there), common.of_items)
+
+    @property
+    def paired(self) -> bool:
+        return self.of_items is not None
 
 
 def _compare(
-    category: str,
-    here: "pd.DataFrame",
-    there: "pd.DataFrame",
-    runs: tuple[RunReader, RunReader],
-    called: Mapping[str, str],
+    pair: _Episodes, runs: tuple[RunReader, RunReader], called: Mapping[str, str]
 ) -> tuple[VlmVlaDifference, Rate]:
     vlm, policy = runs
+    suites = vlm.suite, vlm.suite if pair.paired else policy.suite
     accuracy, sr = (
-        Rate.pooled([success_share(frame, run.suite)]) for frame, run in ((here, vlm), (there, policy))
+        Rate.pooled([success_share(frame, suite)])
+        for frame, suite in zip((pair.here, pair.there), suites, strict=True)
     )
     gap = accuracy.minus(sr)
-    paired = set(here["episode_id"]) == set(there["episode_id"]) and accuracy.paired_with(sr)
     row = VlmVlaDifference(
         asked=called[str(vlm.location)],
         acted=called[str(policy.location)],
-        category=category,
-        paired=paired,
-        same_frames=_same_frames(here, there),
-        n_items=int(here["item_id"].nunique()),
+        category=pair.category,
+        paired=pair.paired,
+        same_frames=_same_frames(pair.here, pair.there),
+        n_items=int(pair.here["item_id"].nunique()),
         accuracy=accuracy.value,
         sr=sr.value,
         difference=gap.value,
         difference_ci=limits(gap.interval),
-        p=_p(here, there) if paired else None,
+        p=_p(pair.here, pair.there) if pair.paired else None,
+        of_items=pair.of_items,
     )
     return row, gap
 
@@ -126,13 +149,12 @@ def _same_frames(here: "pd.DataFrame", there: "pd.DataFrame") -> bool | None:
     return bool(len(both) and (both[f"{column}_x"] == both[f"{column}_y"]).all())
 
 
-def _mean(
-    rows: Sequence[VlmVlaDifference], gaps: Sequence[Rate], vlm: RunReader, policy: RunReader
-) -> VlmVlaDifference:
+def _mean(pairs: Sequence[_Episodes], rows: Sequence[VlmVlaDifference], gaps: Sequence[Rate]) -> VlmVlaDifference:
+    import pandas as pd
+
     gap = Rate.mean([one.value for one in gaps], [one.interval for one in gaps])
-    categories = [row.category for row in rows]
     paired = all(row.paired for row in rows)
-    kept = [run.episodes[run.episodes["category"].isin(categories)] for run in (vlm, policy)]
+    known = [row.of_items for row in rows if row.of_items is not None]
     return replace(
         rows[0],
         category=MEAN,
@@ -143,5 +165,6 @@ def _mean(
         sr=sum(row.sr for row in rows) / len(rows),
         difference=gap.value,
         difference_ci=limits(gap.interval),
-        p=_p(*kept) if paired else None,
+        p=_p(pd.concat([one.here for one in pairs]), pd.concat([one.there for one in pairs])) if paired else None,
+        of_items=sum(known) if len(known) == len(rows) else None,
     )

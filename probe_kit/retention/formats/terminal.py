@@ -12,7 +12,7 @@ from probe_kit.retention.columns.conditions import wording_tables
 from probe_kit.retention.columns.lines import TableRow
 from probe_kit.retention.columns.summary import RunSummary, summarise_runs, summary_table
 from probe_kit.retention.columns.tables import Table, cell_text, tables_of, views_of
-from probe_kit.retention.columns.text import ABOVE_CHANCE, call_words, is_vlm, model_name
+from probe_kit.retention.columns.text import ABOVE_CHANCE, call_words, difference_items, is_vlm, model_name
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
@@ -162,7 +162,8 @@ def _short(row: TableRow, rows: Sequence[RetentionRow], called: _Letters) -> str
     for one in rows:
         letters.setdefault(model_name(one) if one.group is None else one.group, []).append(called[one.key])
     sides = ["".join(dict.fromkeys(letters[side])) for side in (row.group, row.minus)]
-    return " − ".join(sides) + ("" if row.paired else ", other items")
+    mark = difference_items(row)
+    return " − ".join(sides) + (f", {mark}" if mark else "")
 
 
 # -- sizes ---------------------------------------------------------------------------------------------------

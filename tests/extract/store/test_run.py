@@ -7,10 +7,17 @@ import torch
 import xarray as xr
 import zarr
 
-from probe_kit.errors import RunDamagedError, RunNotFoundError, UnknownSiteError
+from probe_kit.errors import (
+    NoProbesError,
+    ProbeKitError,
+    RunDamagedError,
+    RunNotFoundError,
+    UnknownSiteError,
+)
 from probe_kit.extract import Run, open_run
 from probe_kit.extract.store.format.arrays import decode_bfloat16
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.train import load_results, train_probes
 
 
 @pytest.fixture
@@ -112,3 +119,47 @@ def test_a_missing_or_truncated_object_is_noticed_on_opening(damaged: Path) -> N
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(RunNotFoundError, match="probe-kit extract"):
         open_run(tmp_path)
+
+
+def test_a_run_shows_the_first_items_of_some_categories(recorded_run: Run) -> None:
+    part = recorded_run.only(["color"], 4)
+    whole = recorded_run.episodes
+    first = list(dict.fromkeys(whole.loc[whole["category"] == "color", "item_id"]))[:4]
+    mine = whole["item_id"].isin(first).to_numpy()
+    assert part.episodes["item_id"].unique().tolist() == first
+    assert (part.planned, len(part.items), set(part.planned_items.values())) == (8, 4, {"color"})
+    for site in (Site("backbone", 2), Site("expert", 3, iteration=7)):
+        np.testing.assert_array_equal(part.column(site), recorded_run.column(site)[mine])
+        np.testing.assert_array_equal(part.tokens(site)[1], recorded_run.tokens(site)[1][mine])
+    assert part.control_steps.tolist() == recorded_run.control_steps[mine].tolist()
+    assert (part.judged("disc")["correct"].to_numpy() == recorded_run.judged("disc")["correct"][mine]).all()
+    assert part.whole is part
+    assert part.only(items=2).episodes["item_id"].unique().tolist() == first[:2]
+    assert recorded_run.only() is recorded_run
+
+
+@pytest.mark.parametrize(
+    ("categories", "items", "why"),
+    [
+        (["colour"], None, "unknown category 'colour'"),
+        ([], None, "no category selected"),
+        (None, 0, "items is 0"),
+        (None, 14, r"plans 12 items of 'color'; give a number from 1 to 12"),
+        (["shape"], 3, "role-exchanged twins"),
+    ],
+)
+def test_a_selection_that_a_run_does_not_hold_is_refused(
+    recorded_run: Run, categories: list[str] | None, items: int | None, why: str
+) -> None:
+    with pytest.raises(ProbeKitError, match=why):
+        recorded_run.only(categories, items)
+
+
+def test_a_part_of_a_run_has_probes_of_its_own(little_runs: Path, tmp_path: Path) -> None:
+    run = open_run(shutil.copytree(little_runs / "run", tmp_path / "run"))
+    part, stored = run.only(items=10), load_results(run).key
+    with pytest.raises(NoProbesError, match="other episodes"):
+        load_results(part)
+    own = train_probes(part, permutations=0)
+    assert (load_results(part).key, load_results(run).key) == (own.key, stored)
+    assert len(own.curves["color", "mean"].episodes) == 20

@@ -16,7 +16,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.behaviour.run_labels import full_names
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.train import ArrayRun, load_results
+from probe_kit.train import ArrayRun, load_results, save_results
 from tests.retention.asked_runs import SUITE, SaidRun, asked, episodes
 from tests.retention.paired_limits import mover
 
@@ -172,9 +172,12 @@ def test_one_run_twice_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("other", "why"),
     [
-        ({"suite": "other@1#ba9876543210"}, "other suites (suite@1#0123456789ab and other@1#ba9876543210)"),
+        (
+            {"suite": "other@1#ba9876543210"},
+            "other suites (suite@1#0123456789ab and other@1#ba9876543210), without item hashes in both runs to "
+            "pair items by",
+        ),
         ({"seed": 4}, "other seeds (0 and 4)"),
-        ({"right": hits(0.5, 1, {"color": 18, "shape": 22})}, "other episodes in every category"),
         ({"right": hits(0.5, 1, {"counting": 4})}, "no category in common"),
     ],
 )
@@ -201,13 +204,94 @@ def test_other_words_are_other_questions(tmp_path: Path) -> None:
     assert retention_table([one, own]).differences
 
 
-def test_a_category_with_other_items_alone_is_left_out(tmp_path: Path) -> None:
-    one = run(tmp_path / "one", hits(0.5, 0))
+def with_content(one: SaidRun, changed: frozenset[str] = frozenset()) -> SaidRun:
+    """The run with hashes of its items; those of `changed` show something else."""
+    content = [f"{item}{'!' * (item in changed)}" for item in one.episodes["item_id"]]
+    return replace(one, episodes=one.episodes.assign(item_content_sha256=content))
+
+
+def test_items_that_only_one_run_has_are_left_out_and_counted(tmp_path: Path) -> None:
+    one = run(tmp_path / "one", hits(0.8, 0))
     other = run(tmp_path / "other", hits(0.5, 1, {"color": 20, "shape": 10}))
     table = retention_table([one, other])
+    assert [row.category for row in table.differences] == ["color", "shape", "mean"]
+    shape = difference(table, "other", "shape")
+    assert (shape.paired, shape.n_items, shape.of_items) == (True, 10, 24)
+    theirs = other.episodes[other.episodes["category"] == "shape"].set_index("episode_id")
+    mine = one.episodes.set_index("episode_id").loc[theirs.index]
+    gains = (mine["outcome"] == "correct").astype(float) - (theirs["outcome"] == "correct")
+    value, _, _, p = oracle(gains, theirs["group_id"])
+    assert (shape.sr, shape.p) == (pytest.approx(value), pytest.approx(p))
+    assert shape.sr_ci == pytest.approx(mover(mine.reset_index(), theirs.reset_index()))
+    mean = difference(table, "other", "mean")
+    assert (mean.n_items, mean.of_items) == (30, 44)
+    assert mean.sr == pytest.approx((value + (difference(table, "other", "color").sr or 0)) / 2)
+    (said,) = table.unpaired
+    assert said.startswith("one and other are compared on the items in common: 10 of 24 in shape. Probes are not")
+    assert "one − other (10 of 24 items)" in table.to_markdown()
+
+
+def test_a_category_without_an_item_in_common_alone_is_left_out(tmp_path: Path) -> None:
+    one, other = (with_content(run(tmp_path / name, hits(0.5, at))) for at, name in enumerate(("one", "other")))
+    new = with_content(other, frozenset(other.episodes.loc[other.episodes["category"] == "shape", "item_id"]))
+    table = retention_table([one, new])
     assert [row.category for row in table.differences] == ["color", "mean"]
     assert table.differences[1].categories == ("color",)
-    assert table.unpaired == ("one and other are not compared in shape: other episodes.",)
+    assert table.unpaired == ("one and other are not compared in shape: no item in common.",)
+
+
+def test_selections_of_one_suite_are_pairs_by_what_their_items_hold(tmp_path: Path) -> None:
+    right, left = hits(0.8, 0), hits(0.5, 1)
+    whole, part = (
+        with_content(run(tmp_path / "whole", right)),
+        with_content(run(tmp_path / "part", {"color": left["color"]}, suite="suite@1#ba9876543210")),
+    )
+    found = retention_table([whole, part])
+    same = retention_table([whole, with_content(run(tmp_path / "same", {"color": left["color"]}))])
+    both = [difference(table, name, "color") for table, name in ((found, "part"), (same, "same"))]
+    assert both[0].paired
+    assert replace(both[0], minus="", minus_run="") == replace(both[1], minus="", minus_run="")
+    changed = with_content(part, frozenset({"color-0", "color-1"}))
+    fewer = difference(retention_table([whole, changed]), "part", "color")
+    assert (fewer.n_items, fewer.of_items) == (18, 22)  # two items of one id are two items
+
+
+def test_probes_on_the_same_items_of_another_selection_are_pairs(probed_run: ProbedRun) -> None:
+    def hashed(one: ArrayRun) -> ArrayRun:
+        return replace(one, episodes=one.episodes.assign(item_content_sha256=one.episodes["item_id"]))
+
+    one = hashed(probed_run({"color": SIGNAL}, "one"))
+    same, part = (
+        hashed(probed_run({"color": SIGNAL}, name, suite=suite))
+        for name, suite in (("same", one.suite), ("part", "suite@1#ba9876543210"))
+    )
+    apart = replace(part, episodes=part.episodes.drop(columns="item_content_sha256"))
+    tables = [retention_table([one, other]) for other in (same, part)]
+    found = [difference(table, name, "color") for table, name in zip(tables, ("same", "part"), strict=True)]
+    widths = [(row.backbone_ci or (0, 0))[1] - (row.backbone_ci or (0, 0))[0] for row in found]  # type: ignore[operator]
+    assert widths[1] == pytest.approx(widths[0], rel=0.05)
+    rows = tables[1].rows
+    assert found[1].backbone == pytest.approx(rows[0].backbone.score - rows[1].backbone.score)  # type: ignore[operator]
+    assert retention_table([one, apart]).differences == []
+
+
+def test_probes_are_not_compared_where_items_differ(probed_run: ProbedRun) -> None:
+    one, other = probed_run({"color": SIGNAL}, "one"), probed_run({"color": WEAK}, "other")
+    fewer = replace(other, episodes=other.episodes.iloc[:160], features={})
+    save_results(load_results(other), fewer.path)
+    row = difference(retention_table([one, fewer], keys=[None, load_results(other).key]), "other", "color")
+    assert (row.n_items, row.of_items, row.backbone, row.retention) == (80, 100, None, None)
+
+
+def test_groups_are_pairs_on_the_items_that_most_of_their_runs_have(tmp_path: Path) -> None:
+    full = {"color": 20, "shape": 24}
+    runs = [run(tmp_path / name, hits(0.7, at, full)) for at, name in enumerate("abc")]
+    nearly = run(tmp_path / "d", hits(0.5, 4, {"color": 18, "shape": 4}))
+    table = retention_table({"x": runs[:2], "y": [runs[2], nearly]})
+    color, shape = (difference(table, "y", name) for name in ("color", "shape"))
+    assert (color.paired, color.n_items, color.of_items) == (True, 18, 20)
+    assert (shape.paired, shape.n_items) == (False, None)  # 4 of 24 are too few to give up the others
+    assert table.unpaired[0].startswith("x and y are compared on the items in common: 18 of 20 in color.")
 
 
 def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path: Path) -> None:

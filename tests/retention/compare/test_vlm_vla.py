@@ -117,10 +117,21 @@ def test_the_gap_is_what_an_independent_count_gives(runs: list[SaidRun]) -> None
     assert mean.difference == pytest.approx(np.mean([gap.difference for gap in table.vlm_vla[:2]]))
 
 
-def test_other_items_are_not_paired_and_have_no_p(runs: list[SaidRun]) -> None:
+def test_only_items_in_common_are_compared_and_counted(runs: list[SaidRun]) -> None:
     policy, vlm = runs
     fewer = replace(policy, episodes=policy.episodes[policy.episodes["item_id"] != "color-0"])
-    color = vlm_vla_differences([vlm, fewer])[0]
+    color, _, mean = vlm_vla_differences([vlm, fewer])
+    asked_too = replace(vlm, episodes=vlm.episodes[vlm.episodes["item_id"] != "color-0"])
+    assert replace(color, of_items=19) == vlm_vla_differences([asked_too, fewer])[0]
+    assert (color.n_items, color.of_items, mean.n_items, mean.of_items) == (19, 20, 35, 36)
+    shown = retention_table([vlm, fewer], vlm_vla=True).further_tables[-1]
+    assert [line[-1] for line in shown.cells] == ["19 of 20", "16", "35 of 36"]
+
+
+def test_other_items_are_not_paired_and_have_no_p(runs: list[SaidRun]) -> None:
+    policy, vlm = runs
+    others = policy.episodes.assign(item_id="new " + policy.episodes["item_id"])
+    color = vlm_vla_differences([vlm, replace(policy, episodes=others)])[0]
     assert (color.paired, color.p) == (False, None)
     other = replace(policy, episodes=policy.episodes.assign(first_frame_sha256="another"))
     assert vlm_vla_differences([vlm, other])[0].same_frames is False
