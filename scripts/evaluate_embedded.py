@@ -17,7 +17,7 @@ from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extrac
 from probe_kit.extract.vqa.templates import TEMPLATES
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.columns.summary import verdict
+from probe_kit.retention.columns.sentences import verdict
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.suite import Suite, build_suite
 

@@ -19,7 +19,7 @@ from probe_kit._terminal.console import counter, progress
 from probe_kit.demo.organisms import TRAINED, Finding, NamedProgress
 from probe_kit.demo.pipeline import PERMUTATIONS, compare_organisms, run_demo
 from probe_kit.retention import RetentionRow
-from probe_kit.retention.columns.summary import verdict
+from probe_kit.retention.columns.sentences import verdict
 from probe_kit.retention.rows.row import MEAN
 
 SHOWN = {"report.html": "sample-report.html", "episode.gif": "episode.gif"}

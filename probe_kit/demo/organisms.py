@@ -19,7 +19,7 @@ from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
 from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.columns.columns import FOLLOWS, MARGIN
-from probe_kit.retention.columns.summary import CategoryVerdict, verdict
+from probe_kit.retention.columns.sentences import CategoryVerdict, verdict
 from probe_kit.retention.columns.text import exceeds_text, number, percent, retention_value
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes

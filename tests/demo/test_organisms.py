@@ -25,7 +25,7 @@ from probe_kit.extract import extract_run
 from probe_kit.intervene import ImageSwap, InstructionSwap, run_intervention
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.behaviour.success_rate import SuccessRate, regime
-from probe_kit.retention.columns.summary import verdict
+from probe_kit.retention.columns.sentences import verdict
 from probe_kit.retention.rows.parts import BackbonePart, RunInfo, SwapEffect
 from probe_kit.suite import Suite
 

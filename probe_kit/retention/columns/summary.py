@@ -2,10 +2,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, cast
 
-from probe_kit.intervene.kinds.image_swap.verdict import Verdict
-from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.columns.sentences import describe_category, knows, verdict
 from probe_kit.retention.columns.text import (
     difference_interval,
     difference_test,
@@ -20,49 +18,19 @@ from probe_kit.retention.columns.text import (
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.estimators.stream_scores import Limits
-from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
 
-CategoryVerdict = (
-    Verdict | Literal["known", "unknown", "encoded", "acted on", "encoded, not acted on", "not shown"]
-)
-"""A verdict on an image swap, or what success rate and probes say where none is stored: these never say *used*."""
 MARK = "✓"
 """After a share: the stream's signal is shown, or the regime of the behaviour is knowledge."""
 _LEGENDS = {
     "VLM %": "VLM: share of its answers that are right",
     "backbone %": "Backbone: accuracy of probes in the backbone, at sites that other questions chose",
     "action %": "Action: the same at the action's sites",
-    "success %": "Success: the cube ends on the right picture",
+    "success %": "Success: the cube ends on the correct picture",
     "retention": "Retention: share of the backbone's signal left in the action",
 }
 """What a column shows."""
-
-
-def verdict(row: RetentionRow) -> CategoryVerdict:
-    """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
-
-    In the backbone: its best site exceeds chance, family-wise, and every control that was run. With a stored
-    image swap the verdict is that of `probe_kit.intervene`. Without one, the SR in the regime of knowledge says
-    *acted on*: only an intervention shows that what is read is used. *Acted on, not found*: the probes missed
-    what the policy acts on. *Absent* is said only where the backbone's best site is below a stated accuracy,
-    else *not shown*. A VLM knows a category in which it answers in the regime of knowledge.
-    """
-    if is_vlm(row):
-        return "known" if _knows(row) else "unknown"
-    nothing: CategoryVerdict = "absent" if row.backbone.verdict == "absent" else "not shown"
-    if row.image_swap.used is not None:
-        return nothing if row.image_swap.used == "absent" else cast("Verdict", row.image_swap.used)
-    if row.success.sr is None:
-        return "encoded" if row.backbone.has_signal else nothing
-    if _knows(row):
-        return "acted on" if row.backbone.has_signal else "acted on, not found"
-    return "encoded, not acted on" if row.backbone.has_signal else nothing
-
-
-def _knows(row: RetentionRow) -> bool:
-    return row.success.regime == Regime.KNOWLEDGE
 
 
 @dataclass(frozen=True)
@@ -82,10 +50,10 @@ class CategorySummary:
         row, asked = self.row, self.row if is_vlm(self.row) else self.asked
         acts = None if is_vlm(row) else row
         return (
-            "–" if asked is None else _share(asked.success.sr, asked.success.ci, _knows(asked), intervals),
+            "–" if asked is None else _share(asked.success.sr, asked.success.ci, knows(asked), intervals),
             _share(row.backbone.score, row.backbone.ci, row.backbone.has_signal, intervals),
             _share(row.action.score, row.action.ci, row.action.has_signal, intervals),
-            "–" if acts is None else _share(acts.success.sr, acts.success.ci, _knows(acts), intervals),
+            "–" if acts is None else _share(acts.success.sr, acts.success.ci, knows(acts), intervals),
             _retention(row, intervals),
             "" if row.category == MEAN else str(verdict(row)),
         )
@@ -93,43 +61,10 @@ class CategorySummary:
     @property
     def sentence(self) -> str:
         """The finding in plain words, with its numbers, their uncertainty and the number of items."""
-        parts = [*_answered(self.row if is_vlm(self.row) else self.asked), *_streams(self.row)]
-        parts += [] if is_vlm(self.row) else [_acted(self.row)]
-        items = self.row.success.n_items
-        return f"{self.name} ({items} item{'s' * (items != 1)}): {'; '.join(parts)}. {self.conclusion}"
-
-    @property
-    def conclusion(self) -> str:
-        """What follows, and what to do next."""
-        return (_UNACTED if self.row.success.sr is None else _CONCLUSIONS)[verdict(self.row)]
+        return f"{self.name} {describe_category(self.row, self.asked)}"
 
 
 HEADINGS = ("VLM %", "backbone %", "action %", "success %", "retention", "verdict")
-_CONCLUSIONS: dict[CategoryVerdict, str] = {
-    "known": "The VLM knows the answer.",
-    "unknown": "Not shown that the VLM knows the answer.",
-    "used": "The answer is used.",
-    "encoded, unused": "Shown in the backbone, not used.",
-    "encoded, acted against": "Shown in the backbone; the policy acts against it.",
-    "absent": "Absent from the backbone, and the policy does not act on it.",
-    "not shown": "Not shown in the backbone, and not acted on: more items would tell.",
-    "acted on, not found": "The policy acts on it, and the probes did not find it.",
-    "acted against, not found": "The policy acts against it, and the probes did not find it.",
-    "follows": "The action follows the pictures; there are no probes.",
-    "acts against": "The action goes against the pictures; there are no probes.",
-    "does not follow": "The action does not follow the pictures; there are no probes.",
-    "inconclusive": "Whether it is used remains open: more items would tell.",
-    "encoded": "Shown in the backbone.",
-    "acted on": "Whether what is read is used was not tested: run `probe-kit intervene`.",
-    "encoded, not acted on": "Shown in the backbone, not acted on. To test its use, run `probe-kit intervene`.",
-}
-
-
-_UNACTED = _CONCLUSIONS | {
-    "absent": "Absent from the backbone.",
-    "not shown": "Not shown in the backbone: more items would tell.",
-}
-"""The same of a model that did not act."""
 
 
 def _share(value: float | None, limits: Limits | None, marked: bool, intervals: bool) -> str:
@@ -147,66 +82,6 @@ def _retention(row: RetentionRow, intervals: bool) -> str:
     if not row.retention.defined:
         return "n/a"
     return with_limits(number(row.retention.value), row.retention.ci if intervals else None, number)
-
-
-def _range(limits: Limits | None) -> str:
-    """Limits of a share in words, with a comma before them."""
-    if limits is None or None in limits:
-        return ""
-    return f", {percent(limits[0], 0)} to {percent(limits[1], 0)}"
-
-
-def _answered(row: RetentionRow | None) -> list[str]:
-    if row is None or row.success.sr is None:
-        return []
-    return [f"the VLM answers right in {percent(row.success.sr, 0)} %{_range(row.success.ci)}{_margin(row)}"]
-
-
-def _margin(row: RetentionRow) -> str:
-    """Where an interval excludes one half and the regime still says nothing: by what it decides."""
-    low = None if row.success.ci is None else row.success.ci[0]
-    if low is None or low <= 0.5 or row.success.regime != Regime.NO_RELIABLE_KNOWLEDGE:
-        return ""
-    return f", less than the {percent(row.success.chance_margin, 0)} points above one half that guessing can reach"
-
-
-def _streams(row: RetentionRow) -> list[str]:
-    """What can be read in the backbone, and where the action is made."""
-    action = f"the {row.run.action_name}"
-    both = row.backbone.verdict == row.action.verdict == "shown"
-    parts = [] if row.backbone.score is None else [_in_stream("the backbone", row.backbone)]
-    if row.action.score is not None:
-        parts.append(f"so does {action} ({_accuracy(row.action)})" if both else _in_stream(action, row.action))
-    return parts
-
-
-def _accuracy(part: StreamPart) -> str:
-    return f"{percent(part.score, 0)} %{_range(part.ci)}"
-
-
-def _in_stream(name: str, part: StreamPart) -> str:
-    most = f"{percent(part.at_most, 0)} %"
-    if part.verdict == "absent":
-        return f"{name} does not hold it (at most {most})"
-    if part.verdict == "shown":
-        return f"{name} holds the answer ({_accuracy(part)})"
-    missed = [control for control, better in part.exceeds.items() if better is False]
-    than = f" to exceed {' and '.join(missed)}" if missed and "chance" not in missed else " to hold it"
-    return f"{name} is not shown{than} ({percent(part.score, 0)} %, could be up to {most})"
-
-
-def _acted(row: RetentionRow) -> str:
-    if row.success.sr is None:
-        return "the model did not act"
-    right = f"the cube ends right in {percent(row.success.sr, 0)} %{_range(row.success.ci)}{_margin(row)}"
-    swap = row.image_swap
-    if swap.follow_rate is None:
-        return right
-    followed, limits = percent(swap.follow_rate, 0), swap.net_follow_rate_ci
-    if verdict(row) in ("used", "acted on, not found", "follows"):
-        return f"the action follows it (in {followed} % of swapped pictures), and {right}"
-    most = "" if limits is None or limits[1] is None else f", at most {percent(limits[1], 0)} %"
-    return f"the action does not follow it (in {followed} % of swapped pictures{most}), and {right}"
 
 
 # -- runs --------------------------------------------------------------------------------------------------------

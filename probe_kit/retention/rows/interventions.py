@@ -35,6 +35,7 @@ def add_image_swap(
         net_follow_rate=own.net_follow_rate,
         net_follow_rate_ci=own.net_follow_rate_ci,
         follow_p=own.follow_p,
+        response=own.response,
         used=judged.verdict,
         used_note=judged.reason,
     )

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from probe_kit.hooks.contract.sites import label_of
+from probe_kit.intervene.kinds.image_swap.effects import Response
 from probe_kit.retention.behaviour.run_labels import full_name
 from probe_kit.retention.estimators.stream_scores import Limits
 from probe_kit.statistics.estimates.verdict import Verdict
@@ -80,8 +81,8 @@ class SwapEffect:
     """Effect of exchanging the two pictures, if `probe-kit intervene` was run.
 
     follow_rate, reversal_rate: shares of episodes; net_follow_rate: their difference, follow_p: exact, one-sided;
-    see `intervene.ImageSwapEffect`. used: the
-    verdict of that and the row's own probes; used_note: what it rests on, or why there is none.
+    see `intervene.ImageSwapEffect`. response: what the action does, in a word. used: the verdict of that and the
+    row's own probes; used_note: what it rests on, or why there is none.
     """
 
     follow_rate: float | None = None
@@ -89,6 +90,7 @@ class SwapEffect:
     net_follow_rate: float | None = None
     net_follow_rate_ci: Limits | None = None
     follow_p: float | None = None
+    response: Response | None = None
     used: str | None = None
     used_note: str = ""
 

@@ -104,6 +104,18 @@ def test_a_guesser_with_a_fixed_preference_per_item_is_not_called_knowing() -> N
     assert np.mean([found is Regime.KNOWLEDGE for found in regimes]) <= 0.025 + 3 * 0.0128
 
 
+def test_knowledge_never_stands_beside_an_interval_that_includes_one_half() -> None:
+    generator = np.random.default_rng(1)
+    found = [
+        success_rate(doubles(groups, lambda *_, ability=ability: bool(generator.random() < ability)))
+        for groups in range(4, 40)
+        for ability in (generator.uniform(0.5, 1.0),)
+    ]
+    lows = [rate.ci[0] for rate in found if rate.regime is Regime.KNOWLEDGE and rate.ci is not None]
+    assert len(lows) > 5
+    assert all(low is not None and low > 0.5 for low in lows)
+
+
 def test_items_that_ran_in_one_layout_are_not_paired(outcome_table: Outcomes) -> None:
     assert paired_items(outcome_table(correct=3, wrong=0, oob=0)).both == 1
 

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from probe_kit.retention import RetentionRow, RetentionTable
 from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
-from probe_kit.retention.columns.summary import HEADINGS, MARK, summarise_runs, summary_table, verdict
+from probe_kit.retention.columns.summary import HEADINGS, MARK, summarise_runs, summary_table
 from probe_kit.retention.rows.parts import (
     ActionPart,
     AnswerStats,
@@ -52,7 +52,9 @@ def acts(
         backbone=BackbonePart(**part),
         action=ActionPart(**part),
         retention=RetentionPart(value=1.0, ci=(0.8, 1.2), defined=shown),
-        image_swap=SwapEffect(used=used, follow_rate=0.04, net_follow_rate_ci=(-0.1, 0.12))
+        image_swap=SwapEffect(
+            used=used, response="does not follow", follow_rate=0.04, net_follow_rate_ci=(-0.1, 0.12)
+        )
         if used
         else SwapEffect(),
     )
@@ -63,30 +65,6 @@ ACTED = [
     acts("color", 1.0, "used", 0.9375), acts("state", 0.979, "encoded, unused", 0.66),
     acts("counting", 0.52, "absent"), acts(MEAN, 0.83, None),
 ]  # fmt: skip
-
-
-def split(*rows: RetentionRow) -> tuple[list[RetentionRow], list[RetentionRow]]:
-    return [one for one in rows if one.category != MEAN], [one for one in rows if one.category == MEAN]
-
-
-def test_a_sentence_says_what_was_found_with_numbers_uncertainty_items_and_what_follows() -> None:
-    (found,) = summarise_runs([*ASKED, *ACTED])
-    color, state, counting = found.sentences
-    assert color == (
-        "Color (24 items): the VLM answers right in 100 %, 90 to 100; the backbone holds the answer (100 %, 40 to "
-        "100); so does the action expert (100 %, 40 to 100); the action follows it (in 4 % of swapped pictures), "
-        "and the cube ends right in 94 %, 84 to 100. The answer is used."
-    )
-    assert "the action does not follow it (in 4 % of swapped pictures, at most 12 %)" in state
-    assert state.endswith("Shown in the backbone, not used.")
-    assert "the backbone is not shown to hold it (52 %, could be up to 78 %)" in counting
-    assert "Absent" not in counting, "a large p is no absence"
-
-
-def test_a_regime_that_says_nothing_beside_an_interval_above_one_half_names_its_margin() -> None:
-    (found,) = summarise_runs(ACTED)
-    assert "56 to 76, less than the 20 points above one half that guessing can reach" in found.sentences[1]
-    assert "guessing can reach" not in found.sentences[0]
 
 
 ELSEWHERE = [answers(name, suite="another@1") for name in ("color", MEAN)]
@@ -131,30 +109,21 @@ def test_several_runs_stand_in_one_table_by_category() -> None:
 
 @pytest.mark.parametrize("width", [80, 100, 120, 200])
 def test_the_terminal_shows_one_table_at_any_width_and_ends_on_the_sentences(width: int) -> None:
-    rows, means = split(*ASKED, *ACTED)
+    everything = [*ASKED, *ACTED]
+    rows = [one for one in everything if one.category != MEAN]
+    means = [one for one in everything if one.category == MEAN]
     console = Console(width=width, record=True)
     with console.capture() as printed:
         console.print(RetentionTable(rows, means).to_rich())
     text = printed.get()
     assert text.count("category") == 1, "one header: one table, and it is not split"
     assert ("[40, 100]" in text.split("Color (24")[0]) == (width >= 120)
-    assert " ".join(text.split()).endswith("Not shown in the backbone, and not acted on: more items would tell.")
-
-
-def test_used_is_said_only_where_an_intervention_was_stored() -> None:
-    assert verdict(acts("color", 1.0, None, 0.95)) == "acted on"
-    assert verdict(acts("color", 1.0, None, 0.5)) == "encoded, not acted on"
-    assert verdict(acts("color", 0.5, None, 0.95)) == "acted on, not found"
-    assert verdict(acts("color", 0.5, None, 0.5)) == "not shown"
-    assert verdict(acts("color", 0.5, "used", 0.5)) == "used"
-    absent = acts("color", 0.5, "absent", 0.5)
-    assert verdict(replace(absent, backbone=replace(absent.backbone, verdict="absent"))) == "absent"
-    (found,) = summarise_runs([acts("color", 1.0, None, 0.95), acts(MEAN, 1.0, None)])
-    assert "was not tested: run `probe-kit intervene`" in found.sentences[0]
+    assert " ".join(text.split()).endswith("not shown in the backbone: more items would tell.")
 
 
 def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:
-    rows = [acts("color", 1.0, None, None), acts("shape", 0.5, None, None), acts(MEAN, 0.75, None, None)]
+    found = (acts(name, score, None, None, capture_only=True) for name, score in (("color", 1.0), ("shape", 0.5)))
+    rows = [*found, acts(MEAN, 0.75, None, None, capture_only=True)]
     (found,) = summarise_runs(rows)
     color, shape = found.sentences
     assert color.endswith("the model did not act. Shown in the backbone.")

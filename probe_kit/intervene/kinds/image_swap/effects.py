@@ -1,7 +1,7 @@
 """What image swaps did, per category. Reads stored outcomes; needs no model."""
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from probe_kit.train.data.run_reader import RunReader
 NAME = "image-swap"
 SMALLEST_EFFECT_OF_INTEREST = 0.25
 """Net follow rate from which the action is said to follow."""
+
+Response = Literal["follows", "reverses", "does not follow", "open"]
+"""What the action does when the pictures are swapped; `open` where its interval leaves room for following."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,15 @@ class ImageSwapEffect:
     def is_bounded(self) -> bool:
         """Whether the interval leaves no room for following that matters."""
         return self.net_follow_rate_ci[1] < SMALLEST_EFFECT_OF_INTEREST
+
+    @property
+    def response(self) -> Response:
+        """The same three in a word."""
+        if self.follows_images:
+            return "follows"
+        if self.is_against:
+            return "reverses"
+        return "does not follow" if self.is_bounded else "open"
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""

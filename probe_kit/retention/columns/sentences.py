@@ -1,0 +1,261 @@
+"""What a row says in words: its verdict, and the sentence about it."""
+
+from typing import Literal, cast
+
+from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST
+from probe_kit.intervene.kinds.image_swap.verdict import Verdict
+from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.columns.text import is_vlm, percent
+from probe_kit.retention.estimators.stream_scores import Limits
+from probe_kit.retention.rows.parts import StreamPart
+from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
+
+CategoryVerdict = (
+    Verdict | Literal["known", "unknown", "encoded", "acted on", "encoded, not acted on", "not shown"]
+)
+"""A verdict on an image swap, or what success rate and probes say where none is stored: these never say *used*."""
+
+
+def verdict(row: RetentionRow) -> CategoryVerdict:
+    """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
+
+    In the backbone: its best site exceeds chance, family-wise, and every control that was run. With a stored
+    image swap the verdict is that of `probe_kit.intervene`. Without one, the SR in the regime of knowledge says
+    *acted on*: only an intervention shows that what is read is used. *Acted on, not found*: the probes missed
+    what the policy acts on. *Absent* is said only where the backbone's best site is below a stated accuracy,
+    else *not shown*. A VLM knows a category in which it answers in the regime of knowledge.
+    """
+    if is_vlm(row):
+        return "known" if knows(row) else "unknown"
+    nothing: CategoryVerdict = "absent" if row.backbone.verdict == "absent" else "not shown"
+    if row.image_swap.used is not None:
+        return nothing if row.image_swap.used == "absent" else cast("Verdict", row.image_swap.used)
+    if row.success.sr is None:
+        return "encoded" if row.backbone.has_signal else nothing
+    if knows(row):
+        return "acted on" if row.backbone.has_signal or not _is_probed(row) else "acted on, not found"
+    return "encoded, not acted on" if row.backbone.has_signal else nothing
+
+
+def knows(row: RetentionRow) -> bool:
+    """Whether its success rate is in the regime of knowledge."""
+    return row.success.regime == Regime.KNOWLEDGE
+
+
+def describe_category(row: RetentionRow, asked: RetentionRow | None = None) -> str:
+    """The finding in plain words, to be set behind the category's name.
+
+    Number of items; what the VLM answers, what the streams hold and what the policy does, each with its
+    uncertainty; what follows, and what to do next. asked: the VLM's row of the same category.
+    """
+    items = row.success.n_items
+    answered = row if is_vlm(row) else asked
+    parts = [] if answered is None or answered.success.sr is None else [_answered(answered)]
+    parts += _streams(row)
+    parts += [] if is_vlm(row) else [_acted(row)]
+    return f"({items} item{'s' * (items != 1)}): {'; '.join(parts)}. {conclusion(row)}"
+
+
+# -- what follows --------------------------------------------------------------------------------------------
+
+_CONCLUSIONS: dict[CategoryVerdict, str] = {
+    "known": "The VLM knows the answer.",
+    "unknown": "Not shown that the VLM knows the answer.",
+    "used": "The answer is used.",
+    "encoded, unused": "Shown in the backbone, not used.",
+    "encoded, acted against": "Shown in the backbone; the policy acts against it.",
+    "acted on, not found": "The policy acts on the answer, and the probes did not find it.",
+    "acted against, not found": "The policy acts against the answer, and the probes did not find it.",
+    "encoded": "Shown in the backbone.",
+    "acted on": "Whether what is read is used was not tested: run `probe-kit intervene`.",
+}
+_MORE_ITEMS = "more items would tell"
+_LATER = "Yet the policy succeeds: actions after the first inference may follow."
+"""An image swap reads the actions of the first inference."""
+
+
+def conclusion(row: RetentionRow) -> str:
+    """What follows from a row, and what to do next."""
+    if is_vlm(row):
+        return _CONCLUSIONS[verdict(row)]
+    parts = [_finding(row), _LATER if row.image_swap.response == "does not follow" and knows(row) else ""]
+    if not _is_probed(row):
+        parts.append("The backbone was not probed: run `probe-kit train`.")
+    return " ".join(filter(None, parts))
+
+
+def _finding(row: RetentionRow) -> str:
+    found = verdict(row)
+    if found == "inconclusive":
+        undecided = f"a net rate of {_whole(SMALLEST_EFFECT_OF_INTEREST)} % would count, and {_MORE_ITEMS}"
+        reason = undecided if row.image_swap.response == "open" else row.image_swap.used_note
+        return f"Whether the answer is used remains open: {reason}."
+    if not _is_probed(row):
+        return _unprobed(row)
+    if found == "encoded, not acted on":
+        return f"Shown in the backbone; {_behaviour(row)}. To test whether it is used, run `probe-kit intervene`."
+    return _nothing_shown(row) if found in ("absent", "not shown") else _CONCLUSIONS[found]
+
+
+def _unprobed(row: RetentionRow) -> str:
+    """Of behaviour alone; empty where the sentence has said all."""
+    if row.image_swap.used is not None or row.success.sr is None:
+        return ""
+    return "The policy acts on the answer." if knows(row) else f"{_capitalised(_behaviour(row))}."
+
+
+def _nothing_shown(row: RetentionRow) -> str:
+    """Of a backbone without signal: what is decided first, then what is open."""
+    absent, untested = row.backbone.verdict == "absent", row.backbone.exceeds["chance"] is None
+    behaviour = _behaviour(row)
+    backbone = "absent from the backbone" if absent else "not shown in the backbone"
+    parts = [backbone, behaviour] if absent or behaviour == _NOT_SHOWN else [behaviour, backbone]
+    said = "; ".join(filter(None, parts))
+    remedy = ""
+    if not absent:
+        remedy = f": {'train probes with permutations' if untested else _MORE_ITEMS}"
+    elif behaviour == _NOT_SHOWN:
+        remedy = f": {_MORE_ITEMS}"
+    return f"{_capitalised(said)}{remedy}."
+
+
+_NOT_SHOWN = "not shown that the policy acts on the answer"
+
+
+def _behaviour(row: RetentionRow) -> str:
+    """What a policy does that is not in the regime of knowledge, or does not follow; empty if it did not act."""
+    if row.image_swap.used is not None:
+        return "the action does not follow the pictures"
+    if row.success.sr is None:
+        return ""
+    failed = row.success.regime == Regime.FAILURE
+    return "the policy is right less often than guessing" if failed else _NOT_SHOWN
+
+
+def _is_probed(row: RetentionRow) -> bool:
+    return bool(row.backbone.exceeds)
+
+
+# -- answers and success rates ---------------------------------------------------------------------------------
+
+
+def _answered(row: RetentionRow) -> str:
+    return f"the VLM answers right in {_rate(row)}"
+
+
+def _rate(row: RetentionRow) -> str:
+    """A success rate with its interval and, where these alone would mislead, why it is in its regime."""
+    return f"{_whole(row.success.sr)} %{_range(row.success.ci)}{_regime_reason(row)}"
+
+
+def _regime_reason(row: RetentionRow) -> str:
+    """By which margin the regime decides, where the interval excludes one half and nothing is shown.
+
+    Also where the rate is above guessing and its interval is not, and why a failure is one.
+    """
+    found = row.success
+    if found.sr is None or found.regime in (None, Regime.KNOWLEDGE) or found.chance_margin is None:
+        return ""
+    points, reach = 100 * abs(found.sr - 0.5), f"the {100 * found.chance_margin:.1f} that guessing can reach"
+    side = "above" if found.sr > 0.5 else "below"
+    if found.regime == Regime.FAILURE:
+        return f", {points:.1f} points {side} one half, more than {reach} ({_failure(row)})"
+    low, high = found.ci or (None, None)
+    if low is not None and high is not None and not low <= 0.5 <= high:
+        return f", {points:.1f} points {side} one half, less than {reach}"
+    return ", which includes one half" if found.sr > 0.5 + found.chance_margin else ""
+
+
+def _failure(row: RetentionRow) -> str:
+    wrong, outside = row.success.share_wrong or 0.0, row.success.share_outside or 0.0
+    if outside >= wrong:
+        return f"{_whole(outside)} % {'unread' if is_vlm(row) else 'on neither picture'}"
+    return f"{_whole(wrong)} % {'name' if is_vlm(row) else 'on'} the other picture"
+
+
+# -- streams -------------------------------------------------------------------------------------------------
+
+_CONTROLS = {RANDOM_FEATURES: "random features", UNTRAINED: "the untrained network"}
+
+
+def _streams(row: RetentionRow) -> list[str]:
+    """What can be read in the backbone, and where the action is made. The first clause names the answer."""
+    action = f"the {row.run.action_name}"
+    if _is_probed(row) and row.backbone.score is None:
+        return ["the probes have no score: too few groups of items, or a fold with one side only"]
+    parts = [] if row.backbone.score is None else [_in_stream("the backbone", row.backbone, "the answer")]
+    if row.action.score is not None:
+        both = row.backbone.verdict == row.action.verdict == "shown"
+        what = "it" if parts else "the answer"
+        parts.append(
+            f"so does {action} ({_accuracy(row.action)})" if both else _in_stream(action, row.action, what)
+        )
+    return parts
+
+
+def _in_stream(name: str, part: StreamPart, what: str) -> str:
+    """One stream. what: how the answer is called there."""
+    score, most = f"{_whole(part.score)} %", f"{_whole(part.at_most)} %"
+    if part.verdict == "shown":
+        return f"{name} holds {what} ({_accuracy(part)})"
+    if part.verdict == "absent":
+        return f"{name} does not hold {what} ({score}, at most {most})"
+    if part.exceeds.get("chance") is None:
+        return f"whether {name} holds {what} was not tested against chance ({score}, could be up to {most})"
+    missed = [_CONTROLS.get(name, name) for name, better in part.exceeds.items() if better is False]
+    beyond = f" beyond {' and '.join(missed)}" if part.exceeds["chance"] else ""
+    return f"{name} is not shown to hold {what}{beyond} ({score}, could be up to {most})"
+
+
+def _accuracy(part: StreamPart) -> str:
+    return f"{_whole(part.score)} %{_range(part.ci)}"
+
+
+# -- behaviour -----------------------------------------------------------------------------------------------
+
+
+def _acted(row: RetentionRow) -> str:
+    """What the action does when the pictures are swapped, and where the cube ends."""
+    swap = _swapped(row)
+    if row.success.sr is None:
+        why = "the model did not act" if row.run.capture_only else "there is no success rate"
+        return f"{swap}; {why}" if swap else why
+    right = f"the cube ends on the correct picture in {_rate(row)}"
+    agrees = row.image_swap.response == "open" or (row.image_swap.response == "follows") == knows(row)
+    return f"{swap}, {'and' if agrees else 'but'} {right}" if swap else right
+
+
+def _swapped(row: RetentionRow) -> str:
+    swap = row.image_swap
+    low, high = (_whole(limit) for limit in swap.net_follow_rate_ci or (None, None))
+    followed = f"in {_whole(swap.follow_rate)} % of episodes"
+    if swap.response is None:
+        return ""
+    if swap.response == "follows":
+        return f"the action follows a swap of the pictures {followed} (net of reversals {low} to {high} %)"
+    if swap.response == "reverses":
+        reversed_ = f"in {_whole(swap.reversal_rate)} % of episodes"
+        return f"the action goes against the pictures, swapped or not, {reversed_}"
+    if swap.response == "does not follow":
+        return f"the action does not follow a swap of the pictures ({followed}, net of reversals at most {high} %)"
+    net = f"net of reversals {low} to {high} %"
+    return f"whether the action follows a swap of the pictures is open ({followed}, {net})"
+
+
+# -- text ---------------------------------------------------------------------------------------------------
+
+
+def _capitalised(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}"
+
+
+def _whole(value: float | None) -> str:
+    return percent(value, 0)
+
+
+def _range(limits: Limits | None) -> str:
+    """Limits of a share in words, with a comma before them."""
+    if limits is None or None in limits:
+        return ""
+    return f", {_whole(limits[0])} to {_whole(limits[1])}"

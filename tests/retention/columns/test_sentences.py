@@ -1,0 +1,332 @@
+"""The sentence about a category, over every combination of success rate, streams and effect of an image swap."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+from typing import Any, Literal
+
+import pytest
+
+from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
+from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
+from probe_kit.retention.columns.sentences import conclusion, describe_category, verdict
+from probe_kit.retention.rows.interventions import add_image_swap
+from probe_kit.retention.rows.parts import ActionPart, BackbonePart, RunInfo
+from probe_kit.retention.rows.row import RetentionRow
+
+RUN = RunInfo(
+    location="run", model="pi0-tiny", random_weights=False, weights_sha256=None, suite="suite@1", settings="r",
+    probes=None, action_stream="expert",
+)  # fmt: skip
+
+
+def rate(sr: float, low: float, high: float, regime: Regime, wrong: float = 0.0) -> SuccessRate:
+    return SuccessRate(
+        n_episodes=48, n_items=24, sr=sr, ci=(low, high), regime=regime, chance_margin=0.2,
+        share_wrong=wrong, share_outside=1 - sr - wrong,
+    )  # fmt: skip
+
+
+OPEN = Regime.NO_RELIABLE_KNOWLEDGE
+RATES = {
+    "knowledge": rate(0.94, 0.84, 1.0, Regime.KNOWLEDGE),
+    "guessing": rate(0.54, 0.34, 0.74, OPEN),
+    "little above": rate(0.66, 0.56, 0.76, OPEN),
+    "little below": rate(0.34, 0.24, 0.44, OPEN),
+    "wide": rate(0.75, 0.45, 0.95, OPEN),
+    "wrong": rate(0.1, 0.02, 0.25, Regime.FAILURE, wrong=0.8),
+    "misses": rate(0.1, 0.02, 0.25, Regime.FAILURE, wrong=0.1),
+    "none": SuccessRate(n_episodes=48, n_items=24),
+}
+
+
+def part(found: Literal["shown", "not shown", "absent"], score: float, most: float, **exceeds: bool | None) -> Any:
+    limits = (score - 0.1, min(1.0, score + 0.05))
+    found_: dict[str, Any] = {"score": score, "ci": limits, "at_most": most, "verdict": found}
+    return {**found_, "exceeds": {"chance": False, "random-features": None, "untrained": None, **exceeds}}
+
+
+PARTS: dict[str, dict[str, Any]] = {
+    "shown": part("shown", 0.98, 1.0, chance=True),
+    "at chance": part("not shown", 0.52, 0.78),
+    "no better than controls": part("not shown", 0.9, 0.97, **{"chance": True, "random-features": False}),
+    "no permutations": part("not shown", 0.9, 0.97, chance=None),
+    "absent": part("absent", 0.5, 0.62),
+    "no score": {"peak": 0.9, "exceeds": {"chance": True, "random-features": None, "untrained": None}},
+    "not probed": {},
+}
+
+
+def swap(follow: float, reversal: float, ci: tuple[float, float], p: float, reversal_p: float) -> ImageSwapEffect:
+    return ImageSwapEffect(
+        category="color", n_episodes=48, n_items=24, n_groups=12, follow_rate=follow, reversal_rate=reversal,
+        net_follow_rate=follow - reversal, net_follow_rate_ci=ci, follow_p=p, reversal_p=reversal_p,
+        median_displacement=0.1,
+    )  # fmt: skip
+
+
+FOLLOWS = swap(0.92, 0.02, (0.6, 1.0), 0.001, 1.0)
+SWAPS: dict[str, ImageSwapEffect | None] = {
+    "no swap": None,
+    "follows": FOLLOWS,
+    "reverses": swap(0.0, 0.9, (-1.0, -0.6), 1.0, 0.001),
+    "does not follow": swap(0.04, 0.02, (-0.1, 0.12), 0.6, 0.6),
+    "open": swap(0.2, 0.1, (-0.1, 0.42), 0.3, 0.9),
+}
+CONTROL = {"shape": replace(FOLLOWS, category="shape")}
+"""Another category that follows."""
+
+
+def combination(
+    rate_: str,
+    backbone: str,
+    action: str,
+    swapped: str,
+    control: bool = True,
+    located: tuple[str, ...] | None = None,
+) -> RetentionRow:
+    row = RetentionRow(
+        category="color", view="mean", run=replace(RUN, capture_only=rate_ == "none"), success=RATES[rate_],
+        backbone=BackbonePart(**PARTS[backbone]), action=ActionPart(**PARTS[action]),
+    )  # fmt: skip
+    own = SWAPS[swapped]
+    found = {} if own is None else {"color": own, **(CONTROL if control else {})}
+    return add_image_swap(row, found, {} if located is None else {"color": located}, {})
+
+
+def every_combination() -> Iterator[tuple[str, str, str, str, RetentionRow]]:
+    for rate_, backbone, action, swapped in product(RATES, PARTS, PARTS, SWAPS):
+        for control, located in ((True, None), (False, None), (True, ()), (True, ("backbone.02",))):
+            yield rate_, backbone, action, swapped, combination(rate_, backbone, action, swapped, control, located)
+
+
+ALL = list(every_combination())
+
+
+def test_no_combination_of_rate_streams_and_swap_lacks_a_word_or_a_number() -> None:
+    for *_, row in ALL:
+        text = describe_category(row)
+        assert text.endswith(".")
+        assert not re.search(r"None|–|nan|  |\.\.|;\.|: \.|\(\)|^; ", text), text
+
+
+def test_the_answer_is_named_before_a_pronoun_stands_for_it() -> None:
+    for *_, row in ALL:
+        text = describe_category(row)
+        named = text.find("the answer")
+        pronoun = re.search(r"\bhold(s)? it\b|\bso does\b", text)
+        assert pronoun is None or 0 <= named < pronoun.start(), text
+
+
+def test_each_effect_of_a_swap_has_its_own_words() -> None:
+    words = {
+        "follows": "the action follows a swap of the pictures in 92 % of episodes (net of reversals 60 to 100 %)",
+        "reverses": "the action goes against the pictures, swapped or not, in 90 % of episodes",
+        "does not follow": "the action does not follow a swap of the pictures (in 4 % of episodes, net of "
+        "reversals at most 12 %)",
+        "open": "whether the action follows a swap of the pictures is open (in 20 % of episodes, net of reversals "
+        "-10 to 42 %)",
+    }  # fmt: skip
+    for *_, swapped, row in ALL:
+        text = describe_category(row)
+        for name, said in words.items():
+            assert (said in text) == (name == swapped), f"{swapped}: {text}"
+        assert "does not follow" not in text or swapped == "does not follow", f"{swapped}: {text}"
+
+
+def test_use_is_concluded_from_a_swap_and_knowledge_never_beside_an_interval_that_includes_one_half() -> None:
+    for rate_, backbone, _, swapped, row in ALL:
+        text = conclusion(row)
+        if "The answer is used." in text:
+            assert (swapped, backbone) in (("follows", "shown"), ("follows", "no score"))
+        if "The policy acts on the answer" in text:
+            assert rate_ == "knowledge" or swapped == "follows", text
+        assert "probes did not find it" not in text or backbone != "not probed", text
+
+
+def test_a_rate_that_is_no_knowledge_beside_an_interval_without_one_half_says_by_which_margin() -> None:
+    said = {
+        "little above": "66 %, 56 to 76, 16.0 points above one half, less than the 20.0 that guessing can reach",
+        "little below": "34 %, 24 to 44, 16.0 points below one half, less than the 20.0 that guessing can reach",
+        "wide": "75 %, 45 to 95, which includes one half",
+        "wrong": "more than the 20.0 that guessing can reach (80 % on the other picture)",
+        "misses": "more than the 20.0 that guessing can reach (80 % on neither picture)",
+    }
+    for rate_, *_, row in ALL:
+        text = describe_category(row)
+        for name, words in said.items():
+            assert (words in text) == (name == rate_), f"{rate_}: {text}"
+
+
+def test_absence_is_said_of_a_bounded_backbone_only_and_more_items_are_asked_for_what_is_open_only() -> None:
+    for rate_, backbone, _, swapped, row in ALL:
+        text = conclusion(row)
+        assert ("bsent from the backbone" not in text) or backbone == "absent", text
+        if "more items would tell" in text:
+            guessed = RATES[rate_].regime == OPEN and swapped == "no swap"
+            assert backbone in ("at chance", "no better than controls") or swapped == "open" or guessed, text
+        assert ("train probes with permutations" in text) <= (backbone == "no permutations"), text
+
+
+@pytest.mark.parametrize(
+    ("parts", "sentence"),
+    [
+        (
+            ("knowledge", "shown", "shown", "follows"),
+            "(24 items): the backbone holds the answer (98 %, 88 to 100); so does the action expert (98 %, 88 to "
+            "100); the action follows a swap of the pictures in 92 % of episodes (net of reversals 60 to 100 %), "
+            "and the cube ends on the correct picture in 94 %, 84 to 100. The answer is used.",
+        ),
+        (
+            ("guessing", "shown", "absent", "does not follow"),
+            "(24 items): the backbone holds the answer (98 %, 88 to 100); the action expert does not hold it (50 "
+            "%, at most 62 %); the action does not follow a swap of the pictures (in 4 % of episodes, net of "
+            "reversals at most 12 %), and the cube ends on the correct picture in 54 %, 34 to 74. Shown in the "
+            "backbone, not used.",
+        ),
+        (
+            ("guessing", "at chance", "absent", "no swap"),
+            "(24 items): the backbone is not shown to hold the answer (52 %, could be up to 78 %); the action "
+            "expert does not hold it (50 %, at most 62 %); the cube ends on the correct picture in 54 %, 34 to 74"
+            ". Not shown in the backbone; not shown that the policy acts on the answer: more items would tell.",
+        ),
+    ],
+)
+def test_a_sentence_says_numbers_uncertainty_items_and_what_follows(parts: Any, sentence: str) -> None:
+    assert describe_category(combination(*parts)) == sentence
+
+
+CONCLUSIONS = """
+knowledge | shown | no swap | acted on
+Whether what is read is used was not tested: run `probe-kit intervene`.
+
+guessing | shown | no swap | encoded, not acted on
+Shown in the backbone; not shown that the policy acts on the answer. To test whether it is used, run
+`probe-kit intervene`.
+
+wrong | shown | no swap | encoded, not acted on
+Shown in the backbone; the policy is right less often than guessing. To test whether it is used, run
+`probe-kit intervene`.
+
+knowledge | at chance | no swap | acted on, not found
+The policy acts on the answer, and the probes did not find it.
+
+guessing | absent | no swap | absent
+Absent from the backbone; not shown that the policy acts on the answer: more items would tell.
+
+misses | absent | no swap | absent
+Absent from the backbone; the policy is right less often than guessing.
+
+misses | at chance | no swap | not shown
+The policy is right less often than guessing; not shown in the backbone: more items would tell.
+
+none | absent | no swap | absent
+Absent from the backbone.
+
+none | at chance | no swap | not shown
+Not shown in the backbone: more items would tell.
+
+none | no permutations | no swap | not shown
+Not shown in the backbone: train probes with permutations.
+
+none | shown | no swap | encoded
+Shown in the backbone.
+
+knowledge | not probed | no swap | acted on
+The policy acts on the answer. The backbone was not probed: run `probe-kit train`.
+
+misses | not probed | no swap | not shown
+The policy is right less often than guessing. The backbone was not probed: run `probe-kit train`.
+
+guessing | not probed | no swap | not shown
+Not shown that the policy acts on the answer. The backbone was not probed: run `probe-kit train`.
+
+none | not probed | no swap | not shown
+The backbone was not probed: run `probe-kit train`.
+
+guessing | shown | follows | used
+The answer is used.
+
+knowledge | absent | follows | acted on, not found
+The policy acts on the answer, and the probes did not find it.
+
+knowledge | not probed | follows | follows
+The backbone was not probed: run `probe-kit train`.
+
+wrong | shown | reverses | encoded, acted against
+Shown in the backbone; the policy acts against it.
+
+wrong | at chance | reverses | acted against, not found
+The policy acts against the answer, and the probes did not find it.
+
+wrong | not probed | reverses | acts against
+The backbone was not probed: run `probe-kit train`.
+
+guessing | shown | does not follow | encoded, unused
+Shown in the backbone, not used.
+
+knowledge | shown | does not follow | encoded, unused
+Shown in the backbone, not used. Yet the policy succeeds: actions after the first inference may follow.
+
+guessing | absent | does not follow | absent
+Absent from the backbone; the action does not follow the pictures.
+
+guessing | at chance | does not follow | not shown
+The action does not follow the pictures; not shown in the backbone: more items would tell.
+
+none | not probed | does not follow | does not follow
+The backbone was not probed: run `probe-kit train`.
+
+guessing | shown | open | inconclusive
+Whether the answer is used remains open: a net rate of 25 % would count, and more items would tell.
+"""
+"""Success rate, backbone, swap and verdict; then the conclusion."""
+
+
+def conclusions() -> Iterator[tuple[str, ...]]:
+    for record in CONCLUSIONS.strip().split("\n\n"):
+        names, _, said = record.partition("\n")
+        yield (*names.split(" | "), said.replace("\n", " "))
+
+
+@pytest.mark.parametrize(("rate_", "backbone", "swapped", "found", "said"), list(conclusions()))
+def test_each_verdict_has_its_conclusion(rate_: str, backbone: str, swapped: str, found: str, said: str) -> None:
+    row = combination(rate_, backbone, "not probed", swapped)
+    assert verdict(row) == found
+    assert conclusion(row) == said
+
+
+def test_an_open_verdict_says_what_is_missing_where_items_are_not() -> None:
+    nowhere = combination("knowledge", "shown", "shown", "follows", located=())
+    assert conclusion(nowhere) == (
+        "Whether the answer is used remains open: it follows, and no place that was tried carries half of that."
+    )
+    alone = combination("guessing", "shown", "shown", "does not follow", control=False)
+    assert conclusion(alone) == (
+        "Whether the answer is used remains open: no other category of the run follows, so following is not known "
+        "to show."
+    )
+
+
+def test_without_trajectories_nothing_is_said_of_acting_and_a_stored_swap_is() -> None:
+    row = combination("none", "shown", "shown", "follows")
+    assert "the action follows a swap of the pictures" in describe_category(row)
+    judged = replace(row, run=replace(RUN, capture_only=False))
+    assert "the model did not act" in describe_category(row)
+    assert "there is no success rate" in describe_category(judged)
+
+
+@pytest.mark.parametrize(
+    ("rate_", "said"),
+    [
+        ("knowledge", "the VLM answers right in 94 %, 84 to 100. The VLM knows the answer."),
+        ("wrong", "(80 % name the other picture). Not shown that the VLM knows the answer."),
+        ("misses", "(80 % unread). Not shown that the VLM knows the answer."),
+    ],
+)
+def test_a_vlm_is_described_as_answering(rate_: str, said: str) -> None:
+    asked = RetentionRow(category="color", view=None, run=replace(RUN, mode="answers"), success=RATES[rate_])
+    assert describe_category(asked).endswith(said)
+    acted = combination("knowledge", "shown", "shown", "no swap")
+    assert describe_category(acted, asked).startswith("(24 items): the VLM answers right in ")
