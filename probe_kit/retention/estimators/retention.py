@@ -48,24 +48,33 @@ class Peak:
     ties: int = 0
 
 
-@dataclass(frozen=True)
-class Retention:
-    """Retention of one category in one view.
+@dataclass(frozen=True, kw_only=True)
+class RetentionEstimate:
+    """Retention of two streams.
 
     value: cross-fitted score of the action's best site over that of the backbone's, both above one half (see
-    `probe_kit.statistics.estimates`); NaN where the backbone's is 0. interval: 95 %, Fieller's; without limits
-    where the backbone is not known well enough to divide by. published: the ratio of the peaks, as the paper has
-    it. defined: whether the backbone's best site is above chance (family-wise) and better than every control that
-    was run; `note` else says what is missing. streams: the scores; None with too few groups of items.
+    `probe_kit.statistics.estimates`); NaN where the backbone's is 0, or no score is defined. interval: 95 %,
+    Fieller's; without limits where the backbone is not known well enough to divide by. published: the ratio of the
+    peaks, as the paper has it. defined: whether the backbone's best site is above chance (family-wise) and better
+    than every control that was run; `note` else says what is missing.
     """
 
-    backbone: Peak
-    action: Peak
     value: float
     interval: Interval
     published: float
     defined: bool
     note: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Retention(RetentionEstimate):
+    """Retention of one category in one view.
+
+    backbone, action: the best sites. streams: the scores; None with too few groups of items.
+    """
+
+    backbone: Peak
+    action: Peak
     streams: StreamScores | None
 
 
@@ -81,6 +90,17 @@ def best_site(curve: ProbeCurve, stream: str, iterations: Iterations = "all") ->
     best = rows[np.argmax(right)]
     ties = int((right == right.max()).sum()) - 1
     return Peak(curve.sites[best], float(curve.correct[best].mean()), float(curve.p_fwe()[best]), ties)
+
+
+def stream_peaks(curve: ProbeCurve, iterations: Iterations = "all") -> dict[str, Peak]:
+    """The best sites of `backbone` and of the stream the action is made in, `action`, as far as they were probed.
+
+    Raises UsageError if the action's stream has no such iteration.
+    """
+    found = {BACKBONE: best_site(curve, BACKBONE)}
+    if curve.action_stream is not None:
+        found[ACTION] = best_site(curve, curve.action_stream, iterations)
+    return {name: peak for name, peak in found.items() if peak is not None}
 
 
 def curve_scores(curve: ProbeCurve, iterations: Iterations = "all", suite: str = "") -> StreamScores | None:
@@ -104,35 +124,42 @@ def measure_retention(
     compared on the same halves. exceeds: what the backbone's best site is better than, as `Controls.exceeds` says;
     chance alone by default. Raises UsageError if the action's stream has no such iteration.
     """
-    stream = curve.action_stream
-    backbone = best_site(curve, BACKBONE)
-    action = None if stream is None else best_site(curve, stream, iterations)
-    if backbone is None or action is None:
+    peaks = stream_peaks(curve, iterations)
+    if len(peaks) < 2:
         return None
+    backbone = peaks[BACKBONE]
     exceeds = exceeds or Controls().exceeds("", "", str(backbone.site), backbone.p_fwe)
     streams = curve_scores(curve, iterations, suite)
+    found = estimate_retention(peaks, streams, exceeds)
+    return Retention(backbone=backbone, action=peaks[ACTION], streams=streams, **vars(found))
+
+
+def estimate_retention(
+    peaks: Mapping[str, Peak], streams: StreamScores | None, exceeds: Exceeds, absent_below: float = ABSENT_BELOW
+) -> RetentionEstimate:
+    """Retention of the best sites `action` and `backbone`, with the streams' scores.
+
+    exceeds: what the backbone's best site is better than. absent_below: see `verdict`.
+    """
     if streams is None:
-        published = _ratio(action.accuracy - CHANCE, backbone.accuracy - CHANCE)
-        return Retention(backbone, action, nan, NO_LIMITS, published, False, NO_SCORES, None)
+        published = _published(peaks[ACTION].accuracy, peaks[BACKBONE].accuracy)
+        return RetentionEstimate(value=nan, interval=NO_LIMITS, published=published, defined=False, note=NO_SCORES)
     found: Ratio = retention(streams.scores)
-    return Retention(
-        backbone=backbone,
-        action=action,
+    return RetentionEstimate(
         value=found.value,
         interval=found.interval,
-        published=published_ratio(streams),
+        published=_published(streams.peak(ACTION), streams.peak(BACKBONE)),
         defined=has_signal(exceeds),
-        note=missing_signal(exceeds, streams.at_most),
-        streams=streams,
+        note=_missing_signal(exceeds, streams.at_most, absent_below),
     )
 
 
-def published_ratio(streams: StreamScores) -> float:
-    """The paper's ratio, of the accuracies of the best sites above one half."""
-    return _ratio(streams.peak(ACTION) - CHANCE, streams.peak(BACKBONE) - CHANCE)
+def _published(action: float, backbone: float) -> float:
+    """The paper's ratio, of the accuracies of the best sites above one half; NaN where the backbone's is 0."""
+    return nan if backbone == CHANCE else float((action - CHANCE) / (backbone - CHANCE))
 
 
-def missing_signal(exceeds: Exceeds, at_most: Mapping[str, float], absent_below: float = ABSENT_BELOW) -> str:
+def _missing_signal(exceeds: Exceeds, at_most: Mapping[str, float], absent_below: float) -> str:
     """Why there is nothing to retain; empty where the backbone's signal is shown."""
     if exceeds["chance"] is None:
         return "n/a (no permutations)"
@@ -163,7 +190,3 @@ def stream_rows(curve: ProbeCurve, stream: str, iterations: Iterations) -> NDArr
 def _action_rows(curve: ProbeCurve, iterations: Iterations) -> NDArray[np.intp]:
     stream = curve.action_stream
     return np.empty(0, np.intp) if stream is None else stream_rows(curve, stream, iterations)
-
-
-def _ratio(numerator: float, denominator: float) -> float:
-    return nan if denominator == 0 else float(numerator / denominator)

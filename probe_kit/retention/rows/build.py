@@ -19,15 +19,14 @@ from probe_kit.retention.behaviour.success_rate import (
 )
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.retention import (
-    NO_SCORES,
     Iterations,
     Peak,
     best_site,
     curve_scores,
-    missing_signal,
-    published_ratio,
+    estimate_retention,
+    stream_peaks,
 )
-from probe_kit.retention.estimators.stream_scores import RowEstimates, StreamScores, limits
+from probe_kit.retention.estimators.stream_scores import ACTION, BACKBONE, RowEstimates, StreamScores, limits
 from probe_kit.retention.rows.interventions import add_image_swap
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores, RunUnderRule
 from probe_kit.retention.rows.parts import (
@@ -39,10 +38,9 @@ from probe_kit.retention.rows.parts import (
     RunInfo,
 )
 from probe_kit.retention.rows.row import RetentionRow
-from probe_kit.statistics.estimates.retention import retention
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, verdict
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.results.control_scores import Controls, UntrainedScore, has_signal
+from probe_kit.train.results.control_scores import Controls, Exceeds, UntrainedScore, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
@@ -139,8 +137,12 @@ def _with_probes(
         note = f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
         return replace(row, retention=RetentionPart(note=note)), None
     streams = curve_scores(curve, settings.iterations, run.suite)
-    peaks = _peaks(curve, settings.iterations)
-    probed = _ProbedCategory(results.controls, row.category, row.view, curve, peaks, streams, settings)
+    peaks = stream_peaks(curve, settings.iterations)
+    exceeds = {
+        name: results.controls.exceeds(row.category, row.view, str(peak.site), peak.p_fwe)
+        for name, peak in peaks.items()
+    }
+    probed = _ProbedCategory(results.controls, row.category, row.view, curve, peaks, exceeds, streams, settings)
     row = replace(
         row,
         backbone=probed.backbone(),
@@ -196,37 +198,30 @@ def _no_success(episodes: "pd.DataFrame", heard: bool) -> SuccessRate:
     return SuccessRate(n_episodes=len(episodes), n_items=int(episodes["item_id"].nunique()), reason=reason)
 
 
-def _peaks(curve: ProbeCurve, iterations: Iterations) -> dict[str, Peak]:
-    found = {"backbone": best_site(curve, "backbone")}
-    if curve.action_stream is not None:
-        found["action"] = best_site(curve, curve.action_stream, iterations)
-    return {name: peak for name, peak in found.items() if peak is not None}
-
-
 @dataclass(frozen=True)
 class _ProbedCategory:
-    """The probes of one category in one view: their best sites, `backbone` and `action`, and their scores."""
+    """The probes of one category in one view.
+
+    By stream, `backbone` and `action`: the best sites, and what these are better than. streams: the scores.
+    """
 
     controls_run: Controls
     category: str
     view: str
     curve: ProbeCurve
     peaks: dict[str, Peak]
+    exceeds: dict[str, Exceeds]
     streams: StreamScores | None
     settings: RowSettings
 
-    def exceeds(self, peak: Peak) -> dict[str, bool | None]:
-        """Which controls a best site is better than."""
-        return self.controls_run.exceeds(self.category, self.view, str(peak.site), peak.p_fwe)
-
     def backbone(self) -> BackbonePart:
         """Of the backbone's best site."""
-        peak = self.peaks.get("backbone")
-        return BackbonePart() if peak is None else BackbonePart(**self._part("backbone", peak))
+        peak = self.peaks.get(BACKBONE)
+        return BackbonePart() if peak is None else BackbonePart(**self._part(BACKBONE, peak))
 
     def action(self) -> ActionPart:
         """Of the best site where the action is made."""
-        peak = self.peaks.get("action")
+        peak = self.peaks.get(ACTION)
         if peak is None:
             return ActionPart()
         first = self._first_iteration(peak)
@@ -234,12 +229,12 @@ class _ProbedCategory:
             iteration=peak.site.iteration,
             first_peak=None if first is None else first.accuracy,
             first_layer=None if first is None else first.site.layer,
-            **self._part("action", peak),
+            **self._part(ACTION, peak),
         )
 
     def _part(self, name: str, peak: Peak) -> dict[str, Any]:
         untrained, scored = self._untrained(peak.site.stream), self.streams
-        exceeds = self.exceeds(peak)
+        exceeds = self.exceeds[name]
         most = None if scored is None else scored.at_most[name]
         return {
             "score": None if scored is None else scored.accuracy(name),
@@ -262,22 +257,21 @@ class _ProbedCategory:
         """Of both streams."""
         if len(self.peaks) < 2:
             return RetentionPart(note="n/a (one stream only)")
-        if self.streams is None:
-            return RetentionPart(note=NO_SCORES)
-        found, exceeds = retention(self.streams.scores), self.exceeds(self.peaks["backbone"])
+        backbone = self.exceeds[BACKBONE]
+        found = estimate_retention(self.peaks, self.streams, backbone, self.settings.absent_below)
         return RetentionPart(
             value=_number(found.value),
             ci=limits(found.interval),
-            published=_number(published_ratio(self.streams)),
-            defined=has_signal(exceeds),
-            note=missing_signal(exceeds, self.streams.at_most, self.settings.absent_below),
+            published=_number(found.published),
+            defined=found.defined,
+            note=found.note,
         )
 
     def controls_of(self, success: SuccessRate) -> ControlScores:
         """What the best sites are compared with."""
         baselines = self.controls_run.of_category(self.category)
         untrained = [self._untrained(peak.site.stream) for peak in self.peaks.values()]
-        score = None if self.streams is None or "backbone" not in self.peaks else self.streams.accuracy("backbone")
+        score = None if self.streams is None or BACKBONE not in self.peaks else self.streams.accuracy(BACKBONE)
         return ControlScores(
             n_groups=self.curve.n_groups,
             missing=missing_episodes(self.curve),

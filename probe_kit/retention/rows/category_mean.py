@@ -7,7 +7,15 @@ from statistics import fmean
 from typing import Any
 
 from probe_kit.retention.behaviour.success_rate import SuccessRate, normalised_score
-from probe_kit.retention.estimators.stream_scores import Limits, Rate, RowEstimates, StreamScores, limits
+from probe_kit.retention.estimators.stream_scores import (
+    ACTION,
+    BACKBONE,
+    Limits,
+    Rate,
+    RowEstimates,
+    StreamScores,
+    limits,
+)
 from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores
 from probe_kit.retention.rows.parts import ActionPart, BackbonePart, ControlScores, RetentionPart, SwapEffect
@@ -38,8 +46,8 @@ def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> Rete
         success=_success(rows, estimates, means["success"]),
         rules=_rules(rows, estimates, means["rules"]),
         answers=replace(first.answers, **means["answers"]),
-        backbone=BackbonePart(ci=_accuracy_limits(probed, "backbone"), **means["backbone"]),
-        action=ActionPart(ci=_accuracy_limits(probed, "action"), **means["action"]),
+        backbone=BackbonePart(ci=_accuracy_limits(probed, BACKBONE), **means["backbone"]),
+        action=ActionPart(ci=_accuracy_limits(probed, ACTION), **means["action"]),
         retention=_retention(rows, probed),
         controls=ControlScores(
             baselines=_mean_by_key([row.controls.baselines for row in rows]),

@@ -11,7 +11,7 @@ from probe_kit.errors import UsageError
 from probe_kit.statistics.fieller import Interval
 
 NO_LIMITS = Interval(-inf, inf)
-_NOTHING = 1e-12
+NEGLIGIBLE_VARIANCE = 1e-12
 """A variance below this is the rounding of 0."""
 
 
@@ -65,7 +65,7 @@ def not_surer(covariance: float, variances: tuple[float, float], n_groups: int, 
 def correlation_of(covariance: float, variances: tuple[float, float]) -> float:
     """Correlation of two estimates; 0 where one of them does not vary, or is of a single group."""
     scale = sqrt(variances[0] * variances[1]) if all(map(isfinite, variances)) else 0.0
-    return max(-1.0, min(1.0, covariance / scale)) if scale > _NOTHING else 0.0
+    return max(-1.0, min(1.0, covariance / scale)) if scale > NEGLIGIBLE_VARIANCE else 0.0
 
 
 def _combined(first: float, second: float, correlation: float) -> float:

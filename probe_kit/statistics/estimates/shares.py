@@ -6,13 +6,17 @@ from survey data”, Survey Methodology 24 (1998).
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.statistics.estimates.mover import correlation_of, difference_interval, not_surer
+from probe_kit.statistics.estimates.mover import (
+    NEGLIGIBLE_VARIANCE,
+    correlation_of,
+    difference_interval,
+    not_surer,
+)
 from probe_kit.statistics.fieller import Interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 
@@ -20,8 +24,6 @@ Matrix = NDArray[np.float64]
 
 TAIL = SIGNIFICANCE / 2
 """Chance of either side of a two-sided 95 % interval."""
-_NOTHING = 1e-12
-"""A variance below this is the rounding of 0."""
 
 
 @dataclass(frozen=True)
@@ -94,10 +96,7 @@ class Share:
 
     def correlation(self, other: "Share") -> float:
         """Correlation of two shares; 0 where the groups are not the same, or one of them does not vary."""
-        if min(self.groups.size, other.groups.size) == 1:
-            return 0.0
-        scale = sqrt(self.variance * other.variance)
-        return float(np.clip(self.covariance(other) / scale, -1, 1)) if scale > _NOTHING else 0.0
+        return correlation_of(self.covariance(other), (self.variance, other.variance))
 
     def difference(self, other: "Share") -> Interval:
         """95 % interval of this share minus another (MOVER), paired where both are of the same groups.
@@ -156,7 +155,7 @@ def share_interval(
     from scipy.special import betaincinv, stdtrit  # type: ignore[import-untyped]
 
     s, v, agree = np.broadcast_arrays(np.asarray(share, np.float64).clip(0, 1), variance, never_wrong)
-    agree = agree | (v <= _NOTHING) | (s <= 0) | (s >= 1)
+    agree = agree | (v <= NEGLIGIBLE_VARIANCE) | (s <= 0) | (s >= 1)
     counting = np.minimum(s * (1 - s) / np.where(agree, 1.0, v), n_episodes)
     lost = stdtrit(max(n_episodes - 1, 1), 1 - tail) / stdtrit(df, 1 - tail)
     n = np.where(agree, n_groups, counting * lost**2)
