@@ -23,6 +23,7 @@ def ask(
     suite: common.SuiteFolder = None,
     categories: common.Categories = None,
     items: own.EvenItems = None,
+    protocol: own.AskProtocol = None,
     scene: common.Scene = None,
     seed: common.Seed = 0,
     device: common.Device = "cpu",
@@ -45,9 +46,9 @@ def ask(
 ) -> None:
     """Ask a vision-language model about the first frame of every episode.
 
-    Makes one run per prompt and picture size. Use the --suite, --scene and --seed of the policy runs to compare
-    with. Every question is asked in both orders of the options. Answers are read from the text and from the logits
-    of the options. Then compare with policies: `probe-kit retention ASKED… ACTED…` or `probe-kit stages`.
+    Makes one run per prompt and picture size. Use the --suite, --protocol, --scene and --seed of the policy runs
+    to compare with. Every question is asked in both orders of the options. Answers are read from the text and from
+    the logits of the options. Compare with policies by `probe-kit retention ASKED… ACTED…` or `probe-kit stages`.
 
     The same command resumes interrupted runs. Other settings in the same folder are an error.
     """

@@ -112,6 +112,10 @@ Protocol = Annotated[
         help="Use scene, checkpoint and options of a published protocol. Your options take precedence.",
     ),
 ]
+AskProtocol = Annotated[
+    ProtocolName | None,
+    typer.Option("--protocol", help="Use the scene of a published protocol. --scene takes precedence."),
+]
 Label = Annotated[
     str | None,
     typer.Option(

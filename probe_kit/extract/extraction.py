@@ -27,7 +27,7 @@ from probe_kit.extract.workers.ray import run_on_ray
 from probe_kit.extract.workers.scheduler import Scheduler
 
 if TYPE_CHECKING:
-    from probe_kit.hooks import AnswerModel
+    from probe_kit.hooks import AnswerModel, Policy
 
 Progress = Callable[[int, int, str], None]
 # If this many episodes were given up and none succeeded, something is wrong with all of them.
@@ -111,12 +111,16 @@ class Extraction(Prepared):
 
 
 def prepare(
-    settings: RunSettings, out: Path | str | Location | None = None, answer_model: "AnswerModel | None" = None
+    settings: RunSettings,
+    out: Path | str | Location | None = None,
+    answer_model: "AnswerModel | None" = None,
+    policy: "Policy | None" = None,
 ) -> Extraction:
     """Find the suite, load the model and plan the episodes.
 
     out: where it will be written, if that is known; what is wrong there is then said before the model is loaded.
-    answer_model: the model of these `AskSettings`, if it is loaded already.
+    answer_model: the model of these `AskSettings`, if it is loaded already. policy: that of these
+    `ExtractSettings`; several runs can share one. Workers load their own.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     settings = as_protocol(settings)
@@ -124,9 +128,9 @@ def prepare(
     if settings.workers or settings.ray:
         # This process only plans; the GPUs belong to the workers.
         here = replace(settings, device="cpu", calibrate=False)  # each worker calibrates on its own device
-        planned = load(here, location=location, answer_model=answer_model)
+        planned = load(here, location=location, answer_model=answer_model, policy=policy)
         return Extraction(settings, planned.plan, planned.card, None)
-    prepared = load(settings, location=location, answer_model=answer_model)
+    prepared = load(settings, location=location, answer_model=answer_model, policy=policy)
     return Extraction(prepared.settings, prepared.plan, prepared.card, prepared.controller, prepared.calibration)
 
 

@@ -23,7 +23,7 @@ from probe_kit.hashing import sha256_json
 from probe_kit.suite import Suite, default_suite, load_suite
 
 if TYPE_CHECKING:
-    from probe_kit.hooks import AnswerModel
+    from probe_kit.hooks import AnswerModel, Policy
 
 
 @dataclass(frozen=True)
@@ -79,15 +79,18 @@ def load(
     rehearsed: bool = False,
     location: Location | None = None,
     answer_model: "AnswerModel | None" = None,
+    policy: "Policy | None" = None,
 ) -> Prepared:
     """Find the suite, build the scene once unless that was done, load the model and plan the episodes.
 
     location: where it will be written, if that is known, so that it is looked at before the model is loaded.
     answer_model: the model of these `AskSettings`, if it is loaded already; it may be one of your own.
-    Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
+    policy: the model of these `ExtractSettings`, if it is loaded already; several runs then share it.
+    Raises UsageError for a policy of another family or with other weights than the settings name, and what these
+    raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     settings = as_protocol(settings)
-    suite = check_run(settings, location, loaded=answer_model is not None)
+    suite = check_run(settings, location, loaded=not (answer_model is None and policy is None))
     if not rehearsed:
         run_preflight(settings.scene, plan_episodes(suite, settings.seed))
     wordings = settings.asked_wordings
@@ -97,7 +100,7 @@ def load(
     if isinstance(settings, AskSettings):
         controller: ActingController | AnswerController = _asking(settings, suite, answer_model)
     else:
-        controller = _acting(settings, instructions_of(asked))
+        controller = _acting(settings, instructions_of(asked), policy)
     with_tokens = settings.tokens == "all"
     plan = make_plan(suite, controller.streams, settings.seed, settings.stored_calls, with_tokens, wordings)
     if settings.calibrate and isinstance(controller, PolicyController):
@@ -159,21 +162,13 @@ def load_answer_model(settings: AskSettings) -> "AnswerModel":
     return model
 
 
-def _acting(settings: RunSettings, instructions: Sequence[str]) -> ActingController:
+def _acting(settings: RunSettings, instructions: Sequence[str], loaded: "Policy | None") -> ActingController:
     assert isinstance(settings, ExtractSettings)
     if settings.model in SCRIPTED:
         return ScriptedController(settings.model)
-    from probe_kit.hooks import load_policy
-
-    policy = load_policy(
-        settings.model,
-        settings.checkpoint,
-        settings.device,
-        settings.dtype,
-        settings.random_weights,
-        settings.weights_seed,
-        **settings.options,
-    )
+    if loaded is not None:
+        _check_loaded(settings, loaded)
+    policy = load_acting_policy(settings) if loaded is None else loaded
     examples = example_observations(settings.scene, instructions)
     check_embodiment(settings, policy)
     check_unfit(policy.card, settings.batch, examples[0])
@@ -190,3 +185,36 @@ def _acting(settings: RunSettings, instructions: Sequence[str]) -> ActingControl
         settings.capture_only,
         settings.inference_limit,
     )
+
+
+def load_acting_policy(settings: ExtractSettings) -> "Policy":
+    """The policy that acts, with what its protocol decides. Raises what `load_policy` raises."""
+    from probe_kit.hooks import load_policy
+
+    chosen = settings.followed()
+    return load_policy(
+        chosen.model,
+        chosen.checkpoint,
+        chosen.device,
+        chosen.dtype,
+        chosen.random_weights,
+        chosen.weights_seed,
+        **chosen.options,
+    )
+
+
+def _check_loaded(settings: ExtractSettings, policy: "Policy") -> None:
+    """Raise UsageError for a loaded policy that the settings do not describe."""
+    from probe_kit.hooks.registry import known_families
+
+    card = policy.card
+    said: dict[str, tuple[object, object]] = {"random_weights": (settings.random_weights, card.random_weights)}
+    if card.random_weights:
+        said["weights_seed"] = settings.weights_seed, card.weights_seed
+    if card.family in known_families():
+        said["model"] = settings.model, card.family
+    wrong = [f"{name} {there!r} instead of {asked!r}" for name, (asked, there) in said.items() if asked != there]
+    if wrong:
+        raise UsageError(
+            f"the loaded policy has {', '.join(wrong)}. Give the policy of these settings, or leave it out"
+        )

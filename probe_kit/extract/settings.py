@@ -292,7 +292,8 @@ class AskSettings(RunSettings):
 
     The size of the picture is that of `scene`. tokens may also be `none`, which stores no activations.
     picture: `frame` shows the first frame of the episode, `side-by-side` its two pictures on grey, `none` nothing.
-    query: the object asked for, see `QUERIES`.
+    query: the object asked for, see `QUERIES`. protocol: a published one, whose scene takes the place of the
+    default one; it decides nothing else of a question.
     Raises UsageError for an absent object with a prompt that takes no no.
     """
 
@@ -300,6 +301,7 @@ class AskSettings(RunSettings):
     prompt: Template = P1
     picture: str = "frame"
     query: Query = "target"
+    protocol: str | None = None
 
     tokens_allowed: ClassVar[tuple[str, ...]] = get_args(AskTokens)
 
@@ -338,6 +340,10 @@ class AskSettings(RunSettings):
                 f"{', '.join(twice)} is asked for twice; give every prompt and size once, and files own names"
             )
         return every
+
+    @property
+    def _protocol(self) -> str | None:
+        return self.protocol
 
     @property
     def short_name(self) -> str:

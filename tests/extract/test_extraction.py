@@ -21,6 +21,7 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
+from probe_kit.extract.prepared import load_acting_policy
 from probe_kit.hooks import Site, Tap
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.suite import Suite, build_suite
@@ -159,6 +160,23 @@ def test_seeds_do_not_depend_on_which_other_episodes_are_run(small_suite: Suite)
     part = prepare(ExtractSettings("expert", suite=small_suite.folder, categories=("shape",))).plan.episodes
     seeds = {planned.episode.episode_id: planned.policy_seed for planned in whole}
     assert all(seeds[planned.episode.episode_id] == planned.policy_seed for planned in part)
+
+
+def test_runs_that_share_a_policy_hold_the_same_bytes_as_runs_that_load_their_own(
+    two_items: Suite, tmp_path: Path
+) -> None:
+    settings = ExtractSettings("pi0-tiny", random_weights=True, suite=two_items.folder, scene=SHORT)
+    policy = load_acting_policy(settings)
+    shared = [
+        prepare(replace(settings, seed=seed), policy=policy).run(tmp_path / f"shared-{seed}") for seed in (1, 0)
+    ]
+    alone = prepare(settings).run(tmp_path / "alone")
+    assert (alone.stamp, alone.settings_sha256) == (shared[1].stamp, shared[1].settings_sha256)
+    assert shared[0].stamp != alone.stamp
+    with pytest.raises(UsageError, match="the loaded policy has random_weights True instead of False"):
+        prepare(replace(settings, random_weights=False), policy=policy)
+    with pytest.raises(UsageError, match="model 'pi0-tiny' instead of 'pi0-tiny-state'"):
+        prepare(replace(settings, model="pi0-tiny-state"), policy=policy)
 
 
 def test_the_certificate_names_weights_fires_and_versions(recorded_run) -> None:

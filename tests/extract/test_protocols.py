@@ -8,7 +8,7 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
-from probe_kit.extract import ExtractSettings, extract_run, prepare
+from probe_kit.extract import AskSettings, ExtractSettings, extract_run, prepare
 from probe_kit.extract.protocols import check_protocol, deviations, protocol_identity, protocol_scene
 from probe_kit.extract.settings import run_label
 from probe_kit.hooks.contract.options import check_options
@@ -93,6 +93,19 @@ def test_another_scene_that_is_asked_for_is_kept_and_reported() -> None:
     assert settings.scene == SceneSpec()
     assert deviations(settings)["scene arm"] == ["widowx", "panda"]
     assert protocol_scene(None) == SceneSpec()
+
+
+def test_a_vlm_is_asked_in_the_scene_of_the_protocol_or_the_one_that_is_named() -> None:
+    size = {"picture_size": (224, 224)}
+    asked = AskSettings.from_options(model="vlm-tiny", protocol="act2answer", **size)
+    named = AskSettings.from_options(model="vlm-tiny", scene="act2answer", **size)
+    assert asked.scene == named.scene == protocol_scene("act2answer", **size)
+    assert asked.choices() == named.choices()
+    both = AskSettings.from_options(model="vlm-tiny", protocol="act2answer", scene="frontal", **size)
+    assert both.scene == protocol_scene(None, "frontal", **size)
+    assert AskSettings("vlm-tiny", protocol="act2answer").scene == protocol_scene("act2answer")
+    with pytest.raises(UsageError, match="unknown protocol 'act3answer'"):
+        AskSettings("vlm-tiny", protocol="act3answer")
 
 
 def test_how_a_protocol_differs_from_the_default_is_in_the_run() -> None:
