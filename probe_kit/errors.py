@@ -167,6 +167,12 @@ class RunDamagedError(ProbeKitError):
     """Stored bytes are missing or differ from what was committed."""
 
 
+class ActivationsLeftOutError(ProbeKitError):
+    """A run is a copy without activations, and they were asked for."""
+
+    exit_code = 3
+
+
 class OtherFramesError(ProbeKitError):
     """Two runs did not begin with the same frames, or one of them does not say what its frames were."""
 

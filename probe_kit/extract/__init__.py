@@ -7,6 +7,7 @@ from probe_kit._system.lazy import lazy_names
 if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction, ask_run, extract_run, prepare, prepare_asks
     from probe_kit.extract.settings import AskSettings, ExtractSettings
+    from probe_kit.extract.store.copying import copy_run
     from probe_kit.extract.store.export import export_run
     from probe_kit.extract.store.integrity.audit import Audit, verify_run
     from probe_kit.extract.store.label import label_run
@@ -25,6 +26,7 @@ __all__ = [
     "Location",
     "Run",
     "ask_run",
+    "copy_run",
     "export_run",
     "extract_run",
     "label_run",
@@ -43,6 +45,7 @@ __getattr__, __dir__ = lazy_names(
         "AskSettings": "settings",
         "ExtractSettings": "settings",
         "Extraction": "extraction",
+        "copy_run": "store.copying",
         "export_run": "store.export",
         "ask_run": "extraction",
         "extract_run": "extraction",

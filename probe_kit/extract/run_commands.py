@@ -1,4 +1,4 @@
-"""`probe-kit run` and `probe-kit export`: inspect, verify, seal and export runs."""
+"""`probe-kit run` and `probe-kit export`: inspect, verify, seal, label, copy and export runs."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -37,6 +37,8 @@ def verify(
                 "`probe-kit extract` continues it",
                 soft_wrap=True,
             )
+        if found.left_out:
+            out.print(f"a copy without activations: {', '.join(found.left_out)}", soft_wrap=True)
         for stray in found.strays:
             out.print(f"belongs to no part of the run: {stray}", highlight=False, markup=False, soft_wrap=True)
         for problem in found.problems:
@@ -63,6 +65,20 @@ def label(
 
     label_run(run, text)
     out.print(f"{run}: {text}", markup=False, highlight=False, soft_wrap=True)
+
+
+@app.command("copy")
+def copy(
+    run: RunFolder,
+    out_folder: Annotated[str, typer.Argument(metavar="OUT", help="Folder or URL for the copy.")],
+    pictures: Annotated[bool, typer.Option("--pictures", help="Copy frames and videos too.")] = False,
+    partial: Partial = False,
+) -> None:
+    """Copy a run without its activations: outcomes, probes, interventions and certificates."""
+    from probe_kit.extract import copy_run
+
+    with err.status("copying"):
+        out.print(str(copy_run(run, out_folder, pictures, partial).location), soft_wrap=True)
 
 
 def export(

@@ -483,9 +483,12 @@ class Run:
 
         NaN in the rows of episodes that ended before inference `call`; see `reached`.
 
-        Raises UnknownSiteError, or RunDamagedError if stored bytes are missing or fail their checksum.
+        Raises UnknownSiteError, RunDamagedError if stored bytes are missing or fail their checksum, or
+        ActivationsLeftOutError in a copy without activations.
         """
         stored = self._check(site, call)
+        if self.columns is None and f"{site.stream}/pooled" in self.root.left_out:
+            self.root.refuse_left_out(f"there is no column of {site}")
         view = resolve_view(view, stored.views)
         if view not in stored.views:
             raise UnknownSiteError(f"no view {view!r} of {site.stream}; stored: {', '.join(stored.views)}")
@@ -514,7 +517,12 @@ class Run:
         )
 
     def rows(self, stream: str, kind: Literal["pooled", "tokens"] = "pooled") -> Rows:
-        """The stored rows of the committed episodes: all that was captured in one episode at a time."""
+        """The stored rows of the committed episodes: all that was captured in one episode at a time.
+
+        Raises ActivationsLeftOutError in a copy without activations.
+        """
+        if f"{stream}/{kind}" in self.root.left_out:
+            self.root.refuse_left_out(f"there are no {kind} of {stream}")
         return Rows(open_array(self.data, f"{stream}/{kind}"), self._numbers)
 
     @property

@@ -38,6 +38,8 @@ def seal(path: Path | str | Location) -> bool:
 def _seal(run: Run) -> bool:
     if not run.streams or run.episodes.empty:
         return False
+    if run.root.left_out:
+        run.root.refuse_left_out("there is nothing to seal")
     if run.sealed:
         _remove_former_seals(run)
         return False

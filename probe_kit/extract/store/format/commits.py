@@ -16,6 +16,7 @@ from probe_kit.extract.store.format.hashes import (
     read_record,
     read_sums,
 )
+from probe_kit.extract.store.format.left_out import is_left_out
 from probe_kit.extract.store.format.root import Root
 from probe_kit.extract.store.format.stored_words import in_current_words
 from probe_kit.extract.store.locations.location import Location
@@ -74,7 +75,7 @@ def read_commits(root: Root) -> dict[int, Commit]:
     for number, commit in commits.items():
         for key, (length, *_) in commit["objects"].items():
             problem = wrong_size(sizes, key, length)
-            if problem:
+            if problem and not is_left_out(key, root.left_out):
                 raise RunDamagedError(
                     f"{location}/{DATA}/{key} of episode {commit['episode_id']} {problem}. {redo(number)}"
                 )

@@ -7,9 +7,14 @@ the run's identity: commits name it, so that none counts in another run.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NoReturn
 
-from probe_kit.errors import RunDamagedError, RunNotFoundError, SettingsMismatchError
+from probe_kit.errors import (
+    ActivationsLeftOutError,
+    RunDamagedError,
+    RunNotFoundError,
+    SettingsMismatchError,
+)
 from probe_kit.extract.run_layout import (
     DATA,
     PLAN_FILE,
@@ -29,6 +34,7 @@ from probe_kit.extract.store.format.hashes import (
     read_record,
     read_sums,
 )
+from probe_kit.extract.store.format.left_out import read_left_out
 from probe_kit.extract.store.format.stored_words import in_current_words
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.locations.summary import what_to_open
@@ -68,13 +74,30 @@ class Root:
         return int(self.card["schema_version"])
 
     def check_continuable(self) -> None:
-        """Raise SettingsMismatchError unless this version writes runs of this schema."""
+        """Raise SettingsMismatchError unless this version writes runs of this schema.
+
+        Raises ActivationsLeftOutError for a copy without activations.
+        """
+        if self.left_out:
+            self.refuse_left_out("nothing can be added to it")
         if self.schema != SCHEMA_VERSION:
             raise SettingsMismatchError(
                 f"{self.location} holds a run of schema {self.schema}, which an earlier version of probe_kit "
                 f"wrote; this one writes schema {SCHEMA_VERSION} only. The run can be read, probed and "
                 "compared, but not continued. Choose another --out, or finish it with the version that began it"
             )
+
+    @cached_property
+    def left_out(self) -> frozenset[str]:
+        """The arrays that this run, if it is such a copy, was copied without. Raises RunDamagedError."""
+        return read_left_out(self.location, self.identity)
+
+    def refuse_left_out(self, why: str) -> NoReturn:
+        """Raise ActivationsLeftOutError. why: what is not possible, in words."""
+        raise ActivationsLeftOutError(
+            f"{self.location} is a copy without its activations ({', '.join(sorted(self.left_out))}): {why}. Use "
+            "the run that it was copied from"
+        )
 
     def read(self, key: str) -> bytes:
         """An object that belongs to every run. Raises RunDamagedError if it is missing or was changed."""

@@ -21,6 +21,7 @@ from probe_kit.extract.store.format.commits import (
     stamp_of,
     wrong_size,
 )
+from probe_kit.extract.store.format.left_out import is_left_out
 from probe_kit.extract.store.format.root import RESTORE, Root, read_root
 from probe_kit.extract.store.integrity.deep import content_problems
 from probe_kit.extract.store.integrity.orphans import stray_keys
@@ -37,7 +38,7 @@ class Audit:
 
     committed, planned: episodes. problems: one sentence each. sealed: whether columns belong to these commits.
     deep: whether every byte was read, not only sizes. strays: objects that belong to no part of the run and that
-    nothing reads, such as copies made by hand.
+    nothing reads, such as copies made by hand. left_out: arrays that the run, a copy, was made without.
     """
 
     path: str
@@ -48,6 +49,7 @@ class Audit:
     deep: bool
     problems: tuple[str, ...]
     strays: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -83,6 +85,7 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
     problems += picture_problems(location, commits)
     problems += seconds_problems(root, commits)
     problems += _caught(partial(read_label, root))
+    problems += _caught(lambda: root.left_out)
     problems += _provenance_problems(root, commits)
     if commits:
         problems += _caught(partial(read_certificate, root))
@@ -103,6 +106,7 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
         deep=deep,
         problems=tuple(problems),
         strays=() if problems else tuple(stray_keys(root, commits, columns, stamp_of(commits))),
+        left_out=tuple(sorted(root.left_out)),
     )
 
 
@@ -124,7 +128,8 @@ def _commit_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]
     sizes = committed_sizes(root.location, commits)
     for number, commit in commits.items():
         for key, (length, *_) in commit["objects"].items():
-            if problem := wrong_size(sizes, key, length):
+            problem = wrong_size(sizes, key, length)
+            if problem and not is_left_out(key, root.left_out):
                 yield f"{DATA}/{key} of episode {commit['episode_id']} {problem}. {redo(number)}"
 
 

@@ -3,7 +3,15 @@
 from collections.abc import Iterator, Mapping
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.run_layout import DATA, FAILED, ILLUSTRATIONS, LABEL_FILE, PROVENANCE, RUN_FILE
+from probe_kit.extract.run_layout import (
+    DATA,
+    FAILED,
+    ILLUSTRATIONS,
+    LABEL_FILE,
+    LEFT_OUT_FILE,
+    PROVENANCE,
+    RUN_FILE,
+)
 from probe_kit.extract.store.certificates import certificate_keys
 from probe_kit.extract.store.format.bundles import BUNDLES, HEAD, PARTIAL, TIMES, bundle_keys, read_bundle
 from probe_kit.extract.store.format.columns import Columns, seal_key
@@ -22,6 +30,7 @@ def known_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | Non
     """Keys of all that the root leads to: objects whose every changed byte is found."""
     yield RUN_FILE
     yield LABEL_FILE
+    yield LEFT_OUT_FILE
     yield from root.sums
     for number, commit in commits.items():
         yield commit_key(number)
