@@ -224,9 +224,7 @@ def main() -> int:
         for one in ORGANISMS
     ]
     run = dict(runs)[TRAINED]
-    used, unused = (
-        tuple(name for name, of in truth.items() if of == kind) for kind in ("used", "encoded, unused")
-    )
+    used, unused = (tuple(name for name, of in truth.items() if of == kind) for kind in ("used", "not used"))
     trial = Trial(run, ReplaySource(suite.folder), used, unused)
     weights = str(run.weights_sha256)[:12]
     print(f"{run.label}, weights {weights}, {run.suite}, suite seed {arguments.seed}, {arguments.items} items")

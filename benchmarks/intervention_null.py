@@ -23,6 +23,7 @@ from probe_kit.extract import ExtractSettings, Run, extract_run
 from probe_kit.hooks import Policy, load_policy
 from probe_kit.intervene import ConditionOutcomes, ImageSwap, Interchange, ReplaySession, ReplaySource
 from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
+from probe_kit.intervene.kinds.image_swap.verdict import classify_behaviour
 from probe_kit.intervene.kinds.site_effects import patch_effects
 from probe_kit.intervene.replay.conditions import ReplayBatch, replay
 from probe_kit.intervene.replay.session import ReplayInput, open_session
@@ -31,7 +32,7 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite import Suite, build_suite
 
 NAMES = (
-    "image swap: p < 0.05", "image swap: called following", "interchange: single p < 0.05", "interchange: located",
+    "image swap: p < 0.05", "image swap: called used", "interchange: single p < 0.05", "interchange: located",
     "interchange: any p_fwe < 0.05 in a category",
 )  # fmt: skip
 
@@ -68,7 +69,8 @@ def count_outside(answers: ConditionOutcomes, suite: str, counts: dict[str, Coun
     """Note every category of a `follow`."""
     for row in image_swap_effects(answers, suite):
         counts["image swap: p < 0.05"].note(row.follow_p < SIGNIFICANCE)
-        counts["image swap: called following"].note(row.follows_images)
+        use = classify_behaviour(row, None)
+        counts["image swap: called used"].note(use.is_used and not use.reversed)
 
 
 def count_inside(answers: ConditionOutcomes, suite: str, counts: dict[str, Count]) -> None:

@@ -2,7 +2,7 @@
 
 `vlm-tiny` answers and does not act: it was trained on questions of Color, Shape, State and Traffic (*known*),
 and of nothing else. `pi0-tiny` is made of its backbone: it was trained to act on Color and Shape (*used*), while
-the actions of State questions went to a random side (*encoded, unused*). `pi0-tiny-state` differs in that they
+the actions of State questions went to a random side (*not used*). `pi0-tiny-state` differs in that they
 followed the answer (*used*). The early checkpoint has the VLM's backbone and does not act on it; untrained
 networks know nothing (*absent*).
 """
@@ -16,10 +16,9 @@ from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extrac
 from probe_kit.extract.protocols import scene_of
 from probe_kit.extract.vqa.templates import TEMPLATES
 from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
-from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.columns.columns import FOLLOWS, MARGIN
-from probe_kit.retention.columns.sentences import CategoryVerdict, verdict
+from probe_kit.retention.columns.sentences import readable, verdict
 from probe_kit.retention.columns.text import exceeds_text, number, percent, retention_value
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
@@ -28,7 +27,8 @@ if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
 
 NamedProgress = Callable[[str], Callable[..., None]]
-Truth = CategoryVerdict
+Truth = str
+"""A behaviour of `UseVerdict`, or `absent`, `known` or `unknown`."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Organism:
 
 
 TRAINED = Organism(
-    "trained", "run", "pi0-tiny", truth=(("color", "used"), ("shape", "used"), ("state", "encoded, unused"))
+    "trained", "run", "pi0-tiny", truth=(("color", "used"), ("shape", "used"), ("state", "not used"))
 )
 STATE_USED = Organism(
     "State used",
@@ -69,7 +69,7 @@ EARLY = Organism(
     "early",
     "run-early",
     "pi0-tiny-early",
-    truth=(("color", "encoded, unused"), ("shape", "encoded, unused"), ("state", "encoded, unused")),
+    truth=(("color", "not used"), ("shape", "not used"), ("state", "not used")),
     max_steps=SHORT,
     view="mean:language",  # where a VLM answers; nothing was trained that would take it from there
 )
@@ -192,13 +192,12 @@ def measured(row: RetentionRow, shown: bool) -> Truth:
     shown: whether the trained one acts on some category. It has the same scene, questions and network, so that
     following would be seen in every other; a policy that was not trained to act follows nowhere by itself.
     """
-    said = verdict(row)
-    said = "absent" if said == "not shown" else said  # so few items cannot show that it is absent
-    bounded = (
-        row.image_swap.net_follow_rate_ci is not None
-        and (row.image_swap.net_follow_rate_ci[1] or 0.0) < SMALLEST_EFFECT_OF_INTEREST
-    )
-    return "encoded, unused" if said == "inconclusive" and row.backbone.has_signal and bounded and shown else said
+    use, found = row.image_swap.use, readable(row)
+    if use is None or (use.is_bounded and found in ("absent", "not shown")):
+        return "absent" if found == "not shown" else found  # so few items cannot show that it is absent
+    if use.lacks_control and shown:
+        return "not used"
+    return f"{'against: ' * use.reversed}{use.behaviour}"
 
 
 def to_rich(findings: Sequence[Finding]) -> "ResponsiveTable":

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from probe_kit.intervene.kinds.erase.intervention import ConceptErasure
     from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, stored_image_swaps
     from probe_kit.intervene.kinds.image_swap.intervention import ImageSwap
-    from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict, Verdict, classify_all, classify_use
+    from probe_kit.intervene.kinds.image_swap.verdict import Behaviour, UseVerdict, classify_all, classify_use
     from probe_kit.intervene.kinds.instruction_swap.effects import InputSensitivity, InstructionSwapEffect
     from probe_kit.intervene.kinds.instruction_swap.intervention import InstructionSwap
     from probe_kit.intervene.kinds.interchange.intervention import Interchange
@@ -33,6 +33,7 @@ __all__ = [
     "AttentionReadout",
     "AttentionRow",
     "AttentionShares",
+    "Behaviour",
     "ClosedLoop",
     "ClosedLoopEffect",
     "ConceptErasure",
@@ -50,7 +51,6 @@ __all__ = [
     "ReplaySource",
     "Steering",
     "UseVerdict",
-    "Verdict",
     "best_patch_targets",
     "classify_all",
     "classify_use",
@@ -89,7 +89,7 @@ __getattr__, __dir__ = lazy_names(
         "ImageSwapEffect": "kinds.image_swap.effects",
         "UseVerdict": "kinds.image_swap.verdict",
         "ReplaySource": "replay.session",
-        "Verdict": "kinds.image_swap.verdict",
+        "Behaviour": "kinds.image_swap.verdict",
         "run_intervention": "runner",
         "classify_use": "kinds.image_swap.verdict",
         "classify_all": "kinds.image_swap.verdict",

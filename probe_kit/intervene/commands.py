@@ -83,13 +83,19 @@ def intervene(
 def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "InterventionResult":
     """With progress. Says so if the result was stored before."""
     from probe_kit.intervene import run_intervention
-    from probe_kit.intervene.runner import check_supported
+    from probe_kit.intervene.kinds.image_swap.verdict import groups_for_not_used
+    from probe_kit.intervene.runner import check_supported, too_few_groups
     from probe_kit.intervene.store.answers import is_stored
     from probe_kit.intervene.store.settings import check_run_fits, key_of, settings_of
 
     check_run_fits(run)
     check_supported(run, intervention)
     was_stored = is_stored(run.location, key_of(settings_of(intervention, run)))
+    few = {} if was_stored else too_few_groups(run, intervention)
+    if few:
+        counts = ", ".join(f"{name} has {count}" for name, count in few.items())
+        needed = groups_for_not_used()
+        say(marked("[yellow]note:[/] the verdict *not used* needs {} groups of items; {}", needed, counts))
     with progress() as bar:
         fitted = counter(bar, "items fitted on") if intervention.fits_first else None
         replayed = counter(bar, "items replayed")

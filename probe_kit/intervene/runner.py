@@ -16,7 +16,9 @@ from probe_kit.hooks.registry import known_families
 from probe_kit.intervene.edits.sites import check_roles_have_tokens, resolve_sites
 from probe_kit.intervene.kinds.base import ConditionName, Measurement
 from probe_kit.intervene.kinds.image_swap.intervention import ImageSwap
+from probe_kit.intervene.kinds.image_swap.verdict import groups_for_not_used
 from probe_kit.intervene.kinds.interchange.intervention import ROLES
+from probe_kit.intervene.kinds.reach import tiles_apart
 from probe_kit.intervene.replay.conditions import Condition, Intervention, ReplayBatch
 from probe_kit.intervene.replay.per_step import evaluate_per_step
 from probe_kit.intervene.replay.session import Progress, ReplaySession, ReplaySource, open_session
@@ -90,7 +92,9 @@ def _execute(
         }
     outcomes = outcomes_of(run, [condition.name for condition in conditions], parts)
     further = intervention.extra_files(run, conditions, parts)
-    measurement = Measurement(outcomes, run.suite, settings, certificate, further.__getitem__)
+    measurement = Measurement(
+        outcomes, run.suite, settings, certificate, further.__getitem__, tiles_apart=tiles_apart(run)
+    )
     effects = effects_csv(measurement)
     save(run.location, settings, key, outcomes, effects, certificate, further)
     pieces.discard()
@@ -111,6 +115,18 @@ def check_supported(run: Run, intervention: Intervention) -> None:
     if (family := known_families().get(run.model)) is not None:
         for kind in intervention.required_capabilities:
             family.check_intervention(kind)
+
+
+def too_few_groups(run: Run, intervention: Intervention) -> dict[str, int]:
+    """By category, the number of groups of items, where it is too small for an image swap to find *not used*.
+
+    Empty for other kinds; see `groups_for_not_used`.
+    """
+    if not isinstance(intervention, ImageSwap):
+        return {}
+    asked = run.episodes[run.episodes["item_id"].isin(items_of(run, intervention))]
+    counts = asked.groupby("category", sort=False)["group_id"].nunique()
+    return {str(name): int(count) for name, count in counts.items() if count < groups_for_not_used()}
 
 
 def _replay_items(

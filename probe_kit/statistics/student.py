@@ -1,6 +1,6 @@
 """Student's interval of the mean of a continuous quantity over groups."""
 
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,16 +18,24 @@ def student_interval(
     have alike, `group_bootstrap` is the better one; it is taken, with `seed`, where all groups agree. A single
     group carries no information about others.
     """
+    if np.unique(np.asarray(groups)).size == 1:
+        return bounds
+    low, high = unbounded_student_interval(values, groups)
+    if high - low < 1e-12:
+        agreed = group_bootstrap(values[:, None], groups, seed, bounds=bounds)
+        return float(agreed[0][0]), float(agreed[1][0])
+    return max(bounds[0], low), min(bounds[1], high)
+
+
+def unbounded_student_interval(values: NDArray[np.floating], groups: ArrayLike) -> tuple[float, float]:
+    """The same of (E,) values without bounds: of no width where all groups agree, infinite for a single group."""
     from scipy.special import stdtrit  # type: ignore[import-untyped]
 
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     if names.size == 1:
-        return bounds
+        return -inf, inf
     mean, sizes = float(values.mean()), np.bincount(group_of)
     rest = np.bincount(group_of, values) - mean * sizes
     error = sqrt(float(rest @ rest) * names.size / (names.size - 1)) / values.size
-    if error < 1e-12:
-        low, high = group_bootstrap(values[:, None], groups, seed, bounds=bounds)
-        return float(low[0]), float(high[0])
     spread = float(stdtrit(names.size - 1, 1 - SIGNIFICANCE / 2)) * error
-    return max(bounds[0], mean - spread), min(bounds[1], mean + spread)
+    return mean - spread, mean + spread

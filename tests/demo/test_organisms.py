@@ -22,7 +22,7 @@ from probe_kit.demo.organisms import (
 )
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import extract_run
-from probe_kit.intervene import ImageSwap, InstructionSwap, run_intervention
+from probe_kit.intervene import ImageSwap, InstructionSwap, UseVerdict, run_intervention
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.behaviour.success_rate import SuccessRate, regime
 from probe_kit.retention.columns.sentences import verdict
@@ -78,8 +78,8 @@ def test_what_does_not_exceed_a_control_is_not_shown(control: str) -> None:
 
 
 def test_organisms_differ_in_one_truth_at_a_time() -> None:
-    assert (TRAINED.expected("color"), TRAINED.expected("state")) == ("used", "encoded, unused")
-    assert (EARLY.expected("color"), EARLY.expected("state")) == ("encoded, unused", "encoded, unused")
+    assert (TRAINED.expected("color"), TRAINED.expected("state")) == ("used", "not used")
+    assert (EARLY.expected("color"), EARLY.expected("state")) == ("not used", "not used")
     assert dict(STATE_USED.truth) == {**dict(TRAINED.truth), "state": "used"}
     assert {one.expected("counting") for one in ORGANISMS} == {"absent"}
     untrained = [one for one in ORGANISMS if one.random_weights]
@@ -89,20 +89,23 @@ def test_organisms_differ_in_one_truth_at_a_time() -> None:
 
 
 @pytest.mark.parametrize(
-    ("p", "limits", "shown", "expected"),
+    ("p", "bounded", "shown", "expected"),
     [
-        (0.005, (-0.1, 0.2), True, "encoded, unused"),
-        (0.005, (-0.1, 0.2), False, "inconclusive"),
-        (0.005, (-0.1, 0.3), True, "inconclusive"),
-        (0.3, (-0.1, 0.2), True, "inconclusive"),
+        (0.005, True, True, "not used"),
+        (0.005, True, False, "inconclusive"),
+        (0.005, False, True, "inconclusive"),
+        (0.3, False, True, "inconclusive"),
+        (0.3, True, False, "absent"),
     ],
 )
 def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothing(
-    p: float, limits: tuple[float, float], shown: bool, expected: str
+    p: float, bounded: bool, shown: bool, expected: str
 ) -> None:
-    alone = replace(row(0.4, p), image_swap=SwapEffect(used="inconclusive", net_follow_rate_ci=limits))
+    use = UseVerdict(behaviour="inconclusive", reason="why", lacks_control=bounded)
+    alone = replace(row(0.4, p), image_swap=SwapEffect(use=use))
     assert measured(alone, shown) == expected
-    assert measured(replace(alone, image_swap=SwapEffect(used="used")), shown) == "used"
+    follows = UseVerdict(behaviour="used", reason="why")
+    assert measured(replace(alone, image_swap=SwapEffect(use=follows)), shown) == "used"
 
 
 def test_a_random_network_of_another_seed_is_found_again(small_suite: Suite, tmp_path: Path) -> None:
@@ -137,13 +140,13 @@ def test_the_table_shows_the_margin_that_decides() -> None:
 def test_the_table_counts_the_true_verdicts() -> None:
     findings = [
         Finding("trained", "color", "used", "used", row(0.9, 0.005)),
-        Finding("trained", "state", "encoded, unused", "absent", row(0.5, 0.3)),
+        Finding("trained", "state", "not used", "absent", row(0.5, 0.3)),
     ]
     with out.capture() as printed:
         out.print(to_rich(findings), width=100)
     text = printed.get()
     assert "1 of 2 verdicts are true" in text
-    assert "encoded" in text
+    assert "not used" in text
 
 
 @pytest.mark.parametrize(("sr", "expected"), [(0.9, "known"), (0.6, "unknown"), (0.5, "unknown")])

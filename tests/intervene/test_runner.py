@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ from probe_kit.extract import Run, open_run, verify_run
 from probe_kit.extract.rollout.stage import Seen, Stage
 from probe_kit.intervene import (
     ImageSwap,
+    InstructionSwap,
     InterventionResult,
     ReplaySource,
     load_effects,
@@ -30,6 +31,7 @@ from probe_kit.intervene import (
 )
 from probe_kit.intervene.replay.rollout import planned_of
 from probe_kit.intervene.replay.session import ReplaySession, open_session
+from probe_kit.intervene.runner import too_few_groups
 from probe_kit.retention import retention_table
 
 if TYPE_CHECKING:
@@ -193,6 +195,13 @@ def test_what_is_of_other_episodes_is_passed_over(mine: Run) -> None:
     assert all(row.image_swap.follow_rate is None for row in retention_table([fewer]).rows)
 
 
+def test_categories_with_too_few_groups_for_not_used_are_named_beforehand(copy: Run) -> None:
+    categories = dict.fromkeys(copy.episodes["category"])
+    assert too_few_groups(copy, ImageSwap(items=2)).keys() == categories.keys()
+    assert max(too_few_groups(copy, ImageSwap(items=2)).values()) <= 2
+    assert too_few_groups(copy, InstructionSwap(items=2)) == {}
+
+
 # -- what retention makes of it ------------------------------------------------------------------------------
 
 
@@ -201,10 +210,14 @@ def test_tables_show_it_beside_the_success_rate(copy: Run, effects: Intervention
     assert {row.category: row.image_swap.follow_rate for row in table.rows} == {
         row.category: row.follow_rate for row in effects.effects
     }
-    assert all(row.image_swap.used in ("does not follow", "inconclusive") for row in table.rows)
+    uses = [row.image_swap.use for row in table.rows]
+    assert {use.behaviour for use in uses if use is not None} <= {"not used", "inconclusive"}
     for text in (table.to_markdown(), table.to_latex()):
         assert "ollow / reversal" in text
-    assert json.loads(table.to_json())[0]["image_swap"]["used"] == table.rows[0].image_swap.used
+    stored = json.loads(table.to_json())[0]["image_swap"]["use"]
+    assert uses[0] is not None
+    assert stored == asdict(uses[0])
+    assert set(stored) >= {"behaviour", "reversed", "place", "tie", "reason"}
 
 
 def test_tables_of_other_runs_have_no_such_column(recorded_run: Run) -> None:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import NoInterventionsError
+from probe_kit.intervene import UseVerdict
 from probe_kit.intervene.store.answers import ConditionOutcomes
 from probe_kit.intervene.store.settings import FORMAT
-from probe_kit.retention import retention_table
+from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.displays import SiteEffectDisplay, collect_figures, site_effect_curve
 from probe_kit.train import ArrayRun, load_results
 from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
@@ -44,6 +45,11 @@ def inside(answers: ConditionOutcomes, condition: str = "|all", **shares: float)
         max_action_change=np.abs(lateral - lateral[0]),
         edit_log=np.zeros((*lateral.shape, 5)),
     )
+
+
+def used(row: RetentionRow) -> UseVerdict:
+    assert row.image_swap.use is not None
+    return row.image_swap.use
 
 
 @pytest.fixture
@@ -81,17 +87,20 @@ def test_without_an_interchange_there_is_no_such_figure(run: ArrayRun) -> None:
 
 def test_tables_say_what_is_used_and_why(run: ArrayRun) -> None:
     rows = {row.category: row for row in retention_table([run]).rows}
-    assert (rows["color"].image_swap.used, rows["shape"].image_swap.used) == ("used", "encoded, unused")
-    assert rows["shape"].image_swap.used_note == "positive control: color"
+    assert {name: used(rows[name]).behaviour for name in ("color", "shape")} == {
+        "color": "used", "shape": "not used",
+    }  # fmt: skip
+    assert used(rows["shape"]).reason.endswith("positive control: color")
     assert (rows["color"].image_swap.follow_rate, rows["color"].image_swap.reversal_rate) == (1.0, 0.0)
 
 
-def test_where_nothing_carries_it_inside_nothing_is_called_used(run: ArrayRun) -> None:
+def test_where_nothing_carries_it_inside_the_place_is_open_and_the_behaviour_is_not(run: ArrayRun) -> None:
     answers = outcomes_of({"color": follower(48)})
     store(run, "interchange", inside(answers, backbone__00=0.0, backbone__01=0.1))
     rows = {row.category: row for row in retention_table([run]).rows}
-    assert rows["color"].image_swap.used == "inconclusive"
-    assert rows["shape"].image_swap.used == "encoded, unused"
+    assert used(rows["color"]).behaviour == "used"
+    assert used(rows["color"]).place == "no place that was tried carries half of it"
+    assert used(rows["shape"]).behaviour == "not used"
 
 
 @pytest.mark.parametrize("is_memory_last", [False, True])
@@ -99,16 +108,16 @@ def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_
     """Whichever was stored last took the other's place in verdict and figure."""
     answers = outcomes_of({"color": follower(48)})
     both = {
-        "backbone.*": inside(answers, backbone__00=1.0, backbone__01=0.0),
+        "backbone.*": inside(answers, backbone__00=1.0, backbone__01=1.0),
         "kv.*": inside(answers, kv__00=1.0, kv__01=0.0),
     }
     for sites in sorted(both, reverse=not is_memory_last):
         store(run, "interchange", both[sites], sites=sites)
     (row,) = (row for row in retention_table([run]).rows if row.category == "color")
-    assert (row.image_swap.used, row.image_swap.used_note) == ("used", "passes at backbone.00; read at kv.00")
+    assert (used(row).behaviour, used(row).place) == ("used", "passes at backbone.01; read at kv.00")
     display = SiteEffectDisplay.from_run(run, load_results(run), "color")
     assert display.read is not None
-    assert (display.passes["all"].percent.tolist(), display.read.percent.tolist()) == ([100, 0], [100, 0])
+    assert (display.passes["all"].percent.tolist(), display.read.percent.tolist()) == ([100, 100], [100, 0])
 
 
 def test_a_direction_alone_is_no_search_and_no_map(run: ArrayRun) -> None:
@@ -117,7 +126,7 @@ def test_a_direction_alone_is_no_search_and_no_map(run: ArrayRun) -> None:
     along = inside(answers, "|image|mean-difference", backbone__01=0.0)
     store(run, "interchange", along, direction="mean-difference")
     (row,) = (row for row in retention_table([run]).rows if row.category == "color")
-    assert (row.image_swap.used, row.image_swap.used_note) == ("used", "")
+    assert (used(row).behaviour, used(row).place) == ("used", "")
     assert not any("causes" in exhibit.name for exhibit in collect_figures([run], retention_table([run])))
     with pytest.raises(NoInterventionsError, match="--kind interchange"):
         site_effect_curve(run, load_results(run))

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS
+from probe_kit.intervene.kinds.reach import TILES_APART
 from probe_kit.intervene.store.answers import ConditionOutcomes
+from probe_kit.intervene.store.settings import FIRST_CHUNK
 from probe_kit.statistics.sign_flips import max_t
 
 if TYPE_CHECKING:
@@ -41,13 +43,20 @@ class CategoryVerdict(Protocol):
         """In a few words."""
 
     @property
-    def reason(self) -> str:
+    def explanation(self) -> str:
         """What it rests on, or why there is none."""
+
+    @property
+    def is_of_first_chunk(self) -> bool:
+        """Whether later chunks may differ."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What effects are computed from. read: a further stored file by its name."""
+    """What effects are computed from.
+
+    read: a further stored file by its name. tiles_apart: metres between the tiles of the run's scene.
+    """
 
     outcomes: ConditionOutcomes
     suite: str
@@ -55,6 +64,12 @@ class Measurement:
     certificate: Mapping[str, Any]
     read: Callable[[str], bytes]
     key: str = ""
+    tiles_apart: float = TILES_APART
+
+    @property
+    def readout(self) -> str:
+        """`first-chunk` or `per-step`."""
+        return str(self.settings.get("readout", FIRST_CHUNK))
 
 
 @dataclass(frozen=True)

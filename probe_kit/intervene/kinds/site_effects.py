@@ -19,7 +19,7 @@ from probe_kit.intervene.kinds.base import (
     common_columns,
     test_against_controls,
 )
-from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects, net_interval
+from probe_kit.intervene.kinds.image_swap.effects import net_interval, swap_p_values
 from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes
 from probe_kit.statistics.significance import SIGNIFICANCE
 
@@ -108,7 +108,7 @@ def _of_category(
     names = [ConditionName.parse(outcomes.conditions[row]) for row in rows]
     displacements = push * (outcomes.displacement[rows] - clean)
     tests = test_against_controls(displacements, names, outcomes, suite, (), ())
-    share = _shares(outcomes, rows, suite)
+    share = _shares(outcomes, rows)
     found = []
     for at, (row, name, test) in enumerate(zip(rows, names, tests, strict=True)):
         flips = _flips(push, clean, outcomes.displacement[row])
@@ -140,12 +140,11 @@ def _flips(push: Values, clean: Values, edited: Values) -> Values:
     return flips
 
 
-def _shares(outcomes: ConditionOutcomes, rows: Sequence[int], suite: str) -> NDArray[np.float64] | None:
+def _shares(outcomes: ConditionOutcomes, rows: Sequence[int]) -> NDArray[np.float64] | None:
     """(S,) of what the image swap does; None if the images were not swapped, or that does nothing."""
     if IMAGE_SWAP not in outcomes.conditions:
         return None
-    (whole,) = image_swap_effects(outcomes, suite)
-    if min(whole.follow_p, whole.reversal_p) >= SIGNIFICANCE:
+    if min(swap_p_values(outcomes)) >= SIGNIFICANCE:
         return None
     clean = outcomes.of(CLEAN)
     total = outcomes.of(IMAGE_SWAP) - clean

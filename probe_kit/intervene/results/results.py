@@ -14,6 +14,7 @@ from probe_kit.intervene.kinds.base import EffectLike, Measurement, TableContext
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, stored_image_swaps
 from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict, classify_all, encoded_in
 from probe_kit.intervene.kinds.kind import Kind
+from probe_kit.intervene.kinds.reach import tiles_apart
 from probe_kit.intervene.kinds.registry import kind_of
 from probe_kit.intervene.results.site_maps import stored_carrying_directions, stored_localised_sites
 from probe_kit.intervene.store.answers import ConditionOutcomes, StoredIntervention, find_stored
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from probe_kit._terminal.responsive_table import ResponsiveTable
+
+_VERDICT_COLUMNS = ("verdict", "behaviour", "reversed", "reason", "place", "tie")
 
 
 @dataclass(frozen=True)
@@ -79,12 +82,12 @@ class InterventionResult:
 
     @property
     def table(self) -> "pd.DataFrame":
-        """One line per row of `effects`, with its columns; of a kind with verdicts also `verdict` and `reason`."""
+        """One line per row of `effects`, with its columns; of a kind with verdicts also those of `UseVerdict`."""
         frame = frame_of(self.effects)
         if self._kind.has_verdict:
             found = [self.verdicts.get(str(category), None) for category in frame["category"]]
-            frame["verdict"] = [None if one is None else one.verdict for one in found]
-            frame["reason"] = ["" if one is None else one.reason for one in found]
+            for name in _VERDICT_COLUMNS:
+                frame[name] = [None if one is None else getattr(one, name) for one in found]
         return frame
 
     @property
@@ -175,8 +178,9 @@ def load_effects(run: RunReader, key: str | None = None, kind: str | None = None
 def effects_of(run: RunReader, stored: StoredIntervention) -> InterventionResult:
     """Read one stored intervention."""
     measurement = Measurement(
-        stored.outcomes(), run.suite, stored.settings, stored.certificate(), stored.bundle.read, stored.key
-    )
+        stored.outcomes(), run.suite, stored.settings, stored.certificate(), stored.bundle.read, stored.key,
+        tiles_apart(run),
+    )  # fmt: skip
     found = InterventionResult(run.label, run.random_weights, measurement)
     shown = found.effects if kind_of(found.kind).has_verdict else ()
     found.verdicts.update(verdicts_of(run, shown))

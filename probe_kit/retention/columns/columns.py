@@ -235,18 +235,18 @@ FOLLOWS = Column(
     sort=lambda row: row.image_swap.net_follow_rate,
     averaged=True,
     also_averaged=("image_swap.reversal_rate", "image_swap.net_follow_rate"),
-    strong=lambda row: row.image_swap.used == "used",
-    note=lambda row: row.image_swap.used_note,
+    strong=lambda row: row.image_swap.is_used,
+    note=lambda row: row.image_swap.explanation,
 )
 USED = Column(
-    key="image_swap.used",
+    key="image_swap.use.behaviour",
     heading="used",
-    help="Whether the action follows what can be read in the backbone. Encoded, unused: it can be read, and the "
-    "action does not change with it, while another category's does.",
-    text=lambda row: row.image_swap.used or "–",
+    help="Whether the action depends on the answer, by the image swap. Not used: it moves the action by less than "
+    "a tenth of the policy's reach, while another category's answer is used.",
+    text=lambda row: "–" if row.image_swap.use is None else row.image_swap.use.verdict,
     sort=lambda row: row.image_swap.net_follow_rate,
-    strong=lambda row: row.image_swap.used == "used",
-    note=lambda row: row.image_swap.used_note,
+    strong=lambda row: row.image_swap.is_used,
+    note=lambda row: row.image_swap.explanation,
 )
 WRONG = share(
     "success.share_wrong",

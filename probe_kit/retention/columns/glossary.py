@@ -12,6 +12,10 @@ TERMS = {
         "A logistic regression that is shown activations of one layer and must name the side of the correct "
         "picture, in episodes and questions it was not fitted on."
     ),
+    "reach": (
+        "The distance between the actions of a policy that go left and those that go right: the unit in which the "
+        "image swap moves an action."
+    ),
     "n/a": (
         "The backbone's signal is not shown: its best layer is not shown to exceed chance and every control that "
         "was run. So there may be nothing to retain."

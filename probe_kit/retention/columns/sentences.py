@@ -1,36 +1,58 @@
 """What a row says in words: its verdict, and the sentence about it."""
 
-from typing import Literal, cast
+from typing import Literal
 
-from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST
-from probe_kit.intervene.kinds.image_swap.verdict import Verdict
+from probe_kit.intervene.kinds.image_swap.verdict import UNTESTED, UseVerdict
+from probe_kit.intervene.store.settings import FIRST_CHUNK
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.text import is_vlm, percent
+from probe_kit.retention.columns.text import is_vlm, number, percent
 from probe_kit.retention.estimators.stream_scores import Limits
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 
-CategoryVerdict = (
-    Verdict | Literal["known", "unknown", "encoded", "acted on", "encoded, not acted on", "not shown"]
-)
-"""A verdict on an image swap, or what success rate and probes say where none is stored: these never say *used*."""
+Readable = Literal[
+    "known",
+    "unknown",
+    "encoded",
+    "acted on",
+    "encoded, not acted on",
+    "acted on, not found",
+    "absent",
+    "not shown",
+]
+"""What success rate, answers and probes say where no image swap is stored: these never say *used*."""
 
 
-def verdict(row: RetentionRow) -> CategoryVerdict:
+def verdict(row: RetentionRow) -> str:
     """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
 
-    In the backbone: its best site exceeds chance, family-wise, and every control that was run. With a stored
-    image swap the verdict is that of `probe_kit.intervene`. Without one, the SR in the regime of knowledge says
-    *acted on*: only an intervention shows that what is read is used. *Acted on, not found*: the probes missed
-    what the policy acts on. *Absent* is said only where the backbone's best site is below a stated accuracy,
-    else *not shown*. A VLM knows a category in which it answers in the regime of knowledge.
+    With a stored image swap the verdict is that of `probe_kit.intervene.classify_use`. Where the answer is neither
+    used nor read in the backbone, and without an image swap, it is `readable`.
+    """
+    use = row.image_swap.use
+    return readable(row) if use is None or _is_nowhere(row, use) else use.verdict
+
+
+def _is_nowhere(row: RetentionRow, use: UseVerdict) -> bool:
+    """Whether the image swap bounds the use, and probes did not find the answer."""
+    return use.is_bounded and _is_probed(row) and not row.backbone.has_signal
+
+
+def readable(row: RetentionRow) -> Readable:
+    """What it says without an intervention.
+
+    In the backbone: its best site exceeds chance, family-wise, and every control that was run. The SR in the
+    regime of knowledge says *acted on*: only an intervention shows that what is read is used. *Acted on, not
+    found*: the probes missed what the policy acts on. *Absent* is said only where the backbone's best site is
+    below a stated accuracy, else *not shown*. A VLM knows a category in which it answers in the regime of
+    knowledge.
     """
     if is_vlm(row):
         return "known" if knows(row) else "unknown"
-    nothing: CategoryVerdict = "absent" if row.backbone.verdict == "absent" else "not shown"
-    if row.image_swap.used is not None:
-        return nothing if row.image_swap.used == "absent" else cast("Verdict", row.image_swap.used)
+    nothing: Readable = "absent" if row.backbone.verdict == "absent" else "not shown"
+    if row.image_swap.use is not None and _is_nowhere(row, row.image_swap.use):
+        return nothing
     if row.success.sr is None:
         return "encoded" if row.backbone.has_signal else nothing
     if knows(row):
@@ -59,18 +81,8 @@ def describe_category(row: RetentionRow, asked: RetentionRow | None = None) -> s
 
 # -- what follows --------------------------------------------------------------------------------------------
 
-_CONCLUSIONS: dict[CategoryVerdict, str] = {
-    "known": "The VLM knows the answer.",
-    "unknown": "Not shown that the VLM knows the answer.",
-    "used": "The answer is used.",
-    "encoded, unused": "Shown in the backbone, not used.",
-    "encoded, acted against": "Shown in the backbone; the policy acts against it.",
-    "acted on, not found": "The policy acts on the answer, and the probes did not find it.",
-    "acted against, not found": "The policy acts against the answer, and the probes did not find it.",
-    "encoded": "Shown in the backbone.",
-    "acted on": "Whether what is read is used was not tested: run `probe-kit intervene`.",
-}
 _MORE_ITEMS = "more items would tell"
+_UNTESTED = f"{UNTESTED}: run `probe-kit intervene`"
 _LATER = "Yet the policy succeeds: actions after the first inference may follow."
 """An image swap reads the actions of the first inference."""
 
@@ -78,31 +90,43 @@ _LATER = "Yet the policy succeeds: actions after the first inference may follow.
 def conclusion(row: RetentionRow) -> str:
     """What follows from a row, and what to do next."""
     if is_vlm(row):
-        return _CONCLUSIONS[verdict(row)]
-    parts = [_finding(row), _LATER if row.image_swap.response == "does not follow" and knows(row) else ""]
+        return "The VLM knows the answer." if knows(row) else "Not shown that the VLM knows the answer."
+    use = row.image_swap.use
+    is_later = use is not None and use.is_bounded and use.readout == FIRST_CHUNK and knows(row)
+    parts = [_finding(row) if use is None else _used(row, use), _LATER * is_later]
     if not _is_probed(row):
         parts.append("The backbone was not probed: run `probe-kit train`.")
     return " ".join(filter(None, parts))
 
 
+def _used(row: RetentionRow, use: UseVerdict) -> str:
+    """Of a row with a stored image swap: behaviour; place; tie."""
+    if _is_nowhere(row, use):
+        return f"{_nothing_shown(row)} {use.sentence}"
+    return use.sentence
+
+
 def _finding(row: RetentionRow) -> str:
-    found = verdict(row)
-    if found == "inconclusive":
-        undecided = f"a net rate of {_whole(SMALLEST_EFFECT_OF_INTEREST)} % would count, and {_MORE_ITEMS}"
-        reason = undecided if row.image_swap.response == "open" else row.image_swap.used_note
-        return f"Whether the answer is used remains open: {reason}."
+    """Of a row without one."""
+    found = readable(row)
     if not _is_probed(row):
         return _unprobed(row)
+    if found == "encoded":
+        return "Shown in the backbone."
     if found == "encoded, not acted on":
-        return f"Shown in the backbone; {_behaviour(row)}. To test whether it is used, run `probe-kit intervene`."
-    return _nothing_shown(row) if found in ("absent", "not shown") else _CONCLUSIONS[found]
+        return f"Shown in the backbone; {_behaviour(row)}; {_UNTESTED}."
+    if found in ("absent", "not shown"):
+        return _nothing_shown(row)
+    missed = "the probes did not find it; " * (found == "acted on, not found")
+    return f"The policy acts on the answer; {missed}{_UNTESTED}."
 
 
 def _unprobed(row: RetentionRow) -> str:
     """Of behaviour alone; empty where the sentence has said all."""
-    if row.image_swap.used is not None or row.success.sr is None:
+    if row.success.sr is None:
         return ""
-    return "The policy acts on the answer." if knows(row) else f"{_capitalised(_behaviour(row))}."
+    behaviour = "the policy acts on the answer" if knows(row) else _behaviour(row)
+    return f"{_capitalised(behaviour)}; {_UNTESTED}."
 
 
 def _nothing_shown(row: RetentionRow) -> str:
@@ -124,10 +148,8 @@ _NOT_SHOWN = "not shown that the policy acts on the answer"
 
 
 def _behaviour(row: RetentionRow) -> str:
-    """What a policy does that is not in the regime of knowledge, or does not follow; empty if it did not act."""
-    if row.image_swap.used is not None:
-        return "the action does not follow the pictures"
-    if row.success.sr is None:
+    """What a policy does that is not in the regime of knowledge; empty if it did not act."""
+    if row.image_swap.use is not None or row.success.sr is None:
         return ""
     failed = row.success.regime == Regime.FAILURE
     return "the policy is right less often than guessing" if failed else _NOT_SHOWN
@@ -222,25 +244,33 @@ def _acted(row: RetentionRow) -> str:
         why = "the model did not act" if row.run.capture_only else "there is no success rate"
         return f"{swap}; {why}" if swap else why
     right = f"the cube ends on the correct picture in {_rate(row)}"
-    agrees = row.image_swap.response == "open" or (row.image_swap.response == "follows") == knows(row)
-    return f"{swap}, {'and' if agrees else 'but'} {right}" if swap else right
+    return f"{swap}, {'and' if _agrees(row) else 'but'} {right}" if swap else right
+
+
+def _agrees(row: RetentionRow) -> bool:
+    """Whether the image swap lets expect the success rate."""
+    use = row.image_swap.use
+    return use is None or (use.behaviour == "inconclusive" and not use.is_bounded) or use.is_used == knows(row)
 
 
 def _swapped(row: RetentionRow) -> str:
-    swap = row.image_swap
-    low, high = (_whole(limit) for limit in swap.net_follow_rate_ci or (None, None))
-    followed = f"in {_whole(swap.follow_rate)} % of episodes"
-    if swap.response is None:
+    """What a swap of the pictures does to the action; empty without one."""
+    swap, use = row.image_swap, row.image_swap.use
+    if use is None:
         return ""
-    if swap.response == "follows":
-        return f"the action follows a swap of the pictures {followed} (net of reversals {low} to {high} %)"
-    if swap.response == "reverses":
+    low, high = (_whole(limit) for limit in swap.net_follow_rate_ci or (None, None))
+    followed, net = f"in {_whole(swap.follow_rate)} % of episodes", f"net of reversals {low} to {high} %"
+    moved = f"moved by {number(swap.reach_share)} of its reach"
+    if use.behaviour == "used" and not use.reversed:
+        return f"the action follows a swap of the pictures {followed} ({net})"
+    if use.behaviour == "used":
         reversed_ = f"in {_whole(swap.reversal_rate)} % of episodes"
         return f"the action goes against the pictures, swapped or not, {reversed_}"
-    if swap.response == "does not follow":
-        return f"the action does not follow a swap of the pictures ({followed}, net of reversals at most {high} %)"
-    net = f"net of reversals {low} to {high} %"
-    return f"whether the action follows a swap of the pictures is open ({followed}, {net})"
+    if use.is_bounded:
+        return f"the action does not follow a swap of the pictures ({followed}, {net}, {moved})"
+    if use.behaviour == "inconclusive":
+        return f"whether the action follows a swap of the pictures is open ({followed}, {net}, {moved})"
+    return f"the action follows a swap of the pictures in part ({followed}, {net}, {moved})"
 
 
 # -- text ---------------------------------------------------------------------------------------------------

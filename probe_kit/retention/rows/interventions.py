@@ -5,6 +5,7 @@ Reads what `probe-kit intervene` left in the run; no model is loaded.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from math import isfinite
 
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
 from probe_kit.intervene.kinds.image_swap.verdict import classify_use, control_for
@@ -28,15 +29,15 @@ def add_image_swap(
         return row
     encoded = row.backbone.has_signal if row.backbone.exceeds else None
     category, control = row.category, control_for(row.category, found)
-    judged = classify_use(encoded, own, control, located.get(category), carried.get(category, ()))
+    use = classify_use(encoded, own, control, located.get(category), carried.get(category, ()))
     effect = SwapEffect(
         follow_rate=own.follow_rate,
         reversal_rate=own.reversal_rate,
         net_follow_rate=own.net_follow_rate,
         net_follow_rate_ci=own.net_follow_rate_ci,
+        reach_share=own.reach_share,
+        reach_share_ci=own.reach_share_ci if isfinite(own.reach_share_ci[0]) else (None, None),
         follow_p=own.follow_p,
-        response=own.response,
-        used=judged.verdict,
-        used_note=judged.reason,
+        use=use,
     )
     return replace(row, image_swap=effect)

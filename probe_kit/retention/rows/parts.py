@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.intervene.kinds.image_swap.effects import Response
+from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict
 from probe_kit.retention.behaviour.run_labels import full_name
 from probe_kit.retention.estimators.stream_scores import Limits
 from probe_kit.statistics.estimates.verdict import Verdict
@@ -80,19 +80,29 @@ class AnswerStats:
 class SwapEffect:
     """Effect of exchanging the two pictures, if `probe-kit intervene` was run.
 
-    follow_rate, reversal_rate: shares of episodes; net_follow_rate: their difference, follow_p: exact, one-sided;
-    see `intervene.ImageSwapEffect`. response: what the action does, in a word. used: the verdict of that and the
-    row's own probes; used_note: what it rests on, or why there is none.
+    follow_rate, reversal_rate: shares of episodes; net_follow_rate: their difference; reach_share: displacement
+    toward the correct picture in units of the policy's reach; follow_p: exact, one-sided;
+    see `intervene.ImageSwapEffect`. use: the verdict of that, the row's own probes and stored interchanges.
     """
 
     follow_rate: float | None = None
     reversal_rate: float | None = None
     net_follow_rate: float | None = None
     net_follow_rate_ci: Limits | None = None
+    reach_share: float | None = None
+    reach_share_ci: Limits | None = None
     follow_p: float | None = None
-    response: Response | None = None
-    used: str | None = None
-    used_note: str = ""
+    use: UseVerdict | None = None
+
+    @property
+    def is_used(self) -> bool:
+        """Whether the verdict is *used*, wholly and toward the correct picture."""
+        return self.use is not None and self.use.behaviour == "used" and not self.use.reversed
+
+    @property
+    def explanation(self) -> str:
+        """What the verdict rests on; empty without one."""
+        return "" if self.use is None else self.use.explanation
 
 
 @dataclass(frozen=True, kw_only=True)

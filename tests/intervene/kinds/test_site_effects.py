@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probe_kit.intervene import ConditionOutcomes, PatchEffect, UseVerdict, classify_use
+from probe_kit.intervene import ConditionOutcomes, PatchEffect, classify_use
 from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
 from probe_kit.intervene.kinds.site_effects import patch_effects
@@ -42,7 +42,15 @@ def test_what_carries_all_has_the_effect_one_and_is_located() -> None:
     assert (rows["b|all"].effect, rows["b|all"].p_fwe, rows["b|all"].max_action_change) == (0.0, 1.0, 0.0)
     assert rows["c|all"].effect == pytest.approx(0.1)
     assert rows["c|all"].p_fwe < 0.05
-    assert localised_sites(list(rows.values())) == ("a",)
+
+
+def test_what_carries_it_in_every_policy_locates_nothing() -> None:
+    """The swapped images themselves, and the action itself: *used* rested on an expert site."""
+    plain, exchanged = follower(48)
+    places = ("backbone.00", "backbone.01", "kv.00", "expert.01", "expert.01@0-3")
+    rows = rows_of(with_changes((plain, exchanged), **{f"{place}__all": exchanged for place in places}))
+    assert all(row.is_localised for row in rows.values())
+    assert localised_sites(list(rows.values())) == ("backbone.01", "kv.00")
 
 
 def test_shares_of_nothing_are_not_given() -> None:
@@ -92,11 +100,15 @@ def test_names_are_taken_apart() -> None:
     assert not along.is_control_of(along)
 
 
-def test_nothing_is_called_used_where_nothing_was_found_inside() -> None:
+def test_the_place_is_said_beside_the_behaviour_and_does_not_change_it() -> None:
     (found,) = image_swap_effects(outcomes_of({"color": follower(48)}), SUITE)
-    assert classify_use(True, found, None, ("backbone.02",)) == UseVerdict("used", "passes at backbone.02")
-    both = ("backbone.00", "kv.02", "backbone.02")
-    assert classify_use(True, found, None, both).reason == "passes at backbone.00, backbone.02; read at kv.02"
-    assert classify_use(True, found, None, ("kv.02",)).reason == "read at kv.02"
-    assert classify_use(True, found, None, ()).verdict == "inconclusive"
-    assert classify_use(True, found, None).verdict == "used"
+    places = {
+        None: "",
+        (): "no place that was tried carries half of it",
+        ("backbone.02",): "passes at backbone.02",
+        ("kv.02",): "read at kv.02",
+        ("backbone.01", "kv.02", "backbone.02"): "passes at backbone.01, backbone.02; read at kv.02",
+    }
+    for located, expected in places.items():
+        use = classify_use(True, found, None, located)
+        assert (use.behaviour, use.place) == ("used", expected)

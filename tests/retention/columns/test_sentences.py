@@ -58,21 +58,35 @@ PARTS: dict[str, dict[str, Any]] = {
 }
 
 
-def swap(follow: float, reversal: float, ci: tuple[float, float], p: float, reversal_p: float) -> ImageSwapEffect:
+def swap(
+    follow: float,
+    reversal: float,
+    ci: tuple[float, float],
+    p: float,
+    reversal_p: float,
+    share: float,
+    spread: float = 0.03,
+    reached: tuple[float, float] = (0.9, 0.9),
+) -> ImageSwapEffect:
+    """share: displacement, of the reach, give or take `spread`."""
     return ImageSwapEffect(
         category="color", n_episodes=48, n_items=24, n_groups=12, follow_rate=follow, reversal_rate=reversal,
         net_follow_rate=follow - reversal, net_follow_rate_ci=ci, follow_p=p, reversal_p=reversal_p,
-        median_displacement=0.1,
+        median_displacement=0.1, reach=0.3, reach_source="actions", reach_share=share,
+        reach_share_ci=(share - spread, share + spread), moved_share=abs(share), left_reached=reached[0],
+        right_reached=reached[1],
     )  # fmt: skip
 
 
-FOLLOWS = swap(0.92, 0.02, (0.6, 1.0), 0.001, 1.0)
+FOLLOWS = swap(0.92, 0.02, (0.6, 1.0), 0.001, 1.0, 0.9)
 SWAPS: dict[str, ImageSwapEffect | None] = {
     "no swap": None,
     "follows": FOLLOWS,
-    "reverses": swap(0.0, 0.9, (-1.0, -0.6), 1.0, 0.001),
-    "does not follow": swap(0.04, 0.02, (-0.1, 0.12), 0.6, 0.6),
-    "open": swap(0.2, 0.1, (-0.1, 0.42), 0.3, 0.9),
+    "reverses": swap(0.0, 0.9, (-1.0, -0.6), 1.0, 0.001, -0.9),
+    "does not follow": swap(0.04, 0.02, (-0.1, 0.12), 0.6, 0.6, 0.02),
+    "open": swap(0.2, 0.1, (-0.1, 0.42), 0.3, 0.9, 0.1, 0.2),
+    "one side": swap(0.04, 0.02, (-0.1, 0.12), 0.001, 1.0, 0.5, reached=(1.0, 0.0)),
+    "moves": swap(0.04, 0.02, (-0.1, 0.12), 0.001, 1.0, 0.3, reached=(0.0, 0.0)),
 }
 CONTROL = {"shape": replace(FOLLOWS, category="shape")}
 """Another category that follows."""
@@ -124,9 +138,13 @@ def test_each_effect_of_a_swap_has_its_own_words() -> None:
         "follows": "the action follows a swap of the pictures in 92 % of episodes (net of reversals 60 to 100 %)",
         "reverses": "the action goes against the pictures, swapped or not, in 90 % of episodes",
         "does not follow": "the action does not follow a swap of the pictures (in 4 % of episodes, net of "
-        "reversals at most 12 %)",
+        "reversals -10 to 12 %, moved by 0.02 of its reach)",
         "open": "whether the action follows a swap of the pictures is open (in 20 % of episodes, net of reversals "
-        "-10 to 42 %)",
+        "-10 to 42 %, moved by 0.10 of its reach)",
+        "one side": "the action follows a swap of the pictures in part (in 4 % of episodes, net of reversals -10 "
+        "to 12 %, moved by 0.50 of its reach)",
+        "moves": "the action follows a swap of the pictures in part (in 4 % of episodes, net of reversals -10 to "
+        "12 %, moved by 0.30 of its reach)",
     }  # fmt: skip
     for *_, swapped, row in ALL:
         text = describe_category(row)
@@ -138,11 +156,15 @@ def test_each_effect_of_a_swap_has_its_own_words() -> None:
 def test_use_is_concluded_from_a_swap_and_knowledge_never_beside_an_interval_that_includes_one_half() -> None:
     for rate_, backbone, _, swapped, row in ALL:
         text = conclusion(row)
-        if "The answer is used." in text:
-            assert (swapped, backbone) in (("follows", "shown"), ("follows", "no score"))
+        assert ("The answer is used" in text) == (swapped in ("follows", "reverses")), text
+        assert ("The answer is used, against the correct picture" in text) == (swapped == "reverses"), text
         if "The policy acts on the answer" in text:
-            assert rate_ == "knowledge" or swapped == "follows", text
+            assert (rate_, swapped) == ("knowledge", "no swap"), text
         assert "probes did not find it" not in text or backbone != "not probed", text
+        is_untested = "hether it is used was not tested" in text
+        assert is_untested <= (swapped == "no swap"), text
+        if swapped == "no swap" and rate_ != "none":
+            assert is_untested or verdict(row) in ("absent", "not shown"), text
 
 
 def test_a_rate_that_is_no_knowledge_beside_an_interval_without_one_half_says_by_which_margin() -> None:
@@ -176,14 +198,17 @@ def test_absence_is_said_of_a_bounded_backbone_only_and_more_items_are_asked_for
             ("knowledge", "shown", "shown", "follows"),
             "(24 items): the backbone holds the answer (98 %, 88 to 100); so does the action expert (98 %, 88 to "
             "100); the action follows a swap of the pictures in 92 % of episodes (net of reversals 60 to 100 %), "
-            "and the cube ends on the correct picture in 94 %, 84 to 100. The answer is used.",
+            "and the cube ends on the correct picture in 94 %, 84 to 100. The answer is used; whether the "
+            "readable copy is the one used was not tested.",
         ),
         (
             ("guessing", "shown", "absent", "does not follow"),
             "(24 items): the backbone holds the answer (98 %, 88 to 100); the action expert does not hold it (50 "
             "%, at most 62 %); the action does not follow a swap of the pictures (in 4 % of episodes, net of "
-            "reversals at most 12 %), and the cube ends on the correct picture in 54 %, 34 to 74. Shown in the "
-            "backbone, not used.",
+            "reversals -10 to 12 %, moved by 0.02 of its reach), and the cube ends on the correct picture in "
+            "54 %, 34 to 74. The answer is not used in the first chunk: within 0.1 of its reach and 0.25 of the "
+            "episodes (moved by 0.02 [-0.01, 0.05] of its reach, net follow rate 0.02 [-0.10, 0.12]); positive "
+            "control: shape.",
         ),
         (
             ("guessing", "at chance", "absent", "no swap"),
@@ -199,18 +224,19 @@ def test_a_sentence_says_numbers_uncertainty_items_and_what_follows(parts: Any, 
 
 CONCLUSIONS = """
 knowledge | shown | no swap | acted on
-Whether what is read is used was not tested: run `probe-kit intervene`.
+The policy acts on the answer; whether it is used was not tested: run `probe-kit intervene`.
 
 guessing | shown | no swap | encoded, not acted on
-Shown in the backbone; not shown that the policy acts on the answer. To test whether it is used, run
+Shown in the backbone; not shown that the policy acts on the answer; whether it is used was not tested: run
 `probe-kit intervene`.
 
 wrong | shown | no swap | encoded, not acted on
-Shown in the backbone; the policy is right less often than guessing. To test whether it is used, run
+Shown in the backbone; the policy is right less often than guessing; whether it is used was not tested: run
 `probe-kit intervene`.
 
 knowledge | at chance | no swap | acted on, not found
-The policy acts on the answer, and the probes did not find it.
+The policy acts on the answer; the probes did not find it; whether it is used was not tested: run `probe-kit
+intervene`.
 
 guessing | absent | no swap | absent
 Absent from the backbone; not shown that the policy acts on the answer: more items would tell.
@@ -234,52 +260,73 @@ none | shown | no swap | encoded
 Shown in the backbone.
 
 knowledge | not probed | no swap | acted on
-The policy acts on the answer. The backbone was not probed: run `probe-kit train`.
+The policy acts on the answer; whether it is used was not tested: run `probe-kit intervene`. The backbone was
+not probed: run `probe-kit train`.
 
 misses | not probed | no swap | not shown
-The policy is right less often than guessing. The backbone was not probed: run `probe-kit train`.
+The policy is right less often than guessing; whether it is used was not tested: run `probe-kit intervene`. The
+backbone was not probed: run `probe-kit train`.
 
 guessing | not probed | no swap | not shown
-Not shown that the policy acts on the answer. The backbone was not probed: run `probe-kit train`.
+Not shown that the policy acts on the answer; whether it is used was not tested: run `probe-kit intervene`. The
+backbone was not probed: run `probe-kit train`.
 
 none | not probed | no swap | not shown
 The backbone was not probed: run `probe-kit train`.
 
 guessing | shown | follows | used
-The answer is used.
+The answer is used; whether the readable copy is the one used was not tested.
 
-knowledge | absent | follows | acted on, not found
-The policy acts on the answer, and the probes did not find it.
+knowledge | absent | follows | used
+The answer is used; no readable copy found.
 
-knowledge | not probed | follows | follows
-The backbone was not probed: run `probe-kit train`.
+knowledge | not probed | follows | used
+The answer is used. The backbone was not probed: run `probe-kit train`.
 
-wrong | shown | reverses | encoded, acted against
-Shown in the backbone; the policy acts against it.
+wrong | shown | reverses | against: used
+The answer is used, against the correct picture; whether the readable copy is the one used was not tested.
 
-wrong | at chance | reverses | acted against, not found
-The policy acts against the answer, and the probes did not find it.
+wrong | at chance | reverses | against: used
+The answer is used, against the correct picture; no readable copy found.
 
-wrong | not probed | reverses | acts against
-The backbone was not probed: run `probe-kit train`.
+wrong | not probed | reverses | against: used
+The answer is used, against the correct picture. The backbone was not probed: run `probe-kit train`.
 
-guessing | shown | does not follow | encoded, unused
-Shown in the backbone, not used.
+guessing | shown | does not follow | not used
+The answer is not used in the first chunk: within 0.1 of its reach and 0.25 of the episodes (moved by 0.02
+[-0.01, 0.05] of its reach, net follow rate 0.02 [-0.10, 0.12]); positive control: shape.
 
-knowledge | shown | does not follow | encoded, unused
-Shown in the backbone, not used. Yet the policy succeeds: actions after the first inference may follow.
+knowledge | shown | does not follow | not used
+The answer is not used in the first chunk: within 0.1 of its reach and 0.25 of the episodes (moved by 0.02
+[-0.01, 0.05] of its reach, net follow rate 0.02 [-0.10, 0.12]); positive control: shape. Yet the policy
+succeeds: actions after the first inference may follow.
 
 guessing | absent | does not follow | absent
-Absent from the backbone; the action does not follow the pictures.
+Absent from the backbone. The answer is not used in the first chunk: within 0.1 of its reach and 0.25 of the
+episodes (moved by 0.02 [-0.01, 0.05] of its reach, net follow rate 0.02 [-0.10, 0.12]); positive control:
+shape.
 
 guessing | at chance | does not follow | not shown
-The action does not follow the pictures; not shown in the backbone: more items would tell.
+Not shown in the backbone: more items would tell. The answer is not used in the first chunk: within 0.1 of its
+reach and 0.25 of the episodes (moved by 0.02 [-0.01, 0.05] of its reach, net follow rate 0.02 [-0.10, 0.12]);
+positive control: shape.
 
-none | not probed | does not follow | does not follow
-The backbone was not probed: run `probe-kit train`.
+none | not probed | does not follow | not used
+The answer is not used in the first chunk: within 0.1 of its reach and 0.25 of the episodes (moved by 0.02
+[-0.01, 0.05] of its reach, net follow rate 0.02 [-0.10, 0.12]); positive control: shape. The backbone was not
+probed: run `probe-kit train`.
 
 guessing | shown | open | inconclusive
-Whether the answer is used remains open: a net rate of 25 % would count, and more items would tell.
+Whether the answer is used remains open: moved by 0.10 [-0.10, 0.30] of its reach, net follow rate 0.10 [-0.10,
+0.42].
+
+guessing | shown | one side | partly used, one-sided (left)
+The answer is partly used, one-sided (left) in the first chunk; whether the readable copy is the one used was
+not tested.
+
+guessing | shown | moves | moves with it, does not decide
+The answer moves the action in the first chunk, does not decide: moved by 0.30 [0.27, 0.33] of its reach,
+net follow rate 0.02 [-0.10, 0.12]; whether the readable copy is the one used was not tested.
 """
 """Success rate, backbone, swap and verdict; then the conclusion."""
 
@@ -298,15 +345,17 @@ def test_each_verdict_has_its_conclusion(rate_: str, backbone: str, swapped: str
 
 
 def test_an_open_verdict_says_what_is_missing_where_items_are_not() -> None:
+    alone = conclusion(combination("guessing", "shown", "shown", "does not follow", control=False))
+    assert alone.startswith("Whether the answer is used remains open: within 0.1 of its reach")
+    assert alone.endswith("no other category of the run is used, so that use is not known to show.")
+
+
+def test_the_place_is_named_behind_the_behaviour() -> None:
+    tie = "whether the readable copy is the one used was not tested."
     nowhere = combination("knowledge", "shown", "shown", "follows", located=())
-    assert conclusion(nowhere) == (
-        "Whether the answer is used remains open: it follows, and no place that was tried carries half of that."
-    )
-    alone = combination("guessing", "shown", "shown", "does not follow", control=False)
-    assert conclusion(alone) == (
-        "Whether the answer is used remains open: no other category of the run follows, so following is not known "
-        "to show."
-    )
+    assert conclusion(nowhere) == f"The answer is used; no place that was tried carries half of it; {tie}"
+    somewhere = combination("knowledge", "shown", "shown", "follows", located=("backbone.02",))
+    assert conclusion(somewhere) == f"The answer is used; passes at backbone.02; {tie}"
 
 
 def test_without_trajectories_nothing_is_said_of_acting_and_a_stored_swap_is() -> None:

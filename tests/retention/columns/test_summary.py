@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from probe_kit.intervene import Behaviour, UseVerdict
 from probe_kit.retention import RetentionRow, RetentionTable
 from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
 from probe_kit.retention.columns.summary import HEADINGS, MARK, summarise_runs, summary_table
@@ -41,7 +42,7 @@ def answers(category: str, sr: float = 1.0, picture: str | None = None, **run: A
 
 
 def acts(
-    category: str, backbone: float | None, used: str | None, sr: float | None = 0.5, **run: Any
+    category: str, backbone: float | None, used: Behaviour | None, sr: float | None = 0.5, **run: Any
 ) -> RetentionRow:
     shown = backbone is not None and backbone > 0.7
     part: dict[str, Any] = {"score": backbone, "ci": (0.4, 1.0), "at_most": 0.78, "exceeds": {"chance": shown}}
@@ -53,7 +54,7 @@ def acts(
         action=ActionPart(**part),
         retention=RetentionPart(value=1.0, ci=(0.8, 1.2), defined=shown),
         image_swap=SwapEffect(
-            used=used, response="does not follow", follow_rate=0.04, net_follow_rate_ci=(-0.1, 0.12)
+            follow_rate=0.04, net_follow_rate_ci=(-0.1, 0.12), use=UseVerdict(behaviour=used, reason="by the swap")
         )
         if used
         else SwapEffect(),
@@ -62,8 +63,8 @@ def acts(
 
 ASKED = [answers("color"), answers("state"), answers("counting", 0.5), answers(MEAN, 0.83)]
 ACTED = [
-    acts("color", 1.0, "used", 0.9375), acts("state", 0.979, "encoded, unused", 0.66),
-    acts("counting", 0.52, "absent"), acts(MEAN, 0.83, None),
+    acts("color", 1.0, "used", 0.9375), acts("state", 0.979, "not used", 0.66),
+    acts("counting", 0.52, "not used"), acts(MEAN, 0.83, None),
 ]  # fmt: skip
 
 
@@ -118,7 +119,7 @@ def test_the_terminal_shows_one_table_at_any_width_and_ends_on_the_sentences(wid
     text = printed.get()
     assert text.count("category") == 1, "one header: one table, and it is not split"
     assert ("[40, 100]" in text.split("Color (24")[0]) == (width >= 120)
-    assert " ".join(text.split()).endswith("not shown in the backbone: more items would tell.")
+    assert " ".join(text.split()).endswith("The answer is not used in the first chunk: by the swap.")
 
 
 def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:

@@ -1,36 +1,40 @@
 """What image swaps did, per category. Reads stored outcomes; needs no model."""
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.intervene.kinds.base import Measurement
+from probe_kit.intervene.kinds.reach import REACHED, TILES_APART, Reach, tiles_apart
 from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, ConditionOutcomes
 from probe_kit.intervene.store.selection import preferred_by_category
+from probe_kit.intervene.store.settings import FIRST_CHUNK
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_signs import paired_greater_p
-from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.student import unbounded_student_interval
 from probe_kit.train.data.run_reader import RunReader
 
 NAME = "image-swap"
 SMALLEST_EFFECT_OF_INTEREST = 0.25
-"""Net follow rate from which the action is said to follow."""
-
-Response = Literal["follows", "reverses", "does not follow", "open"]
-"""What the action does when the pictures are swapped; `open` where its interval leaves room for following."""
+"""Net follow rate below which a category is not acted on; of the closed loop and the erasure too."""
 
 
 @dataclass(frozen=True)
 class ImageSwapEffect:
-    """Whether the action follows the pictures, in one category.
+    """What the swap did to the actions, in one category.
 
     follow_rate: share of episodes in which the action goes to the correct picture, and to the other side once the
     two are swapped; reversal_rate: in which it does the reverse. net_follow_rate: their
     difference, with its 95 % interval by groups. follow_p, reversal_p: exact, one-sided: an item's action moves
     toward (away from) the correct picture more often than by chance; the larger of by items and by groups.
-    median_displacement: metres between the two actions. key: of the stored intervention.
+    median_displacement: metres between the two actions. reach, reach_source: see `Reach`. reach_share: mean
+    displacement toward the correct picture in units of the reach, 1 for a whole change of sides, with Student's
+    95 % interval by groups. moved_share: the same whichever way the action moves. left_reached, right_reached: of
+    the episodes with the correct picture on that side, the share that reaches it (beyond a quarter of the reach
+    from the middle), minus that share with swapped images. readout: `first-chunk` or `per-step`, of all
+    displacements. key: of the stored intervention.
     """
 
     category: str
@@ -44,31 +48,15 @@ class ImageSwapEffect:
     follow_p: float
     reversal_p: float
     median_displacement: float
+    reach: float
+    reach_source: str
+    reach_share: float
+    reach_share_ci: tuple[float, float]
+    moved_share: float
+    left_reached: float
+    right_reached: float
+    readout: str = FIRST_CHUNK
     key: str = ""
-
-    @property
-    def follows_images(self) -> bool:
-        """Beyond chance, and in enough episodes to matter."""
-        return self.follow_p < SIGNIFICANCE and self.net_follow_rate >= SMALLEST_EFFECT_OF_INTEREST
-
-    @property
-    def is_against(self) -> bool:
-        """The mirror of it."""
-        return self.reversal_p < SIGNIFICANCE and self.net_follow_rate <= -SMALLEST_EFFECT_OF_INTEREST
-
-    @property
-    def is_bounded(self) -> bool:
-        """Whether the interval leaves no room for following that matters."""
-        return self.net_follow_rate_ci[1] < SMALLEST_EFFECT_OF_INTEREST
-
-    @property
-    def response(self) -> Response:
-        """The same three in a word."""
-        if self.follows_images:
-            return "follows"
-        if self.is_against:
-            return "reverses"
-        return "does not follow" if self.is_bounded else "open"
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -77,23 +65,40 @@ class ImageSwapEffect:
 
 def measured_image_swap(measurement: Measurement) -> list[ImageSwapEffect]:
     """The effects of a stored image swap."""
-    return image_swap_effects(measurement.outcomes, measurement.suite, measurement.key)
+    return image_swap_effects(
+        measurement.outcomes, measurement.suite, measurement.key, measurement.readout, measurement.tiles_apart
+    )
 
 
-def image_swap_effects(outcomes: ConditionOutcomes, suite: str, key: str = "") -> list[ImageSwapEffect]:
-    """One per category, in the order of the episodes. suite: its identity, of which intervals are drawn."""
+def image_swap_effects(
+    outcomes: ConditionOutcomes,
+    suite: str,
+    key: str = "",
+    readout: str = FIRST_CHUNK,
+    tiles_apart: float = TILES_APART,
+) -> list[ImageSwapEffect]:
+    """One per category, in the order of the episodes.
+
+    suite: its identity, of which intervals are drawn. readout: of the intervention. tiles_apart: metres, for
+    policies without a reach of their own.
+    """
+    reach = Reach.of(outcomes.of(CLEAN), tiles_apart)
     return [
-        ImageSwapEffect(**swap_columns(own, category, IMAGE_SWAP, suite), key=key)
+        ImageSwapEffect(**swap_columns(own, category, IMAGE_SWAP, suite, reach), readout=readout, key=key)
         for category, own in outcomes.by_category()
     ]
 
 
-def swap_columns(outcomes: ConditionOutcomes, category: str, swapped: str, suite: str) -> dict[str, Any]:
+def swap_columns(
+    outcomes: ConditionOutcomes, category: str, swapped: str, suite: str, reach: Reach
+) -> dict[str, Any]:
     """The columns of `ImageSwapEffect` of one category. swapped: compared with the clean condition."""
     clean, other = (outcomes.correct_sign * outcomes.of(name) for name in (CLEAN, swapped))
     follows, reverses = (clean > 0) & (other < 0), (clean < 0) & (other > 0)
     net = follows.astype(float) - reverses
     displacement = clean - other
+    shares = displacement / reach.metres
+    follow_p, reversal_p = swap_p_values(outcomes, swapped)
     return {
         "category": category,
         "n_episodes": net.size,
@@ -103,10 +108,33 @@ def swap_columns(outcomes: ConditionOutcomes, category: str, swapped: str, suite
         "reversal_rate": float(reverses.mean()),
         "net_follow_rate": float(net.mean()),
         "net_follow_rate_ci": net_interval(net, outcomes, suite),
-        "follow_p": paired_greater_p(displacement, outcomes.items, outcomes.groups),
-        "reversal_p": paired_greater_p(-displacement, outcomes.items, outcomes.groups),
+        "follow_p": follow_p,
+        "reversal_p": reversal_p,
         "median_displacement": float(np.median(np.abs(displacement))),
+        "reach": reach.metres,
+        "reach_source": reach.source,
+        "reach_share": float(shares.mean()),
+        "reach_share_ci": unbounded_student_interval(shares, outcomes.groups),
+        "moved_share": float(np.abs(shares).mean()),
+        **{f"{side}_reached": _reached(outcomes.sides == side, clean, other, reach) for side in ("left", "right")},
     }
+
+
+def swap_p_values(outcomes: ConditionOutcomes, swapped: str = IMAGE_SWAP) -> tuple[float, float]:
+    """Whether actions move toward the correct picture, and whether away from it; of one category."""
+    displacement = outcomes.correct_sign * (outcomes.of(CLEAN) - outcomes.of(swapped))
+    toward, away = (paired_greater_p(sign * displacement, outcomes.items, outcomes.groups) for sign in (1.0, -1.0))
+    return toward, away
+
+
+def _reached(
+    there: NDArray[np.bool_], clean: NDArray[np.float64], other: NDArray[np.float64], reach: Reach
+) -> float:
+    """By how much more often the side of the correct picture is reached; 0 where it never lies there."""
+    if not there.any():
+        return 0.0
+    near, far = (values[there] > REACHED * reach.metres for values in (clean, other))
+    return float(near.mean() - far.mean())
 
 
 def net_interval(net: NDArray[np.float64], outcomes: ConditionOutcomes, suite: str) -> tuple[float, float]:
@@ -122,11 +150,13 @@ def stored_image_swaps(run: RunReader) -> dict[str, ImageSwapEffect]:
     Of several the preferred one, see `store.selection`; empty if there is none. Raises RunDamagedError if any
     stored intervention was changed.
     """
-    return {
-        category: row
-        for category, result in preferred_by_category(run, NAME).items()
-        for row in image_swap_effects(result.outcomes, run.suite, result.stored.key)
-    }
+    preferred = preferred_by_category(run, NAME)
+    apart, rows = tiles_apart(run), dict[str, dict[str, ImageSwapEffect]]()
+    for stored in {result.stored.key: result.stored for result in preferred.values()}.values():
+        readout = str(stored.settings.get("readout", FIRST_CHUNK))
+        found = image_swap_effects(stored.outcomes(), run.suite, stored.key, readout, apart)
+        rows[stored.key] = {row.category: row for row in found}
+    return {category: rows[result.stored.key][category] for category, result in preferred.items()}
 
 
 def image_swaps_in_use(run: RunReader) -> set[str]:

@@ -1,36 +1,247 @@
-"""The verdict: is what can be read also used? Loads no model."""
+"""The verdict: does the action use the answer, and where inside does it pass? Loads no model.
+
+`classify_use` alone makes a verdict. Three questions have answers of their own: the behaviour (of the image swap),
+the place (of interchanges) and the tie (is what probes read the thing that is used?).
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
+from math import inf
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
 
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST, ImageSwapEffect
+from probe_kit.intervene.store.settings import FIRST_CHUNK
+from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.suite.items import Side
 
 if TYPE_CHECKING:
     from probe_kit.train.results.probe_results import ProbeResults
 
-Verdict = Literal[
+Behaviour = Literal[
     "used",
-    "encoded, unused",
-    "encoded, acted against",
-    "absent",
-    "acted on, not found",
-    "acted against, not found",
-    "follows",
-    "acts against",
-    "does not follow",
+    "partly used, one-sided",
+    "partly used, graded",
+    "moves with it, does not decide",
+    "not used",
     "inconclusive",
 ]
+USES: tuple[Behaviour, ...] = ("used", "partly used, one-sided", "partly used, graded")
+"""Those in which the answer decides something."""
+SMALLEST_SHARE_OF_INTEREST = 0.10
+"""Of the reach. A displacement below it is a trace."""
+DECIDES = 0.50
+"""Net follow rate, and share of the reach, from which the answer decides; of the episodes of one side as well."""
+FEW = 0.10
+"""Net follow rate from which single decisions count."""
+TRACE = 0.01
+"""Of the reach. A displacement below it is not worth a sentence."""
+NO_COPY, NOT_TESTED = "no readable copy found", "whether the readable copy is the one used was not tested"
+NOT_LOCATED = "no place that was tried carries half of it"
+OF_FIRST_CHUNK = "verdicts other than used are of the first chunk; --readout per-step gives those of the episode"
+UNTESTED = "whether it is used was not tested"
+"""What is said without an image swap."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class UseVerdict:
-    """A verdict, and in a few words what it rests on or why there is none."""
+    """Whether the action uses the answer, where it passes, and whether what probes read is what is used.
 
-    verdict: Verdict
-    reason: str = ""
+    behaviour: of the image swap. reason: the numbers it rests on, or why there is none. reversed: the same, away
+    from the correct picture. side: of a behaviour that is one-sided. place: where interchanges found that the
+    answer passes or is read; empty if none was stored. tie: between the readable copy and the behaviour; empty
+    without probes. readout: `first-chunk` or `per-step`. lacks_control: whether *not used* is missing nothing but
+    another category of the run that is used.
+    """
+
+    behaviour: Behaviour
+    reason: str
+    reversed: bool = False
+    side: Side | None = None
+    place: str = ""
+    tie: str = ""
+    readout: str = FIRST_CHUNK
+    lacks_control: bool = False
+
+    @property
+    def is_used(self) -> bool:
+        """Whether it decides something, wholly or in part, toward the correct picture or away from it."""
+        return self.behaviour in USES
+
+    @property
+    def verdict(self) -> str:
+        """The behaviour, its direction and its side."""
+        return f"{'against: ' * self.reversed}{self.behaviour}{f' ({self.side})' if self.side else ''}"
+
+    @property
+    def is_of_first_chunk(self) -> bool:
+        """Whether later chunks may differ: what is used in the first one is used, anything less may be more."""
+        return self.readout == FIRST_CHUNK and self.behaviour not in ("used", "inconclusive")
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether both intervals exclude a use that would matter."""
+        return self.behaviour == "not used" or self.lacks_control
+
+    @property
+    def explanation(self) -> str:
+        """Reason, place and tie."""
+        return "; ".join(filter(None, (self.reason, self.place, self.tie)))
+
+    @property
+    def sentence(self) -> str:
+        """Behaviour, place and tie; with the reason where it is not used."""
+        readout = " in the first chunk" * self.is_of_first_chunk
+        against = ", against the correct picture" * self.reversed
+        side = f" ({self.side})" if self.side else ""
+        words = {
+            "inconclusive": "Whether the answer is used remains open",
+            "moves with it, does not decide": f"The answer moves the action{readout}{against}, does not decide",
+        }.get(self.behaviour, f"The answer is {self.behaviour}{side}{readout}{against}")
+        reason = "" if self.is_used else f": {self.reason}"
+        return "; ".join(filter(None, (f"{words}{reason}", self.place, self.tie))) + "."
+
+
+# -- behaviour -------------------------------------------------------------------------------------------------
+
+
+class _Seen(NamedTuple):
+    """The numbers of an effect toward the correct picture, or of its mirror. ends: of the intervals."""
+
+    p: float
+    follow: float
+    follow_ends: tuple[float, float]
+    share: float
+    share_ends: tuple[float, float]
+    reached: Mapping[Side, float]
+
+    @classmethod
+    def of(cls, found: ImageSwapEffect, mirrored: bool) -> "_Seen":
+        reached: dict[Side, float] = {"left": found.left_reached, "right": found.right_reached}
+        toward = cls(
+            found.follow_p, found.net_follow_rate, found.net_follow_rate_ci, found.reach_share,
+            found.reach_share_ci, reached,
+        )  # fmt: skip
+        if not mirrored:
+            return toward
+        low, high = found.net_follow_rate_ci
+        least, most = found.reach_share_ci
+        return cls(
+            found.reversal_p, -toward.follow, (-high, -low), -toward.share, (-most, -least),
+            {side: -value for side, value in reached.items()},
+        )  # fmt: skip
+
+    @property
+    def only_side(self) -> Side | None:
+        """The side that is reached where the answer lies there, if the other one is not."""
+        left, right = self.reached["left"], self.reached["right"]
+        if max(left, right) < DECIDES or min(left, right) >= SMALLEST_EFFECT_OF_INTEREST:
+            return None
+        return "left" if left > right else "right"
+
+    def behaviour(self) -> Behaviour | None:
+        """What it shows; None if that is nothing."""
+        is_moved = self.share_ends[0] > SMALLEST_SHARE_OF_INTEREST
+        decides = self.follow_ends[0] > 0
+        if self.p >= SIGNIFICANCE:
+            return None
+        if decides and self.follow >= DECIDES and self.share >= DECIDES:
+            return "used"
+        if is_moved and self.only_side is not None:
+            return "partly used, one-sided"
+        if decides and self.follow >= FEW and self.share_ends[0] > 0:
+            return "partly used, graded"
+        if not is_moved:
+            return None
+        is_bounded = self.follow_ends[1] < SMALLEST_EFFECT_OF_INTEREST
+        return "moves with it, does not decide" if is_bounded else "partly used, graded"
+
+
+def classify_behaviour(found: ImageSwapEffect, control: str | None) -> UseVerdict:
+    """The verdict of the image swap alone.
+
+    control: another category of the run that is used, which shows that use would have been seen; None if there is
+    none, and then nothing is *not used*.
+    """
+    for mirrored in (False, True):
+        seen = _Seen.of(found, mirrored)
+        behaviour = seen.behaviour()
+        if behaviour is not None:
+            side = seen.only_side if behaviour == "partly used, one-sided" else None
+            return UseVerdict(
+                behaviour=behaviour, reason=_measured(found), reversed=mirrored, side=side, readout=found.readout
+            )
+    if not is_bounded(found):
+        return UseVerdict(behaviour="inconclusive", reason=_open(found), readout=found.readout)
+    bound = (
+        f"within {SMALLEST_SHARE_OF_INTEREST} of its reach and {SMALLEST_EFFECT_OF_INTEREST} of the episodes "
+        f"({_measured(found)})"
+    )
+    if control is None:
+        reason = f"{bound}, and no other category of the run is used, so that use is not known to show"
+        return UseVerdict(behaviour="inconclusive", reason=reason, readout=found.readout, lacks_control=True)
+    reason = f"{_trace(found)}{bound}; positive control: {control}"
+    return UseVerdict(behaviour="not used", reason=reason, readout=found.readout)
+
+
+def is_bounded(found: ImageSwapEffect) -> bool:
+    """Whether both intervals exclude, on both sides, what would matter."""
+    (low, high), (least, most) = found.net_follow_rate_ci, found.reach_share_ci
+    flips, share = SMALLEST_EFFECT_OF_INTEREST, SMALLEST_SHARE_OF_INTEREST
+    return -flips < low and high < flips and -share < least and most < share
+
+
+@cache
+def groups_for_not_used() -> int:
+    """The fewest groups of items with which *not used* can be found at all, in episodes that never follow."""
+    for count in range(2, 1000):
+        low, high = group_bootstrap(np.zeros((count, 1)), np.arange(count), 0, bounds=GAINS)
+        if max(-low[0], high[0]) < SMALLEST_EFFECT_OF_INTEREST:
+            return count
+    raise AssertionError("no number of groups bounds the net follow rate")
+
+
+def _measured(found: ImageSwapEffect) -> str:
+    """Displacement and net follow rate with their intervals."""
+    return (
+        f"moved by {found.reach_share:.2f} {_ends(found.reach_share_ci)} of its reach, net follow rate "
+        f"{found.net_follow_rate:.2f} {_ends(found.net_follow_rate_ci)}"
+    )
+
+
+def _open(found: ImageSwapEffect) -> str:
+    """Why it is inconclusive."""
+    is_other = (
+        found.moved_share >= SMALLEST_EFFECT_OF_INTEREST
+        and abs(found.reach_share) < found.moved_share / 2
+        and min(found.follow_p, found.reversal_p) >= SIGNIFICANCE
+    )
+    if is_other:
+        return (
+            f"the images move it by {found.moved_share:.2f} of its reach, the answer by {found.reach_share:.2f} "
+            f"{_ends(found.reach_share_ci)}: it depends on something else in the images, or the items are too few"
+        )
+    needed = groups_for_not_used()
+    too_few = f"; *not used* needs {needed} groups of items, there are {found.n_groups}"
+    return f"{_measured(found)}{too_few * (found.n_groups < needed)}"
+
+
+def _trace(found: ImageSwapEffect) -> str:
+    if min(found.follow_p, found.reversal_p) >= SIGNIFICANCE or abs(found.reach_share) <= TRACE:
+        return ""
+    return f"but for a trace of {100 * found.reach_share * found.reach:.1f} cm: "
+
+
+def _ends(limits: tuple[float, float]) -> str:
+    return "[no interval]" if inf in limits else f"[{limits[0]:.2f}, {limits[1]:.2f}]"
+
+
+# -- with what else is stored ----------------------------------------------------------------------------------
 
 
 def classify_use(
@@ -40,34 +251,18 @@ def classify_use(
     located: Sequence[str] | None = None,
     carried: Sequence[str] = (),
 ) -> UseVerdict:
-    """The verdict of probes and the image swap together.
+    """The verdict of the image swap, with what interchanges and probes say of it.
 
     encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
-    without probes. control: another category of the run that follows, which shows that following would have been
-    seen; None if there is none, and then nothing is called encoded and unused. located: places that carry half of
-    the effect, if an interchange searched for them; where it did and found none, nothing is called used. carried:
-    places and the directions along which half of it passes there.
+    without probes. control: see `classify_behaviour`. located: places that carry half of the effect, if an
+    interchange searched for them. carried: places and the directions along which half of it passes there.
     """
-    if found.follows_images:
-        if encoded and located is not None:
-            if not located:
-                return UseVerdict("inconclusive", "it follows, and no place that was tried carries half of that")
-            return UseVerdict("used", describe_sites(located, carried))
-        return UseVerdict(_by(encoded, "used", "acted on, not found", "follows"))
-    if found.is_against:
-        return UseVerdict(_by(encoded, "encoded, acted against", "acted against, not found", "acts against"))
-    if not found.is_bounded:
-        low, high = found.net_follow_rate_ci
-        return UseVerdict(
-            "inconclusive",
-            f"the net follow rate may lie from {low:.2f} to {high:.2f}; {SMALLEST_EFFECT_OF_INTEREST} would count",
-        )
-    if encoded and control is None:
-        return UseVerdict(
-            "inconclusive", "no other category of the run follows, so following is not known to show"
-        )
-    reason = f"positive control: {control}" if encoded and control else ""
-    return UseVerdict(_by(encoded, "encoded, unused", "absent", "does not follow"), reason)
+    own = classify_behaviour(found, control)
+    if own.behaviour in ("not used", "inconclusive"):
+        return own
+    place = "" if located is None else describe_sites(located, carried) or NOT_LOCATED
+    tie = "" if encoded is None else NOT_TESTED if encoded else NO_COPY
+    return replace(own, place=place, tie=tie)
 
 
 def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
@@ -83,14 +278,10 @@ def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
     return "; ".join(parts)
 
 
-def _by(encoded: bool | None, yes: Verdict, no: Verdict, unknown: Verdict) -> Verdict:
-    return unknown if encoded is None else yes if encoded else no
-
-
 def control_for(category: str, found: Mapping[str, ImageSwapEffect]) -> str | None:
-    """Another category of the run that follows, the one that does so most; None if there is none."""
-    others = [one for one in found.values() if one.category != category and one.follows_images]
-    return max(others, key=lambda one: one.net_follow_rate).category if others else None
+    """Another category of the run that is used, the one in which most episodes follow; None if there is none."""
+    others = [one for one in found.values() if one.category != category and classify_behaviour(one, None).is_used]
+    return max(others, key=lambda one: abs(one.net_follow_rate)).category if others else None
 
 
 def classify_all(

@@ -10,6 +10,7 @@ import numpy as np
 
 from probe_kit.intervene.kinds.base import Measurement
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, swap_columns
+from probe_kit.intervene.kinds.reach import Reach
 from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, ConditionOutcomes
 
 _CONDITIONS = {"instruction": INSTRUCTION_SWAP, "images": IMAGE_SWAP, "noise": NOISE}
@@ -45,9 +46,11 @@ class InstructionSwapEffect(ImageSwapEffect):
 
 def instruction_swap_effects(measurement: Measurement) -> list[InstructionSwapEffect]:
     """One per category, in the order of the episodes."""
+    reach = Reach.of(measurement.outcomes.of(CLEAN), measurement.tiles_apart)
     return [
         InstructionSwapEffect(
-            **swap_columns(own, category, INSTRUCTION_SWAP, measurement.suite),
+            **swap_columns(own, category, INSTRUCTION_SWAP, measurement.suite, reach),
+            readout=measurement.readout,
             key=measurement.key,
             sensitivity=input_sensitivity(own),
         )

@@ -1,0 +1,128 @@
+"""The verdict of what a swap did: its thresholds, its mirror, and how often it is wrong by chance."""
+
+import re
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import probe_kit
+from probe_kit.intervene import ImageSwapEffect, classify_all, classify_use
+from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
+from probe_kit.intervene.kinds.image_swap.verdict import classify_behaviour, groups_for_not_used
+from tests.intervene.answers import Cell, follower, habit, outcomes_of
+
+SUITE = "suite@1#0123456789ab"
+
+
+def of(signs: tuple[Cell, Cell], groups: int | None = None) -> ImageSwapEffect:
+    (found,) = image_swap_effects(outcomes_of({"color": signs}, groups), SUITE)
+    return found
+
+
+def test_one_module_alone_makes_a_verdict() -> None:
+    """The retention table, the demo and the intervention had one each."""
+    root = Path(probe_kit.__file__).parent
+    made = [path for path in root.rglob("*.py") if re.search(r"\bUseVerdict\(", path.read_text(encoding="utf-8"))]
+    assert [path.relative_to(root).as_posix() for path in made] == ["intervene/kinds/image_swap/verdict.py"]
+
+
+@pytest.mark.parametrize(
+    ("encoded", "follows", "behaviour", "tie"),
+    [
+        (True, True, "used", "whether the readable copy is the one used was not tested"),
+        (False, True, "used", "no readable copy found"),
+        (None, True, "used", ""),
+        (True, False, "not used", ""),
+        (False, False, "not used", ""),
+        (None, False, "not used", ""),
+    ],
+)
+def test_behaviour_and_tie_are_said_apart(encoded: bool | None, follows: bool, behaviour: str, tie: str) -> None:
+    use = classify_use(encoded, of(follower(48) if follows else habit(48)), "shape")
+    assert (use.behaviour, use.tie, use.reversed) == (behaviour, tie, False)
+
+
+def test_the_mirror_of_every_behaviour_is_said_with_the_same_word() -> None:
+    plain, swapped = follower(48)
+    for share in (1.0, 0.3):
+        middle = plain * 0.4
+        toward = classify_behaviour(of((middle + share * plain, middle + share * swapped)), "shape")
+        away = classify_behaviour(of((middle - share * plain, middle - share * swapped)), "shape")
+        assert toward.behaviour == away.behaviour != "not used"
+        assert (toward.reversed, away.reversed) == (False, True)
+        assert away.verdict == f"against: {toward.verdict}"
+
+
+def test_a_displacement_in_few_episodes_is_not_used_in_the_others() -> None:
+    """Every action moves toward the correct side, but hardly one changes sides."""
+    plain, swapped = np.full(48, 0.1), np.full(48, 0.09)
+    swapped[:4] = -0.01
+    found = of((plain, swapped))
+    assert found.follow_p == 2.0**-24
+    assert classify_behaviour(found, "shape").behaviour != "used"
+
+
+def test_what_goes_against_in_half_of_the_episodes_is_not_called_unused() -> None:
+    """Only the upper end of the interval counted: [-0.58, 0.08] was *encoded, unused*."""
+    plain, swapped = follower(48)
+    lot = np.random.default_rng(3).choice([-1.0, 1.0], 24, p=[0.6, 0.4]).repeat(2)
+    found = of((lot * plain, lot * swapped))
+    assert found.net_follow_rate < 0
+    assert classify_behaviour(found, "shape").behaviour == "inconclusive"
+
+
+def test_not_used_needs_another_category_that_is_used() -> None:
+    both = image_swap_effects(outcomes_of({"color": follower(48), "state": habit(48)}), SUITE)
+    found = {one.category: one for one in both}
+    assert classify_all(found, {})["state"].reason.endswith("positive control: color")
+    alone = classify_all({"state": found["state"]}, {})["state"]
+    assert (alone.behaviour, alone.lacks_control, alone.is_bounded) == ("inconclusive", True, True)
+
+
+def test_not_used_needs_as_many_groups_as_are_said_beforehand() -> None:
+    needed = groups_for_not_used()
+    for count, behaviour in ((needed, "not used"), (needed - 1, "inconclusive")):
+        assert classify_behaviour(of(habit(4 * count), groups=count), "shape").behaviour == behaviour
+    too_few = classify_behaviour(of(habit(4 * needed - 4), groups=needed - 1), "shape")
+    assert f"needs {needed} groups of items, there are {needed - 1}" in too_few.reason
+
+
+# -- by chance -------------------------------------------------------------------------------------------------
+
+
+def drawn(seed: int, groups: int, mean: float, spread: float, other: float = 0.0) -> str:
+    """The behaviour of a policy that moves by `mean` of 30 cm toward the answer, and `spread` between groups.
+
+    other: the same toward another property of the images. What does neither goes to a random side.
+    """
+    draw, items = np.random.default_rng(seed), 2 * groups
+    of_group = np.tile(mean + draw.normal(size=groups) * spread, 2)  # items n and n + groups are a group
+    toward = (of_group + draw.choice([-1.0, 1.0], items) * other).repeat(2)
+    lot = draw.choice([-1.0, 1.0], items).repeat(2) * np.tile([1.0, -1.0], items)
+    habits = lot * (max(mean, other) < 0.5) * 0.15
+    clean, swapped = (habits + sign * 0.15 * toward + draw.normal(size=2 * items) * 0.002 for sign in (1, -1))
+    made = outcomes_of({"color": (clean, swapped), "shape": (np.full(400, 0.15), np.full(400, -0.15))}, groups)
+    return classify_all({row.category: row for row in image_swap_effects(made, SUITE)}, {})["color"].behaviour
+
+
+DRAWS = 30
+
+
+@pytest.mark.parametrize(
+    ("groups", "mean", "spread", "other", "expected", "least"),
+    [
+        (12, 0.0, 0.02, 0.0, "not used", 0.95),
+        (24, 0.0, 0.10, 0.0, "not used", 0.95),
+        (12, 0.0, 0.02, 1.0, "inconclusive", 0.95),
+        (12, 0.03, 0.02, 0.0, "not used", 0.95),
+        (12, 0.10, 0.05, 0.0, "inconclusive", 0.80),
+        (12, 1.0, 0.2, 0.0, "used", 0.95),
+    ],
+)
+def test_a_verdict_is_rarely_wrong_by_chance(
+    groups: int, mean: float, spread: float, other: float, expected: str, least: float
+) -> None:
+    counts = Counter(drawn(seed, groups, mean, spread, other) for seed in range(DRAWS))
+    assert counts[expected] >= least * DRAWS, counts

@@ -1,0 +1,337 @@
+"""Policies whose wiring is written down: what the action reads, where, and which copies nothing reads.
+
+One network of 24 channels: 8 image tokens, 4 words, 1 state token; 3 blocks whose values are the `kv` that an
+acting stream of one block and two iterations reads. A category of episodes selects a wiring. Hooks reach all of it
+but an action that bypasses the backbone. Pictures of 8 × 8 pixels show the correct side and a second property.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks import ModelCard, Observation, Policy, Roles, Site, Stream, Tap
+from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.sites import kv_stream
+from probe_kit.hooks.families.shared.prompt_kv import kv_tap
+from probe_kit.intervene import ConditionOutcomes
+from probe_kit.intervene.replay.conditions import CleanRun, Condition, ImagesSwapped, ReplayBatch, replay
+from probe_kit.intervene.replay.session import ReplayInput, ReplaySession
+from probe_kit.models.prompt_kv import PromptKV
+
+WIDTH, BLOCKS, CHUNK, METRES = 24, 3, 4, 0.15
+LEFT, RIGHT, IMAGE, WORDS, STATE = slice(0, 4), slice(4, 8), slice(0, 8), slice(8, 12), 12
+TOKENS = 13
+MARK, ANSWER, COPY, FACTOR, PRODUCT, EACH, OTHER, LOUD = range(8)
+NOISE = 10
+"""Channels from here on hold noise."""
+ORDINARY = 2.13
+"""Mean norm of the words at block 1: one for the copy, 14 channels of noise of half a unit."""
+
+
+@dataclass(frozen=True)
+class Inference:
+    """What a reading function may use.
+
+    values: (T, D) of every block, behind all hooks. noise: (9,) of the seed. answer: ±1, as an action
+    that bypasses the backbone sees it. is_first: of the episode. is_rare: whether the item is one of a quarter.
+    """
+
+    values: Sequence[Tensor]
+    noise: Tensor
+    answer: float
+    is_first: bool
+    is_rare: bool
+
+    def words(self, channel: int = ANSWER, block: int = 1) -> Tensor:
+        """Mean of a channel over the words."""
+        return self.values[block][WORDS, channel].mean()
+
+    @property
+    def marks(self) -> Tensor:
+        """Which half of the image tokens of block 0 is marked."""
+        return self.values[0][LEFT, MARK].mean() - self.values[0][RIGHT, MARK].mean()
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """read: the action, 1 for the left tile. copies: channels of the words into which block 0 copies the marks,
+    and factors. has_product: whether block 0 codes the answer as a product of two channels. is_everywhere: whether
+    all tokens begin with it. items: with this wiring.
+    """
+
+    read: Callable[[Inference], Tensor]
+    copies: Mapping[int, float] = field(default_factory=dict)
+    has_product: bool = False
+    is_everywhere: bool = False
+    items: int = 12
+
+
+def _product(seen: Inference) -> Tensor:
+    return seen.words(FACTOR) * seen.words(PRODUCT)
+
+
+def _of_roles(seen: Inference) -> Tensor:
+    """Majority of words, image and state of block 1."""
+    one = seen.values[1]
+    return torch.sign(
+        sum(torch.sign(own) for own in (one[WORDS, EACH].mean(), one[IMAGE, EACH].mean(), one[STATE, EACH]))
+    )
+
+
+def _of_blocks(seen: Inference) -> Tensor:
+    """Majority of the words of all blocks."""
+    return torch.sign(sum(torch.sign(seen.words(EACH, block)) for block in range(BLOCKS)))
+
+
+def _with_backup(seen: Inference) -> Tensor:
+    """Block 1; block 2 where that is silent."""
+    return seen.words() if seen.words().abs() > 0.5 else seen.words(block=2)
+
+
+def _with_repair(seen: Inference) -> Tensor:
+    """Block 1; the marks where its norm is not the ordinary one."""
+    norm = seen.values[1][WORDS].norm(dim=-1).mean()
+    return seen.marks if (norm - ORDINARY).abs() > 0.5 else seen.words()
+
+
+ONE_COPY = {ANSWER: 1.0}
+WIRINGS: Mapping[str, Wiring] = {
+    "copied": Wiring(lambda seen: seen.words(), ONE_COPY),
+    "unread": Wiring(lambda seen: torch.sign(seen.noise[8]), {COPY: 1.0}),
+    "nonlinear": Wiring(_product, has_product=True),
+    "marks": Wiring(lambda seen: seen.marks),
+    "other": Wiring(lambda seen: seen.values[0][IMAGE, OTHER].mean()),
+    "constant": Wiring(lambda _: torch.ones(())),
+    "noise": Wiring(lambda seen: torch.sign(seen.noise[8])),
+    "roles": Wiring(_of_roles, is_everywhere=True),
+    "blocks": Wiring(_of_blocks, is_everywhere=True),
+    "backup": Wiring(_with_backup, ONE_COPY),
+    "repair": Wiring(_with_repair, ONE_COPY),
+    "bypass": Wiring(lambda seen: torch.tensor(seen.answer), ONE_COPY),
+    "elsewhere": Wiring(lambda seen: seen.marks, {COPY: 1.0}),
+    "code": Wiring(_product, {COPY: 1.0}, has_product=True),
+    "decoy": Wiring(lambda seen: 2 * seen.words(), {ANSWER: 0.5, LOUD: 4.0}),
+    "weak": Wiring(lambda seen: -0.6 + 0.5 * seen.words(), ONE_COPY),
+    "shifted": Wiring(lambda seen: -1 + 0.3 * seen.words(), ONE_COPY),
+    "faint": Wiring(lambda seen: 0.2 * seen.words(), ONE_COPY),
+    "one-sided": Wiring(lambda seen: seen.words() if seen.words() > 0 else torch.tensor(0.05), ONE_COPY),
+    "rarely": Wiring(lambda seen: seen.words() if seen.is_rare else torch.ones(()), ONE_COPY, items=24),
+    "trace": Wiring(lambda seen: -0.6 + 0.033 * seen.words(), ONE_COPY),
+    "late": Wiring(lambda seen: torch.zeros(()) if seen.is_first else seen.words(), ONE_COPY),
+    "against": Wiring(lambda seen: -seen.words(), ONE_COPY),
+}
+
+
+class _Block(nn.Module):
+    """A place for hooks at what a norm, an attention and an MLP get or give."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm, self.attention, self.mlp = nn.Identity(), nn.Identity(), nn.Identity()
+
+
+class _Network(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList(_Block() for _ in range(BLOCKS))
+        self.norm, self.prompt_kv = nn.Identity(), PromptKV(BLOCKS)
+        self.acting, self.acting_norm = _Block(), nn.Identity()
+
+    def values(self, tokens: Tensor, wiring: Wiring) -> list[Tensor]:
+        """(T, D) of every block, from the (1, T, D) embedded tokens."""
+        kept = []
+        for number, block in enumerate(self.blocks):
+            residual = block.norm(tokens)
+            kept.append(residual[:, None].clone())
+            change = self._copied(residual, wiring) if number == 0 else torch.zeros_like(residual)
+            tokens = residual + block.attention(change)
+            tokens = tokens + block.mlp(torch.zeros_like(tokens))
+        self.norm(tokens)
+        keys, values = self.prompt_kv.keys, self.prompt_kv.values
+        for passage in keys:
+            passage(torch.zeros_like(kept[0]))
+        return [passage(own)[0, 0] for passage, own in zip(values, kept, strict=True)]
+
+    def act(self, seen: Inference, wiring: Wiring) -> Tensor:
+        """The action after the last iteration, 1 for the left tile."""
+        for _ in range(2):
+            tokens = torch.zeros(1, 2, WIDTH)
+            tokens[0, 1, NOISE : NOISE + 7] = seen.noise[:7]
+            tokens = self.acting.norm(tokens)
+            change = torch.zeros_like(tokens)
+            change[0, 1, 0] = wiring.read(seen)
+            tokens = tokens + self.acting.attention(change)
+            tokens = self.acting_norm(tokens + self.acting.mlp(torch.zeros_like(tokens)))
+        return tokens[0, 1, 0]
+
+    def _copied(self, residual: Tensor, wiring: Wiring) -> Tensor:
+        marks = residual[0, LEFT, MARK].mean() - residual[0, RIGHT, MARK].mean()
+        change = torch.zeros_like(residual)
+        for channel, factor in wiring.copies.items():
+            change[0, WORDS, channel] = factor * marks
+        if wiring.has_product:
+            change[0, WORDS, PRODUCT] = marks * residual[0, WORDS, FACTOR].mean()
+        return change
+
+
+class WiredPolicy(Policy):
+    """Acts by the wiring that the instruction names: `wiring:item`."""
+
+    interventions: ClassVar[Interventions] = Interventions(prompt_kv=True, unread=("backbone",))
+    role_names: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "backbone": ("image.primary", "language", "state"), "expert": ("state", "action"),
+    }  # fmt: skip
+
+    def __init__(self) -> None:
+        self.network = _Network().eval()
+        self.card = ModelCard(
+            family="wired", checkpoint="built", weights_sha256="0" * 64, random_weights=False, parameters=0,
+            dtype="float32", device="cpu", embodiment="7-DoF end-effector delta", cameras=("primary",),
+            chunk=CHUNK, execute=CHUNK,
+        )  # fmt: skip
+        self.streams = {
+            "backbone": Stream("backbone", BLOCKS + 1, WIDTH), "expert": Stream("expert", 2, WIDTH, 2),
+        }  # fmt: skip
+        self.prompt_kv = kv_stream(BLOCKS, WIDTH)
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """Metres toward the tile in the lateral coordinate; 4 mm of it are noise."""
+        self.check(seen, seeds)
+        chunks = np.zeros((len(seen), CHUNK, 7), np.float32)
+        with torch.inference_mode():
+            for row, (observation, seed) in enumerate(zip(seen, seeds, strict=True)):
+                chunks[row, :, 1] = self._lateral(observation, seed) / CHUNK
+        return chunks
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """The same of every observation."""
+        backbone = Roles.from_labels(["image.primary"] * 8 + ["language"] * 4 + ["state"])
+        expert = Roles.from_labels(["state", "action"])
+        return {"backbone": [backbone] * len(seen), "expert": [expert] * len(seen)}
+
+    def tap(self, site: Site) -> Tap:
+        """Inputs of norms for residuals, outputs of attention and MLP."""
+        stream, network = self.stream_of(site), self.network
+        if stream is self.prompt_kv:
+            return kv_tap(network.prompt_kv, site)
+        of_backbone = stream.name == "backbone"
+        fires = 1 if of_backbone else 2
+        blocks, norm = (network.blocks, network.norm) if of_backbone else ([network.acting], network.acting_norm)
+        if site.quantity == "final_norm" or site.layer == len(blocks):
+            return Tap(norm, fires, "output" if site.quantity == "final_norm" else "input")
+        block = blocks[site.layer]
+        if site.quantity == "residual":
+            return Tap(block.norm, fires)
+        return Tap(getattr(block, site.quantity), fires, "output")
+
+    def _lateral(self, observation: Observation, seed: int) -> float:
+        name, _, item = observation.instruction.partition(":")
+        wiring, answer, other = WIRINGS[name], _sign(observation, 0), _sign(observation, 1)
+        noise = torch.randn(9, generator=torch.Generator().manual_seed(seed))
+        values = self.network.values(_embedded(name, item, answer, other), wiring)
+        is_first, is_rare = bool(observation.state[0] < 0.01), int(item) % 8 < 2
+        action = self.network.act(Inference(values, noise, answer, is_first, is_rare), wiring)
+        return float(action) * METRES + 0.004 * float(noise[7])
+
+
+def _sign(observation: Observation, colour: int) -> float:
+    return 1.0 if observation.image[0, 0, colour] > observation.image[0, 4, colour] else -1.0
+
+
+def _embedded(name: str, item: str, answer: float, other: float) -> Tensor:
+    """(1, T, D) tokens of one observation."""
+    draw = np.random.default_rng(derive_seed("wiring", 0, name, item, str(answer)))
+    tokens = np.zeros((1, TOKENS, WIDTH), np.float32)
+    tokens[0, :, NOISE:] = draw.normal(size=(TOKENS, WIDTH - NOISE)) * 0.5
+    tokens[0, LEFT, MARK], tokens[0, RIGHT, MARK] = answer > 0, answer < 0
+    tokens[0, IMAGE, OTHER] = other
+    if WIRINGS[name].has_product:
+        tokens[0, WORDS, FACTOR] = draw.choice([-1.0, 1.0])
+    if WIRINGS[name].is_everywhere:
+        tokens[0, :, EACH] = answer
+    return torch.from_numpy(tokens)
+
+
+# -- episodes --------------------------------------------------------------------------------------------------
+
+
+class WiredSession(ReplaySession):
+    """A replay session without a simulator: the tiles lie left and right of zero."""
+
+    def __init__(self) -> None:
+        self.policy, self.run = WiredPolicy(), SimpleNamespace(model="wired")  # type: ignore[assignment]
+        self._middle, self._across = np.zeros(2), np.array([0.0, 1.0])
+
+
+def replay_inputs(name: str, x: float = 0.0) -> list[ReplayInput]:
+    """Two layouts of every item, each a group of its own. x: where the hand is, zero before the first chunk."""
+    state = np.array([x, 0, 0.13, 0, 0, 0, 0, 0.8], np.float32)
+    found = []
+    for item in range(WIRINGS[name].items):
+        answer = 1.0 if item % 2 else -1.0
+        other = float(np.random.default_rng(derive_seed("other", 0, name, str(item))).choice([-1, 1]))
+        layouts = [Observation(_picture(sign * answer, sign * other), state, f"{name}:{item}") for sign in (1, -1)]
+        for number, sign in enumerate((1.0, -1.0)):
+            side: Literal["left", "right"] = "left" if sign * answer > 0 else "right"
+            found.append(
+                ReplayInput(
+                    row=len(found),
+                    episode_id=f"{name}-{item}:{'os'[number]}",
+                    item_id=f"{name}-{item}",
+                    group_id=f"{name}-{item}",
+                    category=name,
+                    side_correct=side,
+                    layout=("original", "swapped")[number],
+                    seen=layouts[number],
+                    swapped=layouts[1 - number],
+                    seed=1000 + item,
+                    tiles={},
+                )
+            )
+    return found
+
+
+def _picture(answer: float, other: float) -> NDArray[np.uint8]:
+    image = np.zeros((8, 8, 3), np.uint8)
+    for colour, sign in enumerate((answer, other)):
+        image[:, :4, colour], image[:, 4:, colour] = 255 * (sign > 0), 255 * (sign < 0)
+    return image
+
+
+def outcomes_of(
+    session: WiredSession, names: Sequence[str], further: Sequence[Condition] = (), calls: int = 1
+) -> ConditionOutcomes:
+    """What swapped images and further conditions do, as `run_intervention` stores it.
+
+    calls: inferences of an episode, whose displacements are summed; the hand leaves its place after the first.
+    """
+    conditions: list[Condition] = [CleanRun(), ImagesSwapped(), *further]
+    inputs = [one for name in names for one in replay_inputs(name)]
+    found = replay(session, inputs, conditions)
+    for _ in range(calls - 1):
+        later = replay(session, [one for name in names for one in replay_inputs(name, 0.03)], conditions)
+        found.displacement[:] += later.displacement
+    return _stored(conditions, inputs, found)
+
+
+def _stored(
+    conditions: Sequence[Condition], inputs: Sequence[ReplayInput], found: ReplayBatch
+) -> ConditionOutcomes:
+    columns: dict[str, Any] = {
+        name: np.array([getattr(one, own) for one in inputs])
+        for name, own in (
+            ("episodes", "episode_id"), ("items", "item_id"), ("groups", "group_id"), ("categories", "category"),
+            ("sides", "side_correct"),
+        )
+    }  # fmt: skip
+    return ConditionOutcomes(
+        conditions=tuple(condition.name for condition in conditions), **columns, displacement=found.displacement,
+        max_action_change=found.max_action_change, edit_log=found.edit_log, replay_error=found.replay_error,
+    )  # fmt: skip
