@@ -36,7 +36,8 @@ from tests.support.prismatic_checkpoints import write_checkpoint
 NOWHERE = EpisodeBuffers([], 1, with_tokens=False, pinned=False)
 SMALL = SceneSpec(picture_size=(224, 224))
 COLUMNS = {
-    "outcome", "side_placed", "answer", "parse", "said", "answer_swapped", "side_placed_swapped", "parse_swapped",
+    "outcome", "side_placed", "answer", "parse", "parse_tier", "said", "answer_swapped", "side_placed_swapped",
+    "parse_swapped", "parse_tier_swapped",
     "outcome_swapped", "logit_left", "logit_right", "option_mass", "margin", "margin_swapped", "content",
     "letter_bias", "near_tie", "side_logits", "outcome_logits", "side_debiased", "outcome_debiased",
     "prompt_tokens", "picture_tokens", "question", "side_word", "first_frame_sha256", "visible_left",

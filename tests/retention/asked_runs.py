@@ -60,6 +60,7 @@ def asked(path: Path, right: dict, model: str = "qwen3-vl", called: str = "", **
     left = table["side_correct"] == "left"
     table = table.assign(
         parse="letter",
+        parse_tier=np.where(np.arange(len(table)) % 4 == 0, "clause", "strict"),
         outcome_logits=np.where(left, "correct", "wrong"),
         side_logits="left",
         outcome_debiased="correct",

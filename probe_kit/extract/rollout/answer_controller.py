@@ -197,6 +197,7 @@ class AnswerController:
                 f"answer{mark}": text,
                 f"said{mark}": read.said,
                 f"parse{mark}": read.rule,
+                f"parse_tier{mark}": read.tier or "none",
             }
         for order, own in zip(self.template.orders, forced, strict=True):
             mark = "" if order == "original" else "_swapped"

@@ -1,103 +1,135 @@
 """Parsing of a text answer: left, right, another statement, or unparsable.
 
 An answer that cannot be read is no wrong answer and is not left out: it is `oob`, with the rule that found it so.
+An inverted answer is worse than an unreadable one: a text which denies or contradicts itself is unreadable.
 """
 
 import re
 import unicodedata
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from probe_kit.extract.vqa.mentions import Mentions, mentions_of
 from probe_kit.extract.vqa.templates import Order, Template, sides
+from probe_kit.suite import Side
 
 Said = Literal["left", "right", "center", "yes", "no", "none"]
+Tier = Literal["strict", "clause"]
+"""strict: the whole text is an option or a side. clause: one was found among other words."""
 
 _THOUGHT = re.compile(r"<think>.*?</think>", re.DOTALL)
 _SPECIAL = re.compile(r"<\|[^<>|]*\|>|</?(?:s|bos|eos|pad|unk|end_of_turn|start_of_turn|loc\d+)>")
-_OPENING = r"[\s\"'`*_(\[{<#:.,!-]*"
-_BEFORE_LETTER = (
-    rf"^{_OPENING}(?:(?:yes|yeah|sure)\b{_OPENING})?"
-    rf"(?:(?:the\s+)?(?:(?:correct|right|best)\s+)?(?:answer|option|choice|letter)\b{_OPENING}(?:is\b|:)?{_OPENING})?"
-    rf"(?:option\b{_OPENING})?"
+_INVISIBLE = re.compile("[\u200b-\u200f\u2060\ufeff]")
+_MARKUP = re.compile(r"\\boxed|[*_`$\\{}\[\]()<>#\"\u201c\u201d]|(?<!\w)'|'(?!\w)")
+_REASON = re.compile(r"\b(?:because|since|due\s+to|as\s+it)\b.*", re.IGNORECASE | re.DOTALL)
+
+_LEAD = r"(?:(?:the|my)\s+)?(?:(?:correct|right|best|final)\s+)?(?:answer|option|choice|letter)\s*(?:is\b)?[\s:]*"
+_PLACE = (
+    r"(?:it\s+is\s+|it's\s+)?(?:(?:on|to|at|in)\s+)?(?:the\s+)?(?P<side>left|right|cent(?:er|re)|middle)(?:most)?"
+    r"(?:-hand)?(?:\s+(?:side|picture|image|tile))?"
 )
-_SIDE = r"(?:left|right|cent(?:er|re)|middle)(?:most)?"
-_LETTER = re.compile(
-    rf"{_BEFORE_LETTER}(?i:(?P<letter>[ab]))(?=$|[^\w\s]|\s*$|\s+[^\w\s]|\s+{_SIDE}\b|\s*\n)", re.IGNORECASE
-)
-_SIDES = re.compile(rf"\b(?P<side>{_SIDE})\b", re.IGNORECASE)
-_REFUSAL = re.compile(
-    r"\b(?:sorry|cannot|can not|can't|unable|not sure|unsure|don't know|do not know|not able|unclear)\b",
+_STRICT = re.compile(
+    rf"[\s:.,!-]*(?P<yes>(?:yes|yeah|yep|sure)\b[\s,.:!-]*)?(?:{_LEAD})?(?:option\s+)?"
+    rf"(?:(?P<letter>[ab])\b(?:[\s,.:-]+(?:is\s+)?(?P<same>left|right))?|{_PLACE})[\s.:,!]*",
     re.IGNORECASE,
 )
+_YES = re.compile(r"\W*(?:that(?:'s|\s+is)\s+right|yes|yeah|yep|sure|correct|indeed)\b", re.IGNORECASE)
+_JUST_YES, _JUST_NO = re.compile(r"\W*yes\W*", re.IGNORECASE), re.compile(r"\W*no\W*", re.IGNORECASE)
 _NO = re.compile(
-    r"^\W*(?:(?:no|nope|none)\b|there (?:is|are) no\b|i (?:do not|don't|can not|cannot|can't) see\b)",
+    r"^\W*(?:no|nope|none|nothing|never)\b(?!\s+(?:problem|doubt|worries|question))"
+    r"|^\W*(?:it\s+is\s+|it's\s+)?not\s+(?:visible|present|there|seen|shown)\b"
+    r"|\bthere\s+(?:(?:is|are)\s+(?:no|not)|(?:is|are)n't)\b|\bunable\s+to\s+(?:see|find)\b"
+    r"|\b(?:(?:do|does|can|could|did)(?:\s+not|n't|not)|can't)\s+(?:\w+\s+)?(?:see|find|show|contain|have|depict|appear)\b"
+    r"|\b(?:is|are)(?:\s+not|n't)\s+(?:\w+\s+)?(?:visible|present|there|seen|shown)\b",
     re.IGNORECASE,
 )
-_YES = re.compile(r"^\W*(?:yes|yeah|yep)\b", re.IGNORECASE)
-_SIDE_OF = {"left": "left", "right": "right", "center": "center", "centre": "center", "middle": "center"}
+_REFUSAL = re.compile(
+    r"\b(?:sorry|cannot|can\s+not|can't|unable|not\s+sure|unsure|don't\s+know|do\s+not\s+know|not\s+able|unclear"
+    r"|not\s+certain|uncertain|impossible)\b",
+    re.IGNORECASE,
+)
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What was read. rule: how, as the outcome of an episode records it."""
+    """What was read. rule: how, as the outcome of an episode records it. tier: None where nothing was read."""
 
     said: Said
     rule: str
+    tier: Tier | None = None
 
 
 def read_answer(text: str, template: Template, order: Order = "original") -> Answer:
-    """What an answer to `template`, its sides named in `order`, says."""
+    """What an answer to `template`, its sides named in `order`, says. The first rule that applies decides."""
     plain = _stripped(text)
     if not plain:
         return Answer("none", "empty")
-    if template.yes_or_no:
-        return _yes_or_no(plain)
-    return (_by_letter(plain, order) if template.lettered else None) or _in_words(plain)
-
-
-def _stripped(text: str) -> str:
-    """Without thoughts, special tokens and spaces around it; nothing of a thought that was not ended."""
-    plain = _SPECIAL.sub("", _THOUGHT.sub("", unicodedata.normalize("NFKC", text)))
-    return plain.partition("<think>")[0].replace("\u2019", "'").strip()
-
-
-def _by_letter(plain: str, order: Order) -> Answer | None:
-    """The option whose letter begins the answer; None if none does, such as in "A red star"."""
-    found = _LETTER.match(plain)
-    if found is None:
-        return None
-    first, second = sides(order)
-    letter = found["letter"].upper()
-    behind = plain[found.end() :]
-    if re.search(rf"\b{'B' if letter == 'A' else 'A'}\b(?!\s+[a-z])", behind):
-        return Answer("none", "several sides")
-    side = first if letter == "A" else second
-    if _named(behind) - {side}:
-        return Answer("none", "contradicts itself")
-    return Answer(side, "letter")
-
-
-def _yes_or_no(plain: str) -> Answer:
-    """Of an answer to "do you see …? If yes, where": a no outweighs every side behind it."""
-    if _NO.match(plain):
-        return Answer("no", "said no")
-    answer = _in_words(plain)
-    if answer.rule == "unparsable" and _YES.match(plain):
-        return Answer("yes", "no side")
+    options = dict(zip("AB", sides(order), strict=True)) if template.lettered else {}
+    strict = _strictly(plain, options)
+    if strict is not None:
+        return strict
+    if template.yes_or_no and _NO.search(plain):
+        return Answer("no", "said no", "strict" if _JUST_NO.fullmatch(plain) else "clause")
+    answer = _by_clauses(plain, options)
+    if template.yes_or_no and answer.rule in ("unparsable", "denied") and _YES.match(plain):
+        if re.search(r"\bno\b", plain, re.IGNORECASE):
+            return Answer("none", "contradicts itself")
+        return Answer("yes", "no side", "strict" if _JUST_YES.fullmatch(plain) else "clause")
     return answer
 
 
-def _in_words(plain: str) -> Answer:
-    named = _named(plain)
-    if len(named) > 1:
+def _stripped(text: str) -> str:
+    """Without thoughts, special tokens, markup, reasons and spaces around it; nothing of an unfinished thought."""
+    plain = _SPECIAL.sub("", _THOUGHT.sub("", unicodedata.normalize("NFKC", text))).partition("<think>")[0]
+    plain = _MARKUP.sub(" ", _INVISIBLE.sub("", plain).replace("\u2019", "'"))
+    return _REASON.sub("", plain).strip()
+
+
+def _strictly(plain: str, options: Mapping[str, Side]) -> Answer | None:
+    """Of a text that is nothing but an option or a side; None for every other."""
+    found = _STRICT.fullmatch(plain)
+    if found is None:
+        return None
+    if found["letter"] is None:
+        mentioned = mentions_of(found["side"]).sides
+        (side,) = mentioned
+        return Answer(side, "center" if side == "center" else "side word", "strict")
+    said = options.get(found["letter"].upper())
+    if said is None or (found["same"] or said).lower() != said:
+        return None
+    return Answer(said, "letter", "strict")
+
+
+def _by_clauses(plain: str, options: Mapping[str, Side]) -> Answer:
+    """Of what the clauses affirm, if that is one thing and is denied nowhere."""
+    found = mentions_of(plain)
+    if _REFUSAL.search(plain):
+        return Answer("none", "refusal")
+    if options:
+        lettered = _by_letter(found, options)
+        if lettered is not None:
+            return lettered
+    if len(found.sides) > 1 or found.sides & found.denied_sides:
         return Answer("none", "several sides")
-    if named:
-        (side,) = named
-        return Answer("center", "center") if side == "center" else Answer(side, "side word")
-    return Answer("none", "refusal" if _REFUSAL.search(plain) else "unparsable")
+    if found.sides:
+        (side,) = found.sides
+        return Answer(side, "center" if side == "center" else "side word", "clause")
+    return Answer("none", "denied" if found.denied_sides else "unparsable")
 
 
-def _named(text: str) -> set[Said]:
-    """The sides that a text names."""
-    words = (place["side"].lower().removesuffix("most") for place in _SIDES.finditer(text))
-    return {_SIDE_OF[word] for word in words}  # type: ignore[misc]
+def _by_letter(found: Mentions, options: Mapping[str, Side]) -> Answer | None:
+    """The option that is named; None where the text has no letter."""
+    if len(found.letters) > 1 or found.letters & found.denied_letters:
+        return Answer("none", "several sides")
+    if found.letters:
+        (letter,) = found.letters
+        said = options[letter]
+        is_other = bool(found.sides - {said}) or said in found.denied_sides
+        return Answer("none", "contradicts itself") if is_other else Answer(said, "letter", "clause")
+    denied = {options[letter] for letter in found.denied_letters}
+    if not denied:
+        return None
+    if not found.sides:
+        return Answer("none", "denied")
+    return Answer("none", "contradicts itself") if denied & found.sides else None

@@ -401,6 +401,17 @@ ANSWERS = (
         "The same with the logits averaged over both orders of the options, without a preference for a letter.",
     ),
     share("answers.share_unparsable", "unparsable %", "Share of answers in text that could not be parsed."),
+    share(
+        "answers.share_by_clause",
+        "by clause %",
+        "Share of answers in text that were found among other words, by rules about clauses and denials. The "
+        "others are a letter or a side and nothing else.",
+    ),
+    share(
+        "answers.accuracy_strict",
+        "strict %",
+        "Share by text with answers found among other words as unparsable; given where they are more than 5 %.",
+    ),
     share("answers.share_near_tie", "near ties %", "Share of choices that rounding may have made."),
     share(
         "answers.option_mass",

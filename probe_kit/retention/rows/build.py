@@ -17,7 +17,7 @@ from probe_kit.retention.behaviour.success_rate import (
     success_rate,
     success_share,
 )
-from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.behaviour.vlm_answers import ask_of, read_by_clause
 from probe_kit.retention.estimators.retention import (
     Iterations,
     Peak,
@@ -176,6 +176,7 @@ def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
         return AnswerStats()
     text = episodes["outcome_text" if "outcome_text" in episodes else "outcome"]
     bias = episodes["letter_bias"].astype(float).mean()
+    by_clause, strict = read_by_clause(episodes, text)
     return AnswerStats(
         prompt=str(ask["prompt"]),
         picture=str(ask["picture"]),
@@ -186,6 +187,8 @@ def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
         accuracy_logits=float((episodes["outcome_logits"] == "correct").mean()),
         accuracy_order_balanced=float((episodes["outcome_debiased"] == "correct").mean()),
         share_unparsable=float((text == "oob").mean()),
+        share_by_clause=by_clause,
+        accuracy_strict=strict,
         option_mass=float(episodes["option_mass"].mean()),
         letter_bias=_number(float(bias)),
         share_near_tie=float(episodes["near_tie"].astype(bool).mean()),

@@ -58,8 +58,10 @@ class AnswerStats:
 
     asked_for: `target`, `distractor` or `absent`. score: by which of its scores `success.sr` is. accuracy_text,
     accuracy_logits, accuracy_order_balanced: shares that are right by each score. share_unparsable: answers in
-    text that could not be parsed. option_mass: mean probability of the admissible answers together. letter_bias:
-    mean logit by which the option named first is preferred. share_near_tie: choices that rounding may have made.
+    text that could not be parsed. share_by_clause: those that were found among other words; accuracy_strict:
+    accuracy_text with these as unparsable, where they are many; both None for runs that do not store it.
+    option_mass: mean probability of the admissible answers together. letter_bias: mean logit by which the option
+    named first is preferred. share_near_tie: choices that rounding may have made.
     """
 
     prompt: str | None = None
@@ -71,6 +73,8 @@ class AnswerStats:
     accuracy_logits: float | None = None
     accuracy_order_balanced: float | None = None
     share_unparsable: float | None = None
+    share_by_clause: float | None = None
+    accuracy_strict: float | None = None
     option_mass: float | None = None
     letter_bias: float | None = None
     share_near_tie: float | None = None

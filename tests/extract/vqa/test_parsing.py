@@ -2,8 +2,17 @@
 
 import pytest
 
-from probe_kit.extract.vqa.parsing import Answer, read_answer
-from probe_kit.extract.vqa.templates import P1, SEEN
+from probe_kit.extract.vqa.parsing import Said, read_answer
+from probe_kit.extract.vqa.templates import P1, SEEN, Order, Template
+from tests.extract.vqa.answer_cases import (
+    HELD_OUT,
+    LATER_LETTERED,
+    LATER_SEEN,
+    MADE_LETTERED,
+    MADE_SEEN,
+    MADE_SWAPPED,
+    Cases,
+)
 
 LETTERED = [
     ("A", "left", "letter"),
@@ -21,7 +30,7 @@ LETTERED = [
     ("Option A", "left", "letter"),
     ("<think>left? right?</think>\n\nB<|im_end|>", "right", "letter"),
     ("A right", "none", "contradicts itself"),
-    ("A left\nB right", "none", "contradicts itself"),
+    ("A left\nB right", "none", "several sides"),
     ("A, B", "none", "several sides"),
     ("A red star", "none", "unparsable"),
     ("A star on the left", "left", "side word"),
@@ -53,25 +62,84 @@ WORDS = [
 ]
 
 
+def read(text: str, template: Template, order: Order = "original") -> tuple[Said, str]:
+    found = read_answer(text, template, order)
+    return found.said, found.rule
+
+
 @pytest.mark.parametrize(("text", "said", "rule"), LETTERED)
 def test_answers_by_letter(text: str, said: str, rule: str) -> None:
-    assert read_answer(text, P1) == Answer(said, rule)  # type: ignore[arg-type]
+    assert read(text, P1) == (said, rule)
 
 
 @pytest.mark.parametrize(("text", "said", "rule"), WORDS)
 def test_answers_in_words(text: str, said: str, rule: str) -> None:
-    assert read_answer(text, SEEN) == Answer(said, rule)  # type: ignore[arg-type]
+    assert read(text, SEEN) == (said, rule)
 
 
 @pytest.mark.parametrize(("text", "said", "rule"), LETTERED)
 def test_with_options_exchanged_letters_change_their_meaning_and_words_do_not(
     text: str, said: str, rule: str
 ) -> None:
-    exchanged = read_answer(text, P1, "swapped")
+    found = read(text, P1, "swapped")
     if text in ("A right", "A left", "B) right"):
-        expected = {"A right": Answer("right", "letter")}.get(text, Answer("none", "contradicts itself"))
+        assert found == (("right", "letter") if text == "A right" else ("none", "contradicts itself"))
     elif rule == "letter":
-        expected = Answer({"left": "right", "right": "left"}[said], "letter")  # type: ignore[arg-type]
+        assert found == ({"left": "right", "right": "left"}[said], "letter")
     else:
-        expected = Answer(said, rule)  # type: ignore[arg-type]
-    assert exchanged == expected
+        assert found == (said, rule)
+
+
+# -- tables of cases -------------------------------------------------------------------------------------------
+
+TABLES: dict[str, tuple[Cases, Template, Order]] = {
+    "made, lettered": (MADE_LETTERED, P1, "original"),
+    "made, swapped": (MADE_SWAPPED, P1, "swapped"),
+    "made, seen": (MADE_SEEN, SEEN, "original"),
+    "held out": (HELD_OUT, P1, "original"),
+    "later, lettered": (LATER_LETTERED, P1, "original"),
+    "later, seen": (LATER_SEEN, SEEN, "original"),
+}
+UNREAD = {
+    "made, lettered": {"Right: A"},
+    "held out": {"Isn't it left?"},
+    "later, lettered": {"not the left one but the right one"},
+    "later, seen": {"It is there"},
+}
+"""What a person reads in some way and the rules leave unreadable."""
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_what_a_person_reads_is_read_or_left_unreadable_and_never_inverted(name: str) -> None:
+    cases, template, order = TABLES[name]
+    wrong = {
+        text: found.said
+        for said, texts in cases.items()
+        for text in texts
+        if (found := read_answer(text, template, order)).said != said
+    }
+    assert wrong == dict.fromkeys(UNREAD.get(name, ()), "none")
+
+
+def test_a_side_that_is_read_has_a_tier_and_nothing_else_has() -> None:
+    for cases, template, order in TABLES.values():
+        for text in (text for texts in cases.values() for text in texts):
+            found = read_answer(text, template, order)
+            assert (found.tier is None) == (found.said == "none"), text
+
+
+@pytest.mark.parametrize(
+    ("text", "tier"),
+    [
+        ("A", "strict"),
+        ("The answer is B.", "strict"),
+        ("Yes, left", "strict"),
+        ("A left", "strict"),
+        ("right side", "strict"),
+        ("A, not B", "clause"),
+        ("I think A", "clause"),
+        ("It is on the left, not the right", "clause"),
+    ],
+)
+def test_strict_is_an_option_or_a_side_and_nothing_else(text: str, tier: str) -> None:
+    assert read_answer(text, P1).tier == tier

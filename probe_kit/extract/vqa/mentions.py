@@ -1,0 +1,109 @@
+"""Mentions of sides and option letters in a text answer, and whether each of them is denied."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal
+
+Named = Literal["left", "right", "center"]
+
+_SIDE_OF: dict[str, Named] = {
+    "left": "left", "right": "right", "center": "center", "centre": "center", "middle": "center",
+}  # fmt: skip
+_SIDE = re.compile(r"\b(left|right|cent(?:er|re)|middle)(?:most)?\b", re.IGNORECASE)
+_LETTER = re.compile(r"(?<![\w'])([AB])(?![\w'])")
+_CLAUSE = re.compile(
+    r"[.,;:!\n]+|[^.,;:!\n]*\?+"
+    r"|(?<!everything)(?<!anything)(?<!all)\s+but\b"
+    r"|\s+(?:instead(?!\s+of)|rather(?!\s+than)|so|therefore|hence|though|although)\b",
+    re.IGNORECASE,
+)
+_DENIAL = re.compile(
+    r"\b(?:not|no|never|nowhere|neither|nor|without|except|avoid|cannot|isnt|wrong|incorrect|false"
+    r"|(?:rather|other)\s+than|instead\s+of|opposite\s+of|(?:everything|anything|all)\s+but)\b|n't\b",
+    re.IGNORECASE,
+)
+_DENIED_BEHIND = re.compile(
+    r"\s+(?:(?:one|side|picture|image|tile|option|answer)\s+)?"
+    r"(?:(?:is|are|was|were|would\s+be|seems|looks)\s+(?:not|wrong|incorrect|false)\b|(?:is|was|are|were)n't\b)",
+    re.IGNORECASE,
+)
+_NO_DENIAL = re.compile(
+    r"\b(?:no\s+(?:doubt|problem|question|worries)|without\s+(?:a\s+|any\s+)?doubt|not\s+only)\b", re.IGNORECASE
+)
+
+_ADVERBIAL = r"(?:now|here|there|next|away|beside|between|behind|above|below|under|in|on|at|after|before|beneath)"
+_RIGHT_IS_NO_SIDE = re.compile(
+    r"\b(?:that(?:'s|\s+is)|you(?:'re|\s+are)|all|quite)\s+right\b"
+    r"|\bright\s+(?:answer|option|choice|letter|one|decision|place)\b"
+    rf"|(?<!the\s)(?<!your\s)(?<!upper\s)(?<!lower\s)(?<!bottom\s)(?<!top\s)(?<!far\s)\bright\s+{_ADVERBIAL}\b"
+    r"|\b(?:[ab]|it|this|which|answer)\s+(?:is|seems|looks|sounds)\s+right\b(?!\s+(?:side|picture|image|tile))"
+    r"|\b(?:seems|looks|sounds)\s+right\b",
+    re.IGNORECASE,
+)
+"""Praise, truth and adverbs."""
+_PRAISE = re.compile(r"\s*right\s*[,:!.]", re.IGNORECASE)
+"""In front of a side; in front of a letter it may be the side."""
+_LEFT_IS_NO_SIDE = re.compile(
+    r"\b(?:has|have|had)\s+left\b|\bnothing\s+left\b|\bleft\s+(?:over|out|behind)\b", re.IGNORECASE
+)
+_OPTION = re.compile(r"\b(?:option|answer|choice|letter|picture|image|tile)\s+$", re.IGNORECASE)
+_VERB = re.compile(
+    r"\s+(?:is|isn't|was|or|and|not|as|seems?|looks?|appears?|shows?|has|matches|contains|depicts|fits|would"
+    r"|left|right|cent(?:er|re)|middle)\b",
+    re.IGNORECASE,
+)
+
+
+@dataclass
+class Mentions:
+    """What is named, and what is named and denied. letters: `A` and `B`; sides: `left`, `right`, `center`."""
+
+    letters: set[str] = field(default_factory=set)
+    denied_letters: set[str] = field(default_factory=set)
+    sides: set[Named] = field(default_factory=set)
+    denied_sides: set[Named] = field(default_factory=set)
+
+
+def mentions_of(text: str) -> Mentions:
+    """All of a text, clause by clause: a denial reaches to the end of its clause. Questions are left out."""
+    found = Mentions()
+    for clause in _clauses(text):
+        for side, is_denied in _sides(clause):
+            (found.denied_sides if is_denied else found.sides).add(side)
+        for letter, is_denied in _letters(clause):
+            (found.denied_letters if is_denied else found.letters).add(letter)
+    return found
+
+
+def _clauses(text: str) -> Iterator[str]:
+    plain = _NO_DENIAL.sub(" ", text)
+    praise = _PRAISE.match(plain)
+    if praise is not None and _SIDE.search(plain, praise.end()):
+        plain = plain[praise.end() :]
+    yield from filter(str.strip, _CLAUSE.split(plain))
+
+
+def _sides(clause: str) -> Iterator[tuple[Named, bool]]:
+    clean = _blanked(_LEFT_IS_NO_SIDE, _blanked(_RIGHT_IS_NO_SIDE, clause))
+    for found in _SIDE.finditer(clean):
+        yield _SIDE_OF[found[1].lower()], _is_denied(clean, found)
+
+
+def _letters(clause: str) -> Iterator[tuple[str, bool]]:
+    """Upper case alone; `A` in front of a noun is an article."""
+    for found in _LETTER.finditer(clause):
+        behind = clause[found.end() :]
+        is_article = found[1] == "A" and re.match(r"\s+(?:[^\W\d_]{2}|[a-z])", behind) and not _VERB.match(behind)
+        if not is_article or _OPTION.search(clause[: found.start()]):
+            yield found[1], _is_denied(clause, found)
+
+
+def _is_denied(clause: str, found: re.Match[str]) -> bool:
+    before, behind = clause[: found.start()], clause[found.end() :]
+    return bool(_DENIAL.search(before) or _DENIED_BEHIND.match(behind))
+
+
+def _blanked(pattern: re.Pattern[str], text: str) -> str:
+    """The text with spaces where the pattern is found, so that positions stay."""
+    return pattern.sub(lambda found: " " * len(found[0]), text)
