@@ -28,13 +28,14 @@ from probe_kit.intervene.commands import KindHelp, intervene
 from probe_kit.intervene.show_command import show
 from probe_kit.retention.commands import retention
 from probe_kit.retention.known_used_command import stages
+from probe_kit.study.commands import app as study_app
 from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import train
 from probe_kit.train.power_commands import power
 
 ORDER = (
     "demo", "doctor", "models", "suite", "extract", "ask", "run", "train", "power", "intervene", "retention",
-    "stages", "export", "verify",
+    "stages", "study", "export", "verify",
 )  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 
@@ -136,6 +137,7 @@ def _before_commands(
 
 app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
+app.add_typer(study_app, name="study")
 run_app.command()(show)
 for command in (
     extract,

@@ -126,6 +126,10 @@ def test_a_command_is_accepted_as_it_is_typed(
     with contextlib.chdir(tmp_path):
         answer = CliRunner().invoke(app, command.words[1:])
     said = " ".join(answer.stderr.split())
+    if "--dry-run" in command.words and leaf.name == "run":  # of a study: it needs nothing that is not there
+        assert answer.exit_code == 0, said
+        assert list(tmp_path.iterdir()) == []
+        return
     assert answer.exit_code in (2, 3), said
     assert re.search(LOOKED_FOR[leaf.name], said), said
     assert list(tmp_path.iterdir()) == []

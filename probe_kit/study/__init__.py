@@ -1,0 +1,36 @@
+"""Studies: models × categories × conditions from one file."""
+
+from typing import TYPE_CHECKING
+
+from probe_kit._system.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from probe_kit.study.conduct import ModelFailure, conduct_study
+    from probe_kit.study.mistakes import Mistake, StudyFileError
+    from probe_kit.study.plan import StudyPlan, plan_study
+    from probe_kit.study.reading import LoadedStudy, load_study
+
+__all__ = [
+    "LoadedStudy",
+    "Mistake",
+    "ModelFailure",
+    "StudyFileError",
+    "StudyPlan",
+    "conduct_study",
+    "load_study",
+    "plan_study",
+]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "LoadedStudy": "reading",
+        "load_study": "reading",
+        "Mistake": "mistakes",
+        "StudyFileError": "mistakes",
+        "StudyPlan": "plan",
+        "plan_study": "plan",
+        "ModelFailure": "conduct",
+        "conduct_study": "conduct",
+    },
+)

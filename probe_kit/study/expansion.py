@@ -1,0 +1,169 @@
+"""Expansion of a study file into its cells."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from probe_kit._terminal.options import read_size
+from probe_kit.errors import ProbeKitError
+from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
+from probe_kit.extract.vqa.templates import find_template
+from probe_kit.study.cells import Cell, Selection
+from probe_kit.study.mistakes import Mistake
+from probe_kit.study.planned_suite import PlannedSuite, slugs
+from probe_kit.study.schema import AskTable, BlockTable, ConditionTable, ModelTable, Study
+
+
+@dataclass(frozen=True)
+class Member:
+    """A run that a block asks for. place: of the block in the file."""
+
+    block: BlockTable
+    place: int
+    model: str
+    way: str
+    seed: int
+
+    @property
+    def path(self) -> tuple[str | int, ...]:
+        """Of the list that names its condition or ask."""
+        return ("runs", self.place, "conditions" if self.block.conditions else "asks")
+
+
+def members(study: Study) -> Iterator[Member]:
+    """The runs that blocks ask for, excludes left out, in the order of the file."""
+    for place, block in enumerate(study.runs):
+        for model in block.models:
+            for way in block.conditions or block.asks or ():
+                if not any(excludes(rule.model_dump(exclude_none=True), model, way) for rule in block.exclude):
+                    yield from (Member(block, place, model, way, seed) for seed in block.seeds)
+
+
+def excludes(rule: dict[str, str], model: str, way: str) -> bool:
+    """Whether an exclude leaves out a model in a condition or ask."""
+    names = {"model": model, "condition": way, "ask": way}
+    return all(names[part] == value for part, value in rule.items())
+
+
+def expand(study: Study, suite: PlannedSuite, beside: Path) -> tuple[list[Cell], list[Mistake]]:
+    """The cells of a study whose names are all known, and mistakes that only their settings show.
+
+    beside: folder that paths of the file are relative to. Blocks that ask for the same run share its cell.
+    """
+    found: dict[tuple[str, str, int], Cell] = {}
+    mistakes: list[Mistake] = []
+    for member in members(study):
+        try:
+            settings = _settings(study, member, beside)
+        except ProbeKitError as error:
+            mistakes.append(Mistake(_blamed(study, member, str(error)), str(error)))
+            continue
+        selection = _selection(study, member.block, suite)
+        place = (member.model, member.way, member.seed)
+        known = found.get(place)
+        if known is None:
+            unavailable = study.models[member.model].unavailable or ""
+            selections = {member.block.name: selection}
+            cell = Cell(member.model, member.way, member.seed, settings, selections, suite, unavailable)
+            found[place] = cell
+        elif known.settings != settings:
+            said = f"{known.name} is already planned by block {next(iter(known.selections))!r} with other settings"
+            mistakes.append(Mistake(member.path, f"{said}; give both blocks the same tokens"))
+        else:
+            found[place] = replace(known, selections={**known.selections, member.block.name: selection})
+    mistakes += _same_settings(list(found.values()))
+    return list(found.values()), list(dict.fromkeys(mistakes))
+
+
+def _selection(study: Study, block: BlockTable, suite: PlannedSuite) -> Selection:
+    categories = block.categories or study.suite.categories or list(suite.items)
+    return Selection(slugs(categories), block.items or study.suite.items)
+
+
+def _blamed(study: Study, member: Member, said: str) -> tuple[str | int, ...]:
+    """The table whose values a settings error is of, and the key in it that the message names."""
+    home, name = ("conditions" if member.block.conditions else "asks"), member.way
+    try:
+        _settings_of(study, member.model, ConditionTable(), None, Path())
+    except ProbeKitError:
+        home, name = "models", member.model
+    given = getattr(study, home)[name].model_fields_set
+    named = [word for word in re.findall(r"\w+", said) if word in given]
+    return (home, name, *named[:1])
+
+
+def _settings(study: Study, member: Member, beside: Path) -> RunSettings:
+    if member.block.asks:
+        ask = study.asks[member.way]
+        tokens = member.block.tokens or "none"
+        return replace(_asked(study, member.model, ask, beside), tokens=tokens, seed=member.seed)
+    found = _settings_of(study, member.model, study.conditions[member.way], member.block.tokens, beside)
+    return replace(found, seed=member.seed)
+
+
+def _common(study: Study, name: str) -> dict[str, Any]:
+    model = study.models[name]
+    return {
+        "model": model.family,
+        "checkpoint": model.checkpoint,
+        "random_weights": model.random_weights,
+        "weights_seed": model.weights_seed,
+        "protocol": model.protocol,
+        "scene": _scene(study, model),
+        "dtype": model.dtype,
+        "batch": model.batch,
+        "device": "cuda" if model.gpus else "cpu",
+    }
+
+
+def _scene(study: Study, model: ModelTable) -> str | None:
+    """A protocol has its own scene; the study's is for models that name neither."""
+    return model.scene or (None if model.protocol else study.scene)
+
+
+def _settings_of(
+    study: Study, name: str, condition: ConditionTable, tokens: str | None, beside: Path
+) -> ExtractSettings:
+    """Of a policy, with what its protocol decides."""
+    fields = condition.model_dump(exclude_none=True)
+    if condition.background is not None:
+        fields["background"] = beside / condition.background
+    if condition.picture_size is not None:
+        fields["picture_size"] = read_size(condition.picture_size)
+    settings = ExtractSettings.from_options(
+        **_common(study, name),
+        **{part: value for part, value in fields.items() if part not in {"wordings", "no_act", "captured_calls"}},
+        execute=study.models[name].execute,
+        captured_calls=condition.captured_calls,
+        capture_only=condition.no_act,
+        wordings=None if condition.wordings is None else tuple(condition.wordings),
+        tokens=tokens or "pooled",
+    )
+    return replace(settings, options=study.models[name].options).followed()
+
+
+def _asked(study: Study, name: str, ask: AskTable, beside: Path) -> AskSettings:
+    prompt = str(beside / ask.prompt) if ask.prompt.endswith(".txt") else ask.prompt
+    settings = AskSettings.from_options(
+        **_common(study, name),
+        prompt=find_template(prompt),
+        picture_size=read_size(ask.picture_size),
+        picture=ask.picture,
+        query=ask.query,
+    )
+    return replace(settings, options=study.models[name].options)
+
+
+def _same_settings(cells: list[Cell]) -> list[Mistake]:
+    """Conditions or asks that are the same for a model under two names."""
+    found = []
+    for at, cell in enumerate(cells):
+        for other in cells[:at]:
+            alike = (cell.model, cell.seed, cell.settings) == (other.model, other.seed, other.settings)
+            if alike and cell.way != other.way:
+                home = "asks" if cell.asks else "conditions"
+                said = f"is the same as {other.way!r} for {cell.model!r}: all values are equal"
+                found.append(Mistake((home, cell.way), f"{said}. Leave one out, or exclude it for this model"))
+    return found

@@ -1,0 +1,46 @@
+"""Mistakes in a study file: where each stands, what is wrong, and what would be right."""
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+from probe_kit.errors import UsageError
+from probe_kit.study.places import line_of
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """path: of the value in the file, such as `("runs", 0, "models")`. text: what is wrong and what is right."""
+
+    path: tuple[str | int, ...]
+    text: str
+
+    @property
+    def place(self) -> str:
+        """The path as it would be written, such as `runs[0].models`."""
+        parts = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in self.path]
+        return "".join(parts).removeprefix(".") or "the file"
+
+
+class StudyFileError(UsageError):
+    """A study file has mistakes; the message lists all of them, each with its line."""
+
+    def __init__(self, file: str, text: str, mistakes: Sequence[Mistake]) -> None:
+        self.mistakes = tuple(mistakes)
+        self.lines = tuple(line_of(text, one.path) for one in mistakes)
+        found = sorted(zip(self.lines, mistakes, strict=True), key=lambda pair: pair[0])
+        super().__init__("\n".join(f"{file}:{line}: {one.place}: {one.text}" for line, one in found))
+
+
+def unknown(what: str, name: str, known: Collection[str], none: str = "there are none") -> str:
+    """What to say of a name that is not known, with the nearest match."""
+    near = get_close_matches(name, known, n=1)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    return f"unknown {what} {name!r}; known: {', '.join(known) or none}.{hint}"
+
+
+def each_unknown(
+    path: tuple[str | int, ...], what: str, names: Iterable[str], known: Collection[str]
+) -> list[Mistake]:
+    """A mistake per name that is not known."""
+    return [Mistake(path, unknown(what, name, known)) for name in names if name not in known]

@@ -1,0 +1,199 @@
+"""What a study file may say: its tables and their fields. Values are checked here, references elsewhere."""
+
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from probe_kit.extract.run_layout import AskTokens
+from probe_kit.extract.vqa.phrases import Picture, Query
+from probe_kit.hooks.contract.protocol import ProtocolName
+from probe_kit.hooks.family import Dtype
+from probe_kit.scene_names import ArmName, Rendering, SceneName
+from probe_kit.train.choices import Baseline, Target
+
+SCHEMA_VERSION = 1
+Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,59}$")]
+"""Of a model, condition, ask, block or table: small letters, digits, dots, hyphens and underscores."""
+Names = Annotated[list[str], Field(min_length=1)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Even = Annotated[int, Field(ge=2, le=1_000_000, multiple_of=2)]
+Size = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,3}x[1-9][0-9]{0,3}$")]
+TableKind = Literal[
+    "success", "sides", "ablation", "vlms", "vlm-vla", "probing", "groups", "chain", "score", "stages", "drift"
+]
+KINDS: tuple[TableKind, ...] = get_args(TableKind)
+
+
+class _Table(BaseModel):
+    """A table of the file: unknown keys are mistakes, and nothing is converted silently."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class SuiteTable(_Table):
+    """The suite of all runs.
+
+    path: its folder; the embedded suite by default. categories, items: of all blocks that name none.
+    counts: items per category of a suite that is not here yet, for the plan; later it must hold so many.
+    """
+
+    path: str | None = None
+    categories: Names | None = None
+    items: Even | None = None
+    counts: dict[str, Even] = {}
+
+
+class ReuseTable(_Table):
+    """folders: where runs that were made by hand lie."""
+
+    folders: list[str] = []
+
+
+class ModelTable(_Table):
+    """One model. family: a name of `probe-kit models`.
+
+    label: what tables call it. groups: it belongs to. vlm: the VLM of its backbone. finetuned_from: what it was
+    trained from. untrained: its network with random weights. unavailable: why it is not played; it is named in
+    plans and tables. The rest is as in `probe-kit extract`.
+    """
+
+    family: str
+    label: str | None = None
+    groups: list[Name] = []
+    vlm: str | None = None
+    finetuned_from: str | None = None
+    untrained: str | None = None
+    checkpoint: str | None = None
+    random_weights: bool = False
+    weights_seed: Annotated[int, Field(ge=0)] = 0
+    options: dict[str, Any] = {}
+    protocol: ProtocolName | None = None
+    scene: SceneName | None = None
+    execute: Count | None = None
+    dtype: Dtype | None = None
+    batch: Count = 1
+    gpus: Annotated[int, Field(ge=0, le=1)] = 0
+    unavailable: Annotated[str, Field(min_length=1)] | None = None
+
+
+class ConditionTable(_Table):
+    """How a policy is played: fields of the scene, and what else `probe-kit extract` takes."""
+
+    max_steps: Count | None = None
+    tile_side: float | None = None
+    light_level: float | None = None
+    rendering: Rendering | None = None
+    background: str | None = None
+    picture_size: Size | None = None
+    epsilon: float | None = None
+    arm: ArmName | None = None
+    start_grasped: bool = False
+    early_stop: bool = False
+    wordings: Names | None = None
+    no_act: bool = False
+    captured_calls: Count = 1
+
+
+class AskTable(_Table):
+    """How a VLM is asked, as in `probe-kit ask`."""
+
+    prompt: str
+    picture_size: Size = "224x224"
+    picture: Picture = "frame"
+    query: Query = "target"
+
+
+class ExcludeTable(_Table):
+    """Runs of a block that are not made: those that equal every name given."""
+
+    model: str | None = None
+    condition: str | None = None
+    ask: str | None = None
+
+
+class BlockTable(_Table):
+    """A block of runs: models × conditions, or models × asks, × seeds. categories, items: default the suite's."""
+
+    name: Name
+    models: Names
+    conditions: Names | None = None
+    asks: Names | None = None
+    categories: Names | None = None
+    items: Even | None = None
+    seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)] = [0]
+    tokens: AskTokens | None = None
+    exclude: list[ExcludeTable] = []
+
+
+class ProbesTable(_Table):
+    """Probes of the runs of some blocks, as in `probe-kit train`."""
+
+    runs: Names
+    views: Names = ["mean"]
+    permutations: Annotated[int, Field(ge=0, le=100_000)] = 200
+    controls: list[Literal["untrained"] | Baseline] = []
+    target: Target = "correct"
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+class PairsTable(_Table):
+    """Two conditions of the same models."""
+
+    conditions: Annotated[list[str], Field(min_length=2, max_length=2)]
+    models: Names
+
+
+class ComparisonTable(_Table):
+    """A named comparison, one family of tests: pairs of conditions, a chain of models, or groups of models."""
+
+    pairs: PairsTable | None = None
+    chain: Annotated[list[str], Field(min_length=2)] | None = None
+    groups: Annotated[list[str], Field(min_length=2)] | None = None
+
+
+class DriftTable(_Table):
+    """Pairs of models, each `model` or `model/ask`, and the view of the tokens."""
+
+    pairs: Annotated[list[Annotated[list[str], Field(min_length=2, max_length=2)]], Field(min_length=1)]
+    view: str = "mean"
+
+
+class TableTable(_Table):
+    """A table to print. runs: blocks it is made of; comparison, drift: by name, where its kind shows one."""
+
+    kind: TableKind
+    runs: Names | None = None
+    comparison: str | None = None
+    drift: str | None = None
+    categories: Names | None = None
+
+
+class Study(_Table):
+    """A whole study file.
+
+    out: folder or URL of runs; default `runs/NAME`. scene: of every model that names none, and of VLMs too.
+    """
+
+    version: Literal[1] = Field(alias="schema")
+    name: Name
+    out: str | None = None
+    scene: SceneName | None = None
+    suite: SuiteTable = SuiteTable()
+    reuse: ReuseTable = ReuseTable()
+    models: Annotated[dict[Name, ModelTable], Field(min_length=1)]
+    conditions: dict[Name, ConditionTable] = {}
+    asks: dict[Name, AskTable] = {}
+    runs: Annotated[list[BlockTable], Field(min_length=1)]
+    probes: dict[Name, ProbesTable] = {}
+    comparisons: dict[Name, ComparisonTable] = {}
+    drift: dict[Name, DriftTable] = {}
+    tables: dict[Name, TableTable] = {}
+
+    @property
+    def folder(self) -> str:
+        """Where runs are written."""
+        return self.out or f"runs/{self.name}"
+
+    def block(self, name: str) -> BlockTable:
+        """The block of this name."""
+        return next(block for block in self.runs if block.name == name)

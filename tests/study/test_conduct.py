@@ -1,0 +1,122 @@
+"""Playing of studies: resumed, each model loaded once, and a model that fails alone."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.extract import open_run
+from probe_kit.study import conduct_study, load_study, plan_study
+from probe_kit.suite import Suite
+
+TEXT = """
+schema = 1
+name = "played"
+out = "{out}"
+
+[suite]
+path = "{suite}"
+categories = ["color"]
+items = 2
+
+[models.expert]
+family = "expert"
+
+[models.broken]
+family = "pi0-tiny"
+checkpoint = "{out}/nowhere"
+
+[models.idle]
+family = "idle"
+
+[conditions.short]
+max_steps = 1
+
+[conditions.dark]
+max_steps = 1
+light_level = 0.7
+
+[[runs]]
+name = "main"
+models = ["expert", "broken", "idle"]
+conditions = ["short"]
+
+[[runs]]
+name = "light"
+models = ["idle"]
+conditions = ["dark"]
+"""
+
+
+@pytest.fixture(scope="module")
+def file(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("study")
+    path = folder / "study.toml"
+    path.write_text(TEXT.format(out=folder / "out", suite=small_suite.folder), encoding="utf-8")
+    return path
+
+
+def states(file: Path) -> dict[str, tuple[str, int]]:
+    return {one.cell.name: (one.state, one.done) for one in plan_study(load_study(file)).cells}
+
+
+def test_a_model_that_fails_stops_itself_alone_and_the_rest_is_played_once(file: Path) -> None:
+    assert set(states(file).values()) == {("new", 0)}
+    told: list[str] = []
+    (failure,) = conduct_study(plan_study(load_study(file)), failed=lambda one: told.append(one.model))
+    assert (failure.model, failure.run, told) == ("broken", "broken/short", ["broken"])
+    assert "nowhere" in failure.reason
+    after = {
+        "expert/short": ("whole", 4),
+        "broken/short": ("new", 0),
+        "idle/short": ("whole", 4),
+        "idle/dark": ("whole", 4),
+    }
+    assert states(file) == after
+    files = {path: path.stat().st_mtime_ns for path in file.parent.rglob("*") if path.is_file()}
+    conduct_study(plan_study(load_study(file)))
+    assert {path: path.stat().st_mtime_ns for path in file.parent.rglob("*") if path.is_file()} == files
+    place = next(one.location for one in plan_study(load_study(file)).cells if one.cell.name == "idle/dark")
+    before = open_run(place).stamp
+    sorted((Path(place) / "commits").iterdir())[2].unlink()
+    assert open_run(place, allow_partial=True).planned == 4
+    assert states(file)["idle/dark"] == ("partial", 3)
+    conduct_study(plan_study(load_study(file), only="light"))
+    assert states(file) == after
+    assert open_run(place).stamp == before
+
+
+def test_the_commands_print_the_plan_and_say_by_their_exit_code_whether_it_is_whole(file: Path) -> None:
+    run = CliRunner()
+    plain = run.invoke(app, ["study", "run", str(file), "--dry-run"])
+    assert plain.exit_code == 0
+    assert "4 runs, 16 episodes (16 acted, 0 captured without acting, 0 asked)" in plain.stdout
+    found = json.loads(run.invoke(app, ["study", "run", str(file), "--dry-run", "--json"]).stdout)
+    assert [one["model"] for one in found["runs"]] == ["expert", "broken", "idle", "idle"]
+    assert run.invoke(app, ["study", "status", str(file)]).exit_code == 1
+    assert run.invoke(app, ["study", "status", str(file), "--only", "absent-block"]).exit_code == 2
+
+
+@pytest.mark.slow
+def test_a_policy_is_loaded_once_for_all_of_its_runs(
+    small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from probe_kit.study import conduct
+
+    loaded: list[str] = []
+    load = conduct.load_acting_policy
+
+    def count(settings):  # type: ignore[no-untyped-def]
+        loaded.append(settings.model)
+        return load(settings)
+
+    monkeypatch.setattr(conduct, "load_acting_policy", count)
+    text = TEXT.format(out=tmp_path / "out", suite=small_suite.folder)
+    text = text.replace('family = "idle"', 'family = "pi0-tiny"\nrandom_weights = true')
+    file = tmp_path / "study.toml"
+    file.write_text(text, encoding="utf-8")
+    assert [one.model for one in conduct_study(plan_study(load_study(file)))] == ["broken"]
+    assert loaded == ["pi0-tiny"]
+    assert states(file)["idle/dark"] == states(file)["idle/short"] == ("whole", 4)

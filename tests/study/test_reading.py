@@ -1,0 +1,189 @@
+"""Study files: mistakes with their lines, all at once, and what a correct one expands to."""
+
+from pathlib import Path
+
+import pytest
+
+from probe_kit.errors import UsageError
+from probe_kit.study import LoadedStudy, StudyFileError, load_study, plan_study
+from probe_kit.study.places import line_of
+from tests.study.broken_files import BASE, ELSEWHERE, MISTAKES
+
+
+def written(folder: Path, text: str = BASE) -> Path:
+    file = folder / "study.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def changed(*changes: tuple[str, str]) -> str:
+    text = BASE
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new, 1)
+    return text
+
+
+def lines_with(text: str, marker: str) -> list[int]:
+    return [number for number, line in enumerate(text.splitlines(), 1) if marker in line]
+
+
+@pytest.mark.parametrize(("old", "new", "said"), MISTAKES, ids=[new.strip()[:40] for _, new, _ in MISTAKES])
+def test_a_mistake_is_named_with_its_line_and_nothing_else_is_raised(
+    tmp_path: Path, old: str, new: str, said: str
+) -> None:
+    text = changed((old, new))
+    file = written(tmp_path, text)
+    with pytest.raises(StudyFileError) as caught:
+        load_study(file)
+    expected = lines_with(text, "# here") or [text[: text.index(ELSEWHERE[said])].count("\n") + 1]
+    found = [line for line in str(caught.value).splitlines() if said in line]
+    assert found, str(caught.value)
+    assert any(line.startswith(f"{file}:{number}: ") for line in found for number in expected), str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_all_mistakes_are_said_at_once_in_the_order_of_the_file(tmp_path: Path) -> None:
+    text = changed(
+        ("items = 24", "items = 200  # here"),
+        ('vlm = "reader"', 'vlm = "raeder"  # here'),
+        ('asks = ["p1", "p2"]', 'asks = ["p1", "p3"]  # here'),
+        ('comparison = "light"', 'comparison = "dark"  # here'),
+    )
+    with pytest.raises(StudyFileError) as caught:
+        load_study(written(tmp_path, text))
+    assert [int(line.split(":")[1]) for line in str(caught.value).splitlines()] == [
+        *lines_with(text, "# here")[:2],
+        *lines_with(text, "[asks.p2]"),
+        *lines_with(text, "# here")[2:],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [("a = = 1", "line 1"), ("schema = 1\nschema = 1", "overwrite"), ("", "is missing")]
+)
+def test_what_is_no_toml_or_says_nothing_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        load_study(written(tmp_path, text))
+    with pytest.raises(UsageError, match="the package has embedded, paper"):
+        load_study(tmp_path / "other.toml")
+
+
+def test_lines_are_found_in_every_form_that_toml_has() -> None:
+    text = """\
+a = 1 # [not.a.table]
+b.c = 2
+[table."quoted name".x]
+'key' = [
+    ["p", "q"], # ]
+    "]",
+]
+after = 3
+[[runs]]
+name = "[x]"
+[[runs]]
+name = "y"
+"""
+    places = [
+        ("a",), ("b", "c"), ("table", "quoted name", "x"), ("table", "quoted name", "x", "key"),
+        ("table", "quoted name", "x", "key", 0, 1), ("table", "quoted name", "x", "after"), ("runs", 0, "name"),
+        ("runs", 1), ("runs", 1, "name"), ("nothing",),
+    ]  # fmt: skip
+    assert [line_of(text, place) for place in places] == [1, 2, 3, 4, 4, 8, 10, 11, 12, 1]
+
+
+# -- expansion ---------------------------------------------------------------------------------------------------
+
+
+def keys(study: LoadedStudy) -> dict[str, str]:
+    return {cell.name: cell.key for cell in study.cells}
+
+
+def test_blocks_that_ask_for_the_same_run_share_it(tmp_path: Path) -> None:
+    study = load_study(written(tmp_path))
+    assert list(keys(study)) == [
+        "base/plain", "state/plain", "random/plain", "random-state/plain", "base/dark", "reader/p1", "reader/p2",
+    ]  # fmt: skip
+    base = study.cells[0]
+    assert list(base.selections) == ["main", "light"]
+    assert (base.selection.categories, base.n_items, base.episodes) == (("color", "shape"), 48, 96)
+    assert base.inferences == 96 * 40
+    assert len(set(keys(study).values())) == 7
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "other"),
+    [
+        ('name = "small"', 'name = "tiny"', set()),
+        ('groups = ["one"]', 'groups = ["one"]\nlabel = "π0"', set()),
+        ("light_level = 0.7", "light_level = 0.7 # 30 % less", set()),
+        ('["base", "state", "random", "random-state"]', '["random", "base", "random-state", "state"]', set()),
+        ('categories = ["color", "Shape"]', 'categories = ["color", "Shape", "traffic"]', set()),
+        ("items = 24", "items = 30", set()),
+        ("permutations = 100", "permutations = 300", set()),
+        ("light_level = 0.7", "light_level = 0.6", {"base/dark"}),
+        ('prompt = "p2"', 'prompt = "seen"', {"reader/p2"}),
+        ('family = "vlm-tiny"', 'family = "vlm-tiny"\nscene = "bridge"', {"reader/p1", "reader/p2"}),
+    ],
+)  # fmt: skip
+def test_one_change_makes_other_runs_of_what_it_concerns_alone(
+    tmp_path: Path, old: str, new: str, other: set[str]
+) -> None:
+    before, after = keys(load_study(written(tmp_path))), keys(load_study(written(tmp_path, changed((old, new)))))
+    assert {name for name in before if after[name] != before[name]} == other
+
+
+def test_a_byte_of_a_checkpoint_makes_other_runs_of_its_model(tmp_path: Path) -> None:
+    weights = tmp_path / "weights" / "model.safetensors"
+    weights.parent.mkdir()
+    weights.write_bytes(b"one")
+    text = changed(('vlm = "reader"', f'vlm = "reader"\ncheckpoint = "{weights.parent}"'))
+    before = keys(load_study(written(tmp_path, text)))
+    weights.write_bytes(b"other")
+    after = keys(load_study(written(tmp_path, text)))
+    assert {name for name in before if after[name] != before[name]} == {"base/plain", "base/dark"}
+
+
+def test_seeds_and_wordings_multiply_episodes(tmp_path: Path) -> None:
+    text = changed(
+        ("light_level = 0.7", 'light_level = 0.7\nwordings = ["knowledge", "named"]'),
+        ('conditions = ["plain"]', 'conditions = ["plain"]\nseeds = [0, 7]'),
+    )
+    study = load_study(written(tmp_path, text))
+    episodes = {cell.name: cell.episodes for cell in study.cells}
+    assert (episodes["base/plain"], episodes["base/plain/seed 7"], episodes["base/dark"]) == (96, 96, 96)
+    places = {cell.location("out") for cell in study.cells}
+    assert len(places) == len(study.cells)
+    assert any(place.startswith("out/base/plain-seed7-") for place in places)
+
+
+# -- studies of the package --------------------------------------------------------------------------------------
+
+
+def test_the_papers_study_is_40_runs_of_104_000_episodes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    plan = plan_study(load_study("paper"))
+    assert plan.totals() == {
+        "runs": 40,
+        "episodes": 104_000,
+        "acted": 45_520,
+        "captured": 3_440,
+        "asked": 55_040,
+        "inferences": 3_438_640,
+        "missing": 104_000,
+    }
+    assert list(plan.skipped()) == ["pi0-paraphrases", "pi0-distill", "prismatic"]
+    assert len(plan.study.study.models) == 20
+    scenes = {one.cell.settings.scene.name for one in plan.cells}
+    assert scenes == {"act2answer"}  # policies and VLMs: else they would see other frames
+    checkpoints = {one.cell.model: one.cell.settings.checkpoint for one in plan.cells if one.cell.way == "plain"}
+    assert checkpoints["openvla"] == "openvla/openvla-7b"
+    assert checkpoints["openvla-sft"] == "gen-robot/openvla-7b-rlvla-sft_16k"
+
+
+def test_the_embedded_study_needs_no_download(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    study = load_study("embedded")
+    assert all(cell.settings.checkpoint is None for cell in study.cells)
+    assert {cell.model for cell in study.cells} == set(study.study.models)
+    assert plan_study(study).totals()["episodes"] == 1344
