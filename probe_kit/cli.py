@@ -16,6 +16,7 @@ from probe_kit._terminal.console import marked, out, say
 from probe_kit._terminal.error_reporting import report_error
 from probe_kit._terminal.interruption import begun
 from probe_kit._terminal.plain_text import terminal_safe
+from probe_kit.check_adapter.command import check_adapter
 from probe_kit.demo.commands import demo
 from probe_kit.doctor_command import doctor
 from probe_kit.extract.ask_commands import ask
@@ -35,7 +36,7 @@ from probe_kit.train.power_commands import power
 
 ORDER = (
     "demo", "doctor", "models", "suite", "extract", "ask", "run", "train", "power", "intervene", "retention",
-    "stages", "study", "export", "verify",
+    "stages", "study", "export", "new-adapter", "check-adapter", "verify",
 )  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 
@@ -147,6 +148,7 @@ for command in (
     models,
     verify,
     new_adapter,
+    check_adapter,
     train,
     power,
     retention,

@@ -28,13 +28,10 @@ def check_model(settings: RunSettings, scripted: tuple[str, ...]) -> None:
         raise MissingExtraError("--ray needs ray, which is not installed; `pip install 'probe-kit[ray]'`")
     from probe_kit.hooks.registry import find_family, known_families
 
-    if isinstance(settings, AskSettings):
+    asked = isinstance(settings, AskSettings)
+    if asked and (settings.model in scripted or not find_family(settings.model, scripted).reads):
         reads = [name for name, family in known_families().items() if family.reads]
-        named = settings.model in scripted or not find_family(settings.model, scripted).reads
-        if named:
-            raise UsageError(
-                f"{settings.model} acts and does not answer questions; those that do: {', '.join(reads)}"
-            )
+        raise UsageError(f"{settings.model} acts and does not answer questions; those that do: {', '.join(reads)}")
     if settings.model in scripted:
         return
 

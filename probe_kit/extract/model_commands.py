@@ -17,7 +17,10 @@ def models(
     run: Annotated[str | None, typer.Option(metavar="RUN", help="Show the certificate of this run.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List the models, one per line. With NAME: its checkpoint, streams, options and missing requirements."""
+    """List the models, one per line. With NAME: its checkpoint, streams, options and missing requirements.
+
+    A third party's model is imported only when it is named.
+    """
     if run is not None:
         from probe_kit.extract import open_run
 
@@ -44,8 +47,8 @@ def models(
                 if supported["readout"] == "first-chunk"
                 else "; one action per inference, which says little alone"
             )
-            line = f"{', '.join(supported['kinds'])}{one}"
-            out.print(marked("  [dim]intervene [/] {}", line), soft_wrap=True)
+            asked = "; ".join(f"{option} {', '.join(values)}" for option, values in supported["asked_as"].items())
+            out.print(marked("  [dim]intervene [/] {}", f"{asked}{one}"), soft_wrap=True)
         for option in row["options"]:
             default = f" Default {option['default']}." if option["default"] else ""
             line = f"-M {option['name']}={option['kind'].upper()}  {option['help']}{default}"
@@ -80,9 +83,9 @@ def _ready(family: "Family") -> str:
 
 def _model_rows(name: str | None) -> list[dict[str, Any]]:
     from probe_kit.extract.rollout.controllers import SCRIPTED
-    from probe_kit.hooks.registry import find_family, known_families
+    from probe_kit.hooks.registry import find_family, own_families, third_party_families
 
-    chosen = list(known_families().values())
+    chosen = list(own_families().values())
     if name is not None:
         chosen = [] if name in SCRIPTED else [find_family(name, tuple(SCRIPTED))]
     rows = [
@@ -112,5 +115,10 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
         {"model": model, "description": text, **scripted, "does": "acts", **nothing}
         for model, text in SCRIPTED.items()
         if name in (None, model)
+    ]
+    others = third_party_families() if name is None else {}
+    rows += [
+        {"model": model, "description": text, **dict.fromkeys(scripted, ""), "ready": "?", "does": "?", **nothing}
+        for model, text in others.items()
     ]
     return rows

@@ -205,13 +205,13 @@ def load_acting_policy(settings: ExtractSettings) -> "Policy":
 
 def _check_loaded(settings: ExtractSettings, policy: "Policy") -> None:
     """Raise UsageError for a loaded policy that the settings do not describe."""
-    from probe_kit.hooks.registry import known_families
+    from probe_kit.hooks.registry import family_names
 
     card = policy.card
     said: dict[str, tuple[object, object]] = {"random_weights": (settings.random_weights, card.random_weights)}
     if card.random_weights:
         said["weights_seed"] = settings.weights_seed, card.weights_seed
-    if card.family in known_families():
+    if card.family in family_names():
         said["model"] = settings.model, card.family
     wrong = [f"{name} {there!r} instead of {asked!r}" for name, (asked, there) in said.items() if asked != there]
     if wrong:

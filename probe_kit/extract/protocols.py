@@ -68,7 +68,7 @@ def scene_of(model: str, protocol: str | None = None, name: str | None = None, *
 
     An unknown family and a scripted policy have the default scene. Errors are those of `protocol_scene`.
     """
-    family = None if protocol or name else _families().get(model)
+    family = None if protocol or name else _family(model)
     if family is None:
         return protocol_scene(protocol, name, **changes)
     return SceneSpec.preset(family.home.preset, **{**family.home.changes, **changes})
@@ -117,11 +117,13 @@ def protocol_row(model: str, protocol: str | None) -> ProtocolRow | None:
 
     Raises UsageError for a model that the protocol does not use.
     """
-    family = _families().get(model)
+    family = _family(model)
     if protocol is None or family is None:
         return None
     if protocol not in family.protocols:
-        using = [name for name, one in _families().items() if protocol in one.protocols]
+        from probe_kit.hooks.registry import known_families
+
+        using = [name for name, one in known_families().items() if protocol in one.protocols]
         raise UsageError(
             f"the protocol {protocol} does not use {model}; it uses {', '.join(using)}. Leave --protocol out, and "
             f"take its scene with --scene {SCENES[protocol]}"
@@ -129,10 +131,10 @@ def protocol_row(model: str, protocol: str | None) -> ProtocolRow | None:
     return family.protocols[protocol]
 
 
-def _families() -> "dict[str, Family]":
-    from probe_kit.hooks.registry import known_families
+def _family(model: str) -> "Family | None":
+    from probe_kit.hooks.registry import get_family
 
-    return known_families()
+    return get_family(model)
 
 
 def _used(settings: ProtocolSettings) -> dict[str, str]:
@@ -150,7 +152,9 @@ def _told(value: str) -> str:
 
 def _defaults(settings: ProtocolSettings, row: ProtocolRow) -> dict[str, str]:
     """What the same settings are without a protocol, in the words of `probe-kit models`."""
-    family = _families()[settings.model]
+    from probe_kit.hooks.registry import find_family
+
+    family = find_family(settings.model)
     known = {f"-M {option.name}": option.default for option in family.options}
     known |= {
         "checkpoint": family.default_checkpoint or "embedded",

@@ -177,14 +177,18 @@ class Family:
         """Raises UnsupportedInterventionError, before anything is loaded, for what the family does not support."""
         if not self.acts:
             raise UnsupportedInterventionError(
-                f"{self.name} does not support the intervention {kind!r}: it answers and does not act, and "
+                f"{self.name} does not support interventions ({kind}): it answers and does not act, and "
                 "interventions compare actions. Take a family that acts (`probe-kit models` lists which do)"
             )
         self.interventions.check(kind, self.name)
 
     def interventions_json(self) -> dict[str, Any] | None:
-        """What of the interventions is supported, as plain values; None for a family that does not act."""
-        return self.interventions.to_json() if self.acts else None
+        """What of the interventions is supported, as plain values; None for a family that does not act.
+
+        asked_as: the same in the words of `probe-kit intervene`, values by option.
+        """
+        own = self.interventions
+        return {**own.to_json(), "asked_as": own.asked_as()} if self.acts else None
 
     def place(self, checkpoint: str | None, size: str | None = None) -> str | None:
         """What is loaded: `checkpoint`, that of a `size`, or the default. Raises UsageError for both at once."""

@@ -1,5 +1,7 @@
 """The registry of model families: those of probe_kit, and third-party ones from entry points.
 
+A third party's module is imported only when its family is named: it may import torch, or fail.
+
 A family of ours is a folder in `families/` whose package lists its `FAMILIES`, and its name in `FOLDERS`.
 """
 
@@ -42,54 +44,101 @@ class BrokenFamilyWarning(UserWarning):
 def known_families() -> dict[str, Family]:
     """All families by name. Third parties add theirs as entry points that name a `Family`.
 
-    One that cannot be loaded is left out with a BrokenFamilyWarning that says what to change.
+    Imports the modules of all of them, of which some import torch; `get_family` imports one. A family that cannot
+    be loaded is left out with a BrokenFamilyWarning that says what to change.
     """
-    found = dict(_own_families())
-    for entry in entry_points(group=ENTRY_POINTS):
-        family = _third_party(entry)
-        if family is not None:
-            found.setdefault(family.name, family)
+    found = dict(own_families())
+    for name in third_party_families():
+        if (family := get_family(name)) is not None:
+            found[name] = family
     return found
 
 
 @cache
-def _own_families() -> dict[str, Family]:
+def own_families() -> dict[str, Family]:
+    """The families of probe_kit by name, in the order of `FOLDERS`."""
     folders = (import_module(f"probe_kit.hooks.families.{folder}") for folder in FOLDERS)
     return {family.name: family for folder in folders for family in folder.FAMILIES}
 
 
-def _third_party(entry: EntryPoint) -> Family | None:
-    try:
-        family = entry.load()
-    except (Exception, SystemExit) as error:  # noqa: BLE001 - other people's code may raise anything
-        reason = f"{type(error).__name__}: {error}"
-    else:
-        if isinstance(family, Family):
-            return family
-        reason = f"it is a {type(family).__name__}, not a probe_kit.hooks.Family"
-    warnings.warn(
-        f"the model family {entry.name!r} ({entry.value}) cannot be used: {reason}. Its contract is described in "
-        "docs/capture.md; import names from probe_kit.hooks, not from its modules",
-        BrokenFamilyWarning,
-        stacklevel=3,
+def family_names() -> list[str]:
+    """The names of all families, also of those that cannot be loaded; imports no third party."""
+    return [*own_families(), *third_party_families()]
+
+
+def third_party_families() -> dict[str, str]:
+    """The names of third parties' families, and what their packages say of themselves; imports none of them."""
+    return {
+        entry.name: _summary(entry)
+        for entry in entry_points(group=ENTRY_POINTS)
+        if entry.name not in own_families()
+    }
+
+
+def _summary(entry: EntryPoint) -> str:
+    package = entry.dist
+    if package is None:
+        return entry.value
+    said = package.metadata.get("Summary")
+    return f"{said} ({package.name})" if said else f"of the package {package.name}"
+
+
+def entry_module(name: str) -> str | None:
+    """The module in which a third party names its family `name`; None for a family of probe_kit."""
+    entries = (
+        [] if name in own_families() else [own for own in entry_points(group=ENTRY_POINTS) if own.name == name]
     )
-    return None
+    return entries[0].module if entries else None
+
+
+def get_family(name: str) -> Family | None:
+    """The family called `name`, or None. Of third parties' modules only that of `name` is imported.
+
+    One that cannot be loaded is None as well, with a BrokenFamilyWarning that says what to change.
+    """
+    try:
+        return _get(name)
+    except UnknownModelError as error:
+        warnings.warn(str(error), BrokenFamilyWarning, stacklevel=3)
+        return None
 
 
 def find_family(name: str, others: tuple[str, ...] = ()) -> Family:
     """The family called `name`. `others` are further names to suggest if there is none.
 
-    Entry points of third parties are looked through only for a name that is not ours.
+    Raises UnknownModelError if there is none, or if it cannot be loaded.
     """
-    if (ours := _own_families().get(name)) is not None:
+    if (family := _get(name)) is not None:
+        return family
+    names = [*family_names(), *others]
+    near = get_close_matches(name, names, n=1)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    raise UnknownModelError(f"unknown model {name!r}; known: {', '.join(names)}.{hint}")
+
+
+def _get(name: str) -> Family | None:
+    """The family called `name`. Raises UnknownModelError for one of a third party that cannot be loaded."""
+    if (ours := own_families().get(name)) is not None:
         return ours
-    known = known_families()
-    if name not in known:
-        names = [*known, *others]
-        near = get_close_matches(name, names, n=1)
-        hint = f" Did you mean {near[0]!r}?" if near else ""
-        raise UnknownModelError(f"unknown model {name!r}; known: {', '.join(names)}.{hint}")
-    return known[name]
+    entries = [entry for entry in entry_points(group=ENTRY_POINTS) if entry.name == name]
+    return _third_party(entries[0]) if entries else None
+
+
+def _third_party(entry: EntryPoint) -> Family:
+    try:
+        family = entry.load()
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - other people's code may raise anything
+        reason = f"{type(error).__name__}: {error}"
+    else:
+        if isinstance(family, Family) and family.name == entry.name:
+            return family
+        reason = f"it is a {type(family).__name__}, not a probe_kit.hooks.Family"
+        if isinstance(family, Family):
+            reason = f"the family is called {family.name!r} and its entry point {entry.name!r}; give both one name"
+    raise UnknownModelError(
+        f"the model family {entry.name!r} ({entry.value}) cannot be used: {reason}. Its contract is described in "
+        "docs/capture.md; import names from probe_kit.hooks, not from its modules"
+    )
 
 
 def load_model(

@@ -12,7 +12,7 @@ from probe_kit.extract.store.format.bundles import tidy_bundle
 from probe_kit.extract.store.format.resume_pieces import Pieces
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS
-from probe_kit.hooks.registry import known_families
+from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.edits.sites import check_roles_have_tokens, resolve_sites
 from probe_kit.intervene.kinds.base import ConditionName, Measurement
 from probe_kit.intervene.kinds.image_swap.intervention import ImageSwap
@@ -112,7 +112,7 @@ def _check_roles(session: ReplaySession, settings: Mapping[str, Any]) -> None:
 
 def check_supported(run: Run, intervention: Intervention) -> None:
     """Raise UnsupportedInterventionError, before anything is loaded, for what the run's family does not do."""
-    if (family := known_families().get(run.model)) is not None:
+    if (family := get_family(run.model)) is not None:
         for kind in intervention.required_capabilities:
             family.check_intervention(kind)
 

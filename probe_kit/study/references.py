@@ -5,7 +5,7 @@ from graphlib import CycleError, TopologicalSorter
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.hooks.contract.options import check_options
-from probe_kit.hooks.registry import known_families
+from probe_kit.hooks.registry import family_names, find_family, get_family
 from probe_kit.statistics.label_permutations import smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.study.expansion import excludes, members
@@ -62,7 +62,7 @@ def _items(
 
 
 def _models(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
-    families = known_families()
+    families = family_names()
     for name, model in study.models.items():
         place = ("models", name)
         if model.family not in families and model.family not in _SCRIPTED:
@@ -82,7 +82,7 @@ def _models(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
 
 def _option_mistakes(name: str, model: ModelTable) -> Iterator[Mistake]:
     try:
-        check_options(model.family, known_families()[model.family].options, model.options)
+        check_options(model.family, find_family(model.family).options, model.options)
     except ProbeKitError as error:
         yield Mistake(("models", name, "options"), str(error))
 
@@ -97,12 +97,12 @@ def _relation(study: Study, name: str, part: str, target: str) -> Iterator[Mista
 
 
 def _answers(model: ModelTable) -> bool:
-    family = known_families().get(model.family)
+    family = get_family(model.family)
     return family is not None and family.reads
 
 
 def _acts(model: ModelTable) -> bool:
-    family = known_families().get(model.family)
+    family = get_family(model.family)
     return model.family in _SCRIPTED or (family is not None and family.acts)
 
 
@@ -140,7 +140,7 @@ def _blocks(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
 def _kinds(study: Study, block: BlockTable, place: tuple[str | int, ...]) -> Iterator[Mistake]:
     for name in block.models:
         model = study.models.get(name)
-        if model is None or (model.family not in known_families() and model.family not in _SCRIPTED):
+        if model is None or (model.family not in family_names() and model.family not in _SCRIPTED):
             continue
         if block.conditions and not _acts(model):
             yield Mistake((*place, "models"), f"{name!r} ({model.family}) does not act; ask it, with asks")

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
@@ -71,6 +72,8 @@ def test_a_suite_in_a_folder_of_a_hostile_name_is_shown_as_text(small_suite: Sui
 
 def test_what_a_third_party_says_of_its_family_is_shown_as_text(monkeypatch: pytest.MonkeyPatch) -> None:
     family = Family("mine", NAME, None, "x:y", streams=NAME, notes=NAME)
-    monkeypatch.setattr(registry, "known_families", lambda: {"mine": family})
+    package = SimpleNamespace(name="theirs", metadata={"Summary": NAME})
+    entry = SimpleNamespace(name="mine", value="x:FAMILY", load=lambda: family, dist=package)
+    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
     assert said("models", "mine").count(SHOWN) == 3
     assert "[bold]x" in said("models")

@@ -12,7 +12,7 @@ from probe_kit.extract import AskSettings, ExtractSettings, extract_run, prepare
 from probe_kit.extract.protocols import check_protocol, deviations, protocol_identity, protocol_scene
 from probe_kit.extract.settings import run_label
 from probe_kit.hooks.contract.options import check_options
-from probe_kit.hooks.registry import known_families
+from probe_kit.hooks.registry import own_families
 from probe_kit.retention.report.provenance import provenance
 from probe_kit.suite import Suite
 from tests.support.pi0_checkpoints import write_intact
@@ -47,7 +47,7 @@ RELEASED = {
 
 
 def test_every_model_of_the_release_that_is_here_has_its_row() -> None:
-    rows = {name: family.protocols["act2answer"].settings() for name, family in known_families().items()
+    rows = {name: family.protocols["act2answer"].settings() for name, family in own_families().items()
             if "act2answer" in family.protocols}  # fmt: skip
     assert rows == RELEASED
 
@@ -55,7 +55,7 @@ def test_every_model_of_the_release_that_is_here_has_its_row() -> None:
 @pytest.mark.parametrize("name", RELEASED)
 def test_the_options_of_a_row_are_the_familys_own(name: str) -> None:
     """What a loader would refuse is refused here, without one."""
-    family = known_families()[name]
+    family = own_families()[name]
     for row in family.protocols.values():
         given = row.options_for(None)
         assert check_options(name, family.options, given) == given
@@ -164,7 +164,7 @@ def test_a_run_names_its_protocol_and_the_report_lists_what_differs(small_suite:
 
 def test_the_documented_table_is_that_of_the_registry() -> None:
     page = (Path(__file__).parents[2] / "docs" / "protocols.md").read_text(encoding="utf-8")
-    for name, family in known_families().items():
+    for name, family in own_families().items():
         for row in family.protocols.values():
             options = " ".join(f"{key}={value}" for key, value in row.settings().items() if key.startswith("-M"))
             line = next(line for line in page.splitlines() if line.startswith(f"| `{name}` |"))

@@ -16,6 +16,7 @@ SHELLS = ("bash", "console", "sh")
 NOT_COMMANDS = {
     ("docs/architecture.md", "suite ──► env"): "a diagram",
     ("docs/architecture.md", "extract ──► RUN"): "a diagram",
+    ("docs/capture.md", "passed   Every stream declares"): "output of check-adapter",
     ("docs/causal.md", "RUN/interventions/<key>/"): "a tree of files",
     ("docs/concepts.md", "suite ──► env ──► extract"): "a diagram",
     ("docs/storage.md", "RUN/"): "a tree of files",

@@ -11,6 +11,16 @@ InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles"]
 Readout = Literal["first-chunk", "per-step"]
 """first-chunk: lateral displacement by the first inference's actions, none of them executed.
 per-step: its sum over every inference of the unedited episode; only the clean actions are executed."""
+ASKED_AS: Mapping[InterventionKind, tuple[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "swap": ("--kind", ("image-swap", "instruction-swap")),
+        "edit": ("--kind", ("interchange", "steer", "closed-loop", "erase")),
+        "attention": ("--kind", ("attention",)),
+        "kv": ("--sites", ("kv.*",)),
+        "tiles": ("--roles", ("image.left", "image.right")),
+    }
+)
+"""What a family supports, as `probe-kit intervene` asks for it: an option and its values."""
 _UNDECLARED = {
     "kv": "its adapter declares no `kv` stream. Patch residual sites instead, or declare `Model.prompt_kv`",
     "attention": "its adapter gives no attention. Patch `kv` or single roles instead: what a patch "
@@ -59,11 +69,23 @@ class Interventions:
         own = {"kv": self.prompt_kv, "attention": self.attention, "tiles": self.tiles}
         return own.get(kind, True)
 
+    def asked_as(self) -> dict[str, list[str]]:
+        """What is supported, as `probe-kit intervene` asks for it: values by option."""
+        found: dict[str, list[str]] = {}
+        for kind, (option, values) in ASKED_AS.items():
+            if self.supports(kind):
+                found.setdefault(option, []).extend(values)
+        return found
+
     def check(self, kind: InterventionKind, family: str) -> None:
         """Raises UnsupportedInterventionError if `family`, whose declaration this is, does not support `kind`."""
         if not self.supports(kind):
             why = {**_UNDECLARED, **self.instead}[kind]
-            raise UnsupportedInterventionError(f"{family} does not support the intervention {kind!r}: {why}")
+            option, values = ASKED_AS[kind]
+            asked = f"{option} {', '.join(values)}"
+            raise UnsupportedInterventionError(
+                f"{family} does not support the intervention {kind!r} (`probe-kit intervene {asked}`): {why}"
+            )
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, for listings and certificates."""

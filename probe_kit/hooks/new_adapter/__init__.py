@@ -12,7 +12,7 @@ from pathlib import Path
 from string import Template
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.registry import known_families
+from probe_kit.hooks.registry import family_names
 from probe_kit.version import __version__
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
@@ -29,7 +29,7 @@ def write_adapter(name: str, folder: Path | str | None = None) -> list[Path]:
         raise UsageError(
             f"{name!r} cannot name a family: expected small letters, digits and hyphens, as in my-vla"
         )
-    if name in known_families():
+    if name in family_names():
         raise UsageError(f"there is a family {name!r} already; give yours another name")
     folder = Path(name if folder is None else folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

@@ -4,6 +4,7 @@ import json
 import pickle
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -134,13 +135,15 @@ def test_a_family_that_cannot_load_says_so_by_name(loader: str, error: type[Exce
         del sys.modules["their_family"]
 
 
-def test_a_family_that_is_wrong_about_itself_breaks_no_list(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_family_that_is_wrong_about_itself_breaks_no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     from probe_kit.extract.model_commands import _model_rows
     from probe_kit.hooks import registry
 
     broken = Family("mine", "theirs", None, "x:y", packages=(("nowhere.at.all", "extra"),))
-    known = {**registry.known_families(), "mine": broken}
-    monkeypatch.setattr(registry, "known_families", lambda: known)
+    entry = SimpleNamespace(name="mine", value="x:y", load=lambda: broken, dist=None)
+    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    (row,) = _model_rows("mine")
+    assert "unknown: " in row["ready"]
     rows = {row["model"]: row["ready"] for row in _model_rows(None)}
-    assert "unknown: " in rows["mine"]
+    assert rows["mine"] == "?"
     assert rows["pi0-tiny"] == "yes"

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UnsupportedInterventionError, UsageError
-from probe_kit.hooks import Observation, Site, capture, edit, known_families
+from probe_kit.hooks import Observation, Site, capture, edit
 from probe_kit.hooks.capturing.edit_engine import apply_edits
 from probe_kit.hooks.capturing.edits import Edit, vector_hash
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
+from probe_kit.hooks.registry import own_families
 
-FAMILIES = known_families()
+FAMILIES = own_families()
 
 
 @pytest.mark.parametrize("name", [name for name, family in FAMILIES.items() if family.acts])

@@ -4,6 +4,7 @@ import importlib
 import json
 from collections.abc import Iterator
 from types import ModuleType
+from typing import get_args
 
 import pytest
 import typer
@@ -11,7 +12,10 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.extract import Run
+from probe_kit.hooks import Site
+from probe_kit.hooks.contract.interventions import ASKED_AS, InterventionKind
 from probe_kit.intervene import commands, load_effects
+from probe_kit.intervene.edits.sites import TILE_ROLES
 from probe_kit.intervene.kinds.registry import KINDS
 from probe_kit.intervene.results.inventory import listed_interventions
 from probe_kit.retention import retention_table
@@ -91,3 +95,18 @@ def test_every_entry_names_functions_that_exist(name: str) -> None:
         *("keys_in_use",) * bool(kind.keys_in_use),
     ):
         assert callable(kind.function(part)), part
+
+
+def test_what_a_family_supports_is_listed_in_the_words_of_the_command() -> None:
+    """`probe-kit models NAME` prints `--kind`, `--sites` and `--roles` as `probe-kit intervene` takes them."""
+    option: dict[str, list[str]] = {"--kind": [], "--sites": [], "--roles": []}
+    for capability, (name, values) in ASKED_AS.items():
+        assert capability in get_args(InterventionKind)
+        option[name] += values
+    assert sorted(option["--kind"]) == sorted(KINDS)
+    assert option["--roles"] == list(TILE_ROLES)
+    assert [Site.parse(f"{site.removesuffix('*')}02.keys").stream for site in option["--sites"]] == ["kv"]
+    page = CliRunner().invoke(app, ["models", "internvla-m1"]).stdout
+    assert "intervene  --kind image-swap, instruction-swap, interchange, steer, closed-loop, erase" in page
+    assert "kv.*" not in page
+    assert "; --sites kv.*" in CliRunner().invoke(app, ["models", "pi0-tiny"]).stdout

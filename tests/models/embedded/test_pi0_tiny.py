@@ -11,8 +11,8 @@ from safetensors.torch import load_file
 from probe_kit.env import SceneSpec
 from probe_kit.extract import AskSettings, ExtractSettings, extract_run
 from probe_kit.extract.protocols import scene_of
-from probe_kit.hooks import known_families
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.hooks.registry import own_families
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.models.embedded.pi0_tiny import ACTION_DIMS
 from probe_kit.suite import build_suite
@@ -73,7 +73,7 @@ def test_an_embedded_model_is_at_home_where_it_was_trained(name: str) -> None:
 
 def test_all_others_are_at_home_in_the_default_scene() -> None:
     embedded = {*NAMES, VLM}
-    assert {scene_of(name) for name in {*known_families(), "expert", "nobody"} - embedded} == {SceneSpec()}
+    assert {scene_of(name) for name in {*own_families(), "expert", "unknown"} - embedded} == {SceneSpec()}
 
 
 def test_the_hand_never_turns(pi0_tiny: Pi0) -> None:

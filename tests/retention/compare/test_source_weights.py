@@ -11,8 +11,8 @@ import torch
 from rich.console import Console
 from safetensors.torch import load_file
 
-from probe_kit.hooks import ModelCard, known_families, load_model
-from probe_kit.hooks.registry import find_family
+from probe_kit.hooks import ModelCard, load_model
+from probe_kit.hooks.registry import find_family, own_families
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.retention import retention_table
 from probe_kit.retention.compare.source_weights import grew_from
@@ -20,7 +20,7 @@ from probe_kit.retention.compare.vlm_vla import vlm_vla_differences
 from probe_kit.retention.report import report_html
 from tests.retention.asked_runs import SaidRun, acted, asked
 
-GROWN = {name: family for name, family in known_families().items() if family.source_weights is not None}
+GROWN = {name: family for name, family in own_families().items() if family.source_weights is not None}
 RIGHT = {"color": np.random.default_rng(0).random((12, 2)) < 0.7}
 
 

@@ -68,7 +68,7 @@ class LerobotFlow(Policy):
         self.stacks = self._stacks()
         self.streams = {name: self.stacks[name].stream(name) for name in ("backbone", "expert")}
         self._kept = attach_prompt_kv(self._joint, len(self.stacks["backbone"].layers))
-        self.prompt_kv = kv_stream(len(self._kept.keys), self._memory_width)
+        self.prompt_kv = kv_stream(len(self._kept.keys), self._kv_width)
         keys = [key.removeprefix(IMAGES) for key in self.config.image_features]
         self.cameras = tuple(key for key in keys if not key.startswith("empty_camera"))
         self._show(self.cameras[:1])
@@ -147,7 +147,7 @@ class LerobotFlow(Policy):
         """The checkpoint's tokenizer."""
 
     @property
-    def _memory_width(self) -> int:
+    def _kv_width(self) -> int:
         """Heads times size of a head of the backbone's keys."""
         projection: Any = self.stacks["backbone"].layers[0]
         return int(projection.self_attn.k_proj.out_features)

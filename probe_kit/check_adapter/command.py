@@ -1,0 +1,86 @@
+"""`probe-kit check-adapter`."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from probe_kit._terminal import options as common
+from probe_kit._terminal.console import err, marked, out, print_json, say
+from probe_kit.errors import UsageError
+from probe_kit.extract import command_options as own
+
+if TYPE_CHECKING:
+    from probe_kit.check_adapter.outcome import Outcome
+
+Instructions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--instruction",
+        metavar="TEXT",
+        help="An instruction that your tokenizer knows. Repeat for at least two of different length, and two of "
+        "equally many tokens. Default: sentences of the embedded suite.",
+    ),
+]
+
+
+def check_adapter(
+    model: Annotated[str, typer.Argument(metavar="MODEL", help="Model family; `probe-kit models` lists them.")],
+    checkpoint: common.Checkpoint = None,
+    options: common.ModelOptions = None,
+    instructions: Instructions = None,
+    device: common.Device = "cpu",
+    dtype: own.Dtype = None,
+    as_json: common.AsJson = False,
+) -> None:
+    """Check an adapter against the contract, and make a run of two episodes with it.
+
+    Use it while you write an adapter: `probe-kit new-adapter NAME` writes one that passes. Each check is one line:
+    passed, failed or skipped, and the promise that is checked. A failure says what was seen, what was expected and
+    what to change. Needs no pytest; `probe_kit.hooks.testing` runs the same checks as tests.
+
+    Checks of loading copy the checkpoint, so give a tiny one of the same layout if yours is large.
+
+    Example: `probe-kit check-adapter my-vla --checkpoint checkpoint`
+
+    Exits with 1 if a check failed. Ctrl-C stops at any check; nothing is kept.
+    """
+    if instructions is not None and len(instructions) < 2:
+        raise UsageError("one --instruction was given; give at least two, such as two of the same length")
+    with err.status("loading the family"):
+        from probe_kit.check_adapter.checking import Checking
+
+        checking = Checking(model, checkpoint, options or [], instructions, device, dtype)
+    outcomes = []
+    with checking:
+        for outcome in checking.outcomes():
+            outcomes.append(outcome)
+            if not as_json:
+                _print_outcome(outcome)
+    failed = [one for one in outcomes if one.state == "failed"]
+    if as_json:
+        print_json({"model": model, "passed": not failed, "checks": [one.to_json() for one in outcomes]})
+    else:
+        _print_end(model, checkpoint, outcomes)
+    raise typer.Exit(1 if failed else 0)
+
+
+def _print_outcome(outcome: "Outcome") -> None:
+    """One line; below a failed one what was seen, what was expected and what to change."""
+    colours = {"passed": "green", "failed": "bold red", "skipped": "yellow"}
+    line = f"{outcome.sentence} ({outcome.reason})" if outcome.reason else outcome.sentence
+    out.print(marked(f"[{colours[outcome.state]}]{{}}[/] {{}}", f"{outcome.state:8}", line), soft_wrap=True)
+    if outcome.state == "failed":
+        for name in ("seen", "expected", "change"):
+            out.print(marked("         [dim]{}[/] {}", f"{name:9}", getattr(outcome, name)), soft_wrap=True)
+
+
+def _print_end(model: str, checkpoint: str | None, outcomes: "list[Outcome]") -> None:
+    """How many passed, and what to do next."""
+    counts = {state: sum(one.state == state for one in outcomes) for state in ("passed", "failed", "skipped")}
+    out.print(", ".join(f"{count} {state}" for state, count in counts.items()))
+    if counts["failed"]:
+        first = next(one for one in outcomes if one.state == "failed")
+        say(marked("next: {}. Then run the same command again.", first.change.rstrip(".")))
+    else:
+        place = f" --checkpoint {checkpoint}" if checkpoint else ""
+        say(marked("next: [bold]probe-kit extract --model {}[/] --items 24", f"{model}{place}"))

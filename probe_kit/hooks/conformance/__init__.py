@@ -1,0 +1,1 @@
+"""The contract of adapters as checks: plain functions that `hooks.testing` and `probe-kit check-adapter` run."""

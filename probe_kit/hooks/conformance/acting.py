@@ -1,0 +1,71 @@
+"""Checks of policies: actions, seeds, inference without acting."""
+
+import numpy as np
+import torch
+
+from probe_kit.errors import ObservationError
+from probe_kit.hooks.capturing.capture_context import capture
+from probe_kit.hooks.conformance.check import SkipTest, check, refused, require, require_bits
+from probe_kit.hooks.conformance.subject import PolicySubject
+from probe_kit.hooks.contract.model import Policy
+
+
+@check(
+    "The action is made in a probed stream with part='action'.",
+    "Declare the stream that makes the action, and chunk ≥ execute ≥ 1 in the card.",
+)
+def the_action_is_made_in_a_stream(subject: PolicySubject) -> None:
+    streams, card = subject.policy.streams.values(), subject.policy.card
+    acting = [own.name for own in streams if own.part == "action" and own.probed]
+    require(bool(acting), f"streams {[own.name for own in streams]}", "one with part='action' that is probed")
+    require(card.chunk >= card.execute >= 1, f"chunk {card.chunk}, execute {card.execute}", "chunk ≥ execute ≥ 1")
+
+
+@check(
+    "Actions are (batch, chunk, 7) float32, finite, and come from the seed alone.",
+    "Return float32 with seven numbers per action, and draw noise from a generator seeded with the row's seed.",
+)
+def actions_have_the_contracts_shape_and_come_from_the_seed_alone(subject: PolicySubject) -> None:
+    policy, seen = _acting(subject), subject.seen
+    seeds = [5, 6][: len(seen)]
+    torch.manual_seed(1)
+    first = policy.act(seen, seeds)
+    torch.manual_seed(2)
+    require_bits(policy.act(seen, seeds), first, "actions of the same seeds", "those of the first call")
+    wanted = (len(seen), policy.card.chunk, 7)
+    require(first.shape == wanted, f"actions of shape {first.shape}", f"{wanted}")
+    require(first.dtype == np.float32, f"actions of type {first.dtype}", "float32")
+    require(bool(np.isfinite(first).all()), "actions that hold NaN or infinity", "finite numbers")
+
+
+@check(
+    "An inference without acting is that of acting, bit for bit at every site.",
+    "Let `infer_without_acting` call what `act` calls, with the same inputs.",
+)
+def inference_without_acting_equals_that_of_acting(subject: PolicySubject) -> None:
+    policy, one = _acting(subject), subject.one
+    sites = policy.sites()
+    with capture(policy, sites) as acting:
+        policy.act(one, [5])
+    with capture(policy, sites) as without_acting:
+        raw = policy.infer_without_acting(one, [5])
+    require(raw.shape[0] == 1, f"{raw.shape[0]} rows for one observation", "1")
+    for site in sites:
+        equal = torch.equal(acting[site], without_acting[site])
+        require(equal, f"another activation at {site}", "the same, bit for bit")
+
+
+@check(
+    "Every observation needs a seed of its own.",
+    "Call `self.check(observations, seeds)` first in `act`.",
+)
+def every_observation_needs_its_seed(subject: PolicySubject) -> None:
+    with refused("an observation without a seed", ObservationError):
+        subject.policy.act(subject.seen, [])
+
+
+def _acting(subject: PolicySubject) -> Policy:
+    """The policy. Raises SkipTest for one whose actions do not fit this arm."""
+    if (mismatch := subject.policy.embodiment_mismatch()) is not None:
+        raise SkipTest(f"its actions do not fit this arm: {mismatch}")
+    return subject.policy

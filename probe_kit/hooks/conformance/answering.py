@@ -1,0 +1,125 @@
+"""Checks of models that answer: readings, text, and independence of rows and pictures."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from probe_kit.errors import ObservationError, UsageError
+from probe_kit.hooks.conformance.check import SkipTest, check, refused, require, require_bits, require_close
+from probe_kit.hooks.conformance.subject import AnswerSubject
+
+
+@check(
+    "A reading has a logit per option, and the mass of the options is a share.",
+    "Return `Reading.of(logits, options, state)` with the logits behind the prompt.",
+)
+def a_reading_has_a_logit_per_option_and_their_mass_is_a_share(subject: AnswerSubject) -> None:
+    rows, reading = len(subject.asked), subject.read(subject.asked)
+    wanted = (rows, len(subject.settings.letters))
+    require(reading.option_logits.shape == wanted, f"logits of shape {reading.option_logits.shape}", f"{wanted}")
+    mass = reading.option_mass
+    require(mass.shape == (rows,), f"option_mass of shape {mass.shape}", f"({rows},)")
+    require(bool(((mass > 0) & (mass <= 1)).all()), f"option_mass {mass.tolist()}", "shares in (0, 1]")
+
+
+@check(
+    "Text repeats, and there is one text per question.",
+    "Decode greedily, and return a list of text from `speak`.",
+)
+def what_is_spoken_repeats_and_is_as_long_as_asked(subject: AnswerSubject) -> None:
+    model, asked = subject.answer_model, subject.asked
+    first, second = (model.speak(subject.read(asked), 4) for _ in range(2))
+    require(first == second, f"{first} and then {second}", "the same text for the same questions")
+    require(len(first) == len(asked), f"{len(first)} texts", f"{len(asked)}, one per question")
+    require(all(isinstance(text, str) for text in first), f"{first}", "text")
+
+
+@check(
+    "A reading can be used more than once.",
+    "Copy the cache of the reading in `speak` before tokens are appended to it.",
+)
+def speaking_does_not_use_a_reading_up(subject: AnswerSubject) -> None:
+    model, reading = subject.answer_model, subject.read(subject.asked)
+    first, second = model.speak(reading, 4), model.speak(reading, 4)
+    require(first == second, f"{first} and then {second} from one reading", "the same text")
+    none = model.speak(reading, 0)
+    require(none == [""] * len(reading.option_logits), f"{none} for 0 tokens", "empty texts")
+
+
+@check(
+    "Rows in another order are answered alike.",
+    "Mask padding, so that a row does not depend on its neighbours; or declare batch=1 in the card.",
+)
+def rows_in_another_order_are_answered_alike(subject: AnswerSubject) -> None:
+    _needs_batches(subject)
+    questions = subject.questions
+    forth, back = subject.ask(questions), subject.ask(questions[::-1])
+    require_close(forth, back[::-1], subject.settings.tolerance, "logits in another order")
+
+
+@check(
+    "A far longer question in the same batch changes nothing.",
+    "Mask padding and count positions from each row's first token; or declare batch=1 in the card.",
+)
+def a_far_longer_neighbour_changes_nothing(subject: AnswerSubject) -> None:
+    _needs_batches(subject)
+    short = subject.questions[0]
+    longer = replace(short, text=short.text + subject.settings.other_words * 6)
+    together, alone = subject.ask([short, longer]), subject.ask([short])
+    require_close(together[0], alone[0], subject.settings.tolerance, "logits beside a longer question")
+    pair, single = (subject.answer_model.speak(subject.read(asked), 4)[0] for asked in ([short, longer], [short]))
+    require(pair == single, f"{pair!r} beside a longer question", f"{single!r}, as alone")
+
+
+@check(
+    "Without a picture nothing of the picture is left.",
+    "Build the prompt without picture positions where `Prompt.pictured` is False; keep no state between calls.",
+)
+def without_a_picture_nothing_of_it_is_left(subject: AnswerSubject) -> None:
+    """Also right behind questions about pictures: no state may stay from call to call."""
+    asked = [replace(own, pictured=False) for own in subject.asked]
+    other = [replace(own, seen=replace(own.seen, image=255 - own.seen.image)) for own in asked]
+    before = subject.ask(asked)
+    subject.read(subject.asked)
+    require_bits(subject.ask(other), before, "answers without a picture", "those of another hidden picture")
+    for name, rows in subject.answer_model.asked_roles(subject.led(asked)).items():
+        pictured = any(row.mask("image").any() for row in rows)
+        require(not pictured, f"{name} has positions with the role image", "none without a picture")
+
+
+@check(
+    "Questions with and without a picture do not go into one call.",
+    "Call `self.shows_pictures(questions)` first in `read`; it raises UsageError.",
+)
+def questions_with_and_without_a_picture_do_not_go_together(subject: AnswerSubject) -> None:
+    first, second = subject.questions[:2]
+    with refused("one call with and without a picture", UsageError, ObservationError):
+        subject.ask([first, replace(second, pictured=False)])
+
+
+@check(
+    "Options that begin with the same token are refused.",
+    "Return `Reading.of(logits, options, state)`, which compares them.",
+)
+def options_that_begin_alike_are_refused(subject: AnswerSubject) -> None:
+    letter = subject.settings.letters[0]
+    with refused(f"the options {letter} and {letter}", UsageError, says="same token"):
+        subject.ask([replace(subject.questions[0], options=(letter, letter))])
+
+
+@check(
+    "A choice that rounding decides is a near tie.",
+    "Leave `near_ties` as it is inherited, or compare the two largest logits with a limit for the dtype.",
+)
+def a_choice_that_rounding_decides_is_a_near_tie(subject: AnswerSubject) -> None:
+    reading = subject.read(subject.asked)
+    apart = np.tile(np.array([[0.0, 9.0]], np.float32), (len(reading.option_logits), 1))
+    ties = subject.answer_model.near_ties
+    require(not ties(replace(reading, option_logits=apart)).any(), "a near tie at a margin of 9", "none")
+    near = ties(replace(reading, option_logits=apart * 1e-6))
+    require(bool(near.all()), "no near tie at a margin of 0.000009", "a near tie")
+
+
+def _needs_batches(subject: AnswerSubject) -> None:
+    if subject.model.card.batch == 1:
+        raise SkipTest(f"{subject.model.card.family} reads one question at a time")

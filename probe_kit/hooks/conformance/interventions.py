@@ -1,0 +1,292 @@
+"""Checks of the interventions that `Policy.interventions` declares.
+
+Every declared one runs and does what it says; every other one is refused by name. All hold by construction,
+whatever the weights are.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from probe_kit.errors import UnknownSiteError, UnsupportedInterventionError
+from probe_kit.hooks.capturing.activation_cache import ActivationCache
+from probe_kit.hooks.capturing.attention import capture_attention
+from probe_kit.hooks.capturing.capture_context import EditFunction, capture, edit
+from probe_kit.hooks.capturing.edit_engine import apply_edits
+from probe_kit.hooks.capturing.edits import Edit, vector_hash
+from probe_kit.hooks.conformance.check import SkipTest, check, refused, require, require_bits
+from probe_kit.hooks.conformance.subject import PolicySubject
+from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.sites import KV, Site, Stream, kv_stream
+from probe_kit.hooks.registry import find_family
+
+
+@check(
+    "Policy and family declare the same interventions.",
+    "Name one `Interventions` in the adapter and in its Family, with every stream and its quantities.",
+)
+def policy_and_family_declare_the_same(subject: PolicySubject) -> None:
+    policy, own = subject.policy, subject.policy.interventions
+    if subject.settings.family:
+        declared = find_family(subject.settings.family).interventions
+        require(declared == own, f"the family declares {declared}", f"what the policy declares, {own}")
+    require(
+        own.prompt_kv == (policy.prompt_kv is not None),
+        f"interventions.prompt_kv is {own.prompt_kv}, and policy.prompt_kv {policy.prompt_kv}",
+        "both, or neither",
+    )
+    unread, streams = set(own.unread), policy.streams
+    require(unread <= streams.keys(), f"unread streams {sorted(unread)}", f"some of {sorted(streams)}")
+    for name, stream in streams.items():
+        if own.edits is not None:
+            listed = set(own.edits.get(name, ()))
+            require(listed == set(stream.quantities), f"edits of {name}: {sorted(listed)}", f"{stream.quantities}")
+
+
+@check(
+    "Rewriting every site with itself changes no action, bit for bit.",
+    "Tap tensors that can be written in place: no copies, and no views of other memory.",
+)
+def rewriting_every_site_with_itself_changes_no_action_bit_for_bit(subject: PolicySubject) -> None:
+    policy = subject.policy
+    streams = [*policy.streams.values(), *([] if policy.prompt_kv is None else [policy.prompt_kv])]
+    sites = [site for own in streams for quantity in own.quantities for site in own.sites(quantity)]
+    plain = subject.run(subject.one)
+    with edit(policy, {site: lambda activation: activation for site in sites}):
+        same = subject.run(subject.one)
+    require_bits(same, plain, "actions with every site rewritten by itself", "those without")
+
+
+@check(
+    "What is rewritten in a block is read behind it.",
+    "Tap the tensor that is added to the stream, so that an edit of it reaches the next layer.",
+)
+def what_is_rewritten_in_a_block_is_read_behind_it(subject: PolicySubject) -> None:
+    policy = subject.policy
+    for stream in policy.streams.values():
+        behind = [site for site in stream.sites() if site.layer == 1]
+        plain = _captured(subject, subject.one, behind)
+        for quantity in set(stream.quantities) - {"final_norm"}:
+            written = [site for site in stream.sites(quantity) if site.layer == 0]
+            with edit(policy, dict.fromkeys(written, torch.zeros_like)):
+                changed = _captured(subject, subject.one, behind)
+            reached = any((plain[site] != changed[site]).any() for site in behind)
+            require(reached, f"zeros at {stream.name}.00.{quantity} leave layer 1 as it was", "other activations")
+
+
+@check(
+    "An edit at the end of a stream that is declared unread changes no action.",
+    "Leave the stream out of `Interventions(unread=…)` if the acting part reads its end.",
+)
+def the_end_of_an_unread_stream_is_a_control(subject: PolicySubject) -> None:
+    policy = subject.policy
+    plain = subject.run(subject.one)
+    for name in policy.interventions.unread:
+        stream = policy.streams[name]
+        for quantity in {"residual", "final_norm"} & set(stream.quantities):
+            site = stream.sites(quantity)[-1]
+            with edit(policy, {site: torch.zeros_like}):
+                require_bits(subject.run(subject.one), plain, f"actions with zeros at {site}", "those without")
+
+
+@check(
+    "Interventions that are not supported are refused by name.",
+    "Declare what is supported in `Interventions`, and raise UnknownSiteError in `tap` for other sites.",
+)
+def what_is_not_supported_is_refused_by_name(subject: PolicySubject) -> None:
+    policy, family = subject.policy, subject.policy.card.family
+    for kind in get_args(InterventionKind):
+        if policy.interventions.supports(kind):
+            policy.interventions.check(kind, family)
+            continue
+        with refused(f"the intervention {kind}", UnsupportedInterventionError, says=family):
+            policy.interventions.check(kind, family)
+    if policy.prompt_kv is None:
+        with refused("a site of kv", UnknownSiteError):
+            policy.tap(kv_stream(1, 1).sites("keys")[0])
+
+
+# -- kv ----------------------------------------------------------------------------------------------------
+
+
+@check(
+    "The prompt has keys and values for every token of the backbone.",
+    "Declare `prompt_kv` with the heads side by side as its width; tap keys and values with a `HeadsTap`.",
+)
+def the_prompt_has_keys_and_values_for_every_token_of_the_backbone(subject: PolicySubject) -> None:
+    kv, seen = _prompt_kv(subject), subject.seen
+    sites = _all(kv)
+    tape = _captured(subject, seen, sites)
+    tokens = len(subject.policy.token_roles(seen)[kv.name][0])
+    require(len(tape) == len(sites), f"{len(tape)} of {len(sites)} sites fired", "all")
+    wanted = (len(seen), tokens, kv.width)
+    for site in sites:
+        shape = tuple(tape[site].shape)
+        require(shape == wanted, f"{site} has the shape {shape}", f"{wanted}")
+
+
+@check(
+    "All keys and values of another picture give that picture's actions, bit for bit.",
+    "Tap the keys and values that the acting part reads, after rotation; correct `first_affected_token`.",
+)
+def all_keys_and_values_of_another_picture_give_that_pictures_actions(subject: PolicySubject) -> None:
+    """State, words and noise are the same. What chose the first token goes along with it."""
+    policy, kv, one = subject.policy, _prompt_kv(subject), subject.one[0]
+    other = replace(one, image=255 - one.image)
+    acting = [site for site in policy.sites() if policy.streams[site.stream].part == "action"]
+    early = [site for site in acting if (site.iteration or 0) < policy.interventions.first_affected_token]
+    late = [site for site in acting if site not in early]
+    plain, source = (_captured(subject, [own], [*_all(kv), *acting]) for own in (one, other))
+    edits, vectors = _edits_from(source, [*_all(kv), *early])
+    with apply_edits(policy, edits, [one], vectors) as edit_log:
+        edited = _captured(subject, [one], late)
+    with apply_edits(policy, edits, [one], vectors):
+        moved = subject.run([one])
+    require_bits(moved, subject.run([other]), "actions with keys and values of another picture", "its own actions")
+    for site in late:
+        require(torch.equal(edited[site], source[site]), f"another activation at {site}", "the other picture's")
+    require(
+        any((plain[site] != source[site]).any() for site in late),
+        "another picture changes nothing in the acting stream",
+        "other activations",
+    )
+    order = [entry.site for entry in edit_log.entries if entry.site.startswith(kv.name)]
+    wanted = [str(site) for layer in range(kv.layers - 1) for site in _of(kv, layer)]
+    require(order == wanted, f"edits in the order {order}", f"{wanted}")
+    require(sum(entry.moved for entry in edit_log.entries) > 0, "edits that move nothing", "other keys and values")
+
+
+@check(
+    "Values of one role are replaced in that role only.",
+    "Let the tokens of `kv` be those of the backbone, in the same order.",
+)
+def values_of_one_role_are_replaced_in_that_role_only(subject: PolicySubject) -> None:
+    policy, kv, one = subject.policy, _prompt_kv(subject), subject.one[0]
+    site = _of(kv, 0)[1]
+    plain, source = (
+        _captured(subject, [own], [site])[site][0].float().cpu()
+        for own in (one, replace(one, image=255 - one.image))
+    )
+    own = Edit("replace", (site,), roles=("image",), vector=vector_hash(source.numpy()))
+    with apply_edits(policy, [own], [one], {own.vector: source.numpy()}) as edit_log:
+        edited = _captured(subject, [one], [site])[site][0].float().cpu()
+    image = torch.from_numpy(policy.token_roles([one])[kv.name][0].mask("image"))
+    wanted = torch.where(image[:, None], source, plain)
+    require(torch.equal(edited, wanted), f"{site} differs outside of the picture's tokens", "new values there")
+    tokens = [entry.tokens for entry in edit_log.entries]
+    require(tokens == [int(image.sum())], f"edits of {tokens} tokens", f"[{int(image.sum())}]")
+
+
+# -- tiles -------------------------------------------------------------------------------------------------
+
+
+@check(
+    "Every token of the picture comes of the patches that are named.",
+    "Correct `patch_order`: per token of the vision tower, the picture token it ends in.",
+)
+def every_token_of_the_picture_comes_of_the_patches_that_are_named(subject: PolicySubject) -> None:
+    """What leaves the vision tower at the patches of one token reaches that token's embedding and no other."""
+    policy, one = subject.policy, subject.one
+    if not policy.interventions.tiles:
+        with refused("patch_order()", UnknownSiteError, says=policy.card.family):
+            policy.patch_order()
+        raise SkipTest(f"{policy.card.family} declares no tiles, and refuses them by name")
+    order, stream = policy.patch_order(), policy.every_stream()["vision"]
+    last = next(site for site in stream.sites() if site.layer == stream.layers - 1)
+    embedded = next(site for site in policy.sites() if policy.streams[site.stream].part == "backbone")
+    picture = np.flatnonzero(policy.roles(one)["backbone"][0].mask(f"image.{policy.card.cameras[0]}"))
+    named = set(order.tolist()) - {-1}
+    require(
+        named == set(range(picture.size)), f"patch_order names {len(named)} tokens", f"0 to {picture.size - 1}"
+    )
+    plain = _captured(subject, one, [last, embedded])
+    tokens = plain[last].shape[-2]
+    require(tokens == order.size, f"patch_order of length {order.size}", f"{tokens}, one per token of the tower")
+    for token in (0, 1, picture.size // 2, picture.size - 1):
+        with edit(policy, {last: _turned(np.flatnonzero(order == token))}):
+            changed = _captured(subject, one, [embedded])
+        moved = (changed[embedded] != plain[embedded])[0].any(dim=-1).cpu().numpy()
+        reached = np.flatnonzero(moved).tolist()
+        require(
+            reached == [picture[token]], f"patches of token {token} move positions {reached}", f"{picture[token]}"
+        )
+
+
+# -- attention ---------------------------------------------------------------------------------------------
+
+
+@check(
+    "Attention is recorded without changing an action, and its shares are shares.",
+    "Record softmax weights over all tokens of the backbone, computed in addition where kernels return none.",
+)
+def attention_is_recorded_without_changing_an_action_bit_for_bit(subject: PolicySubject) -> None:
+    policy, seen = subject.policy, subject.seen
+    if not policy.interventions.attention:
+        with refused("recorded attention", UnsupportedInterventionError), capture_attention(policy):
+            pass
+        raise SkipTest(f"{policy.card.family} declares no attention, and refuses it by name")
+    plain = subject.run(seen)
+    with capture_attention(policy) as mass:
+        recorded = subject.run(seen)
+    require_bits(recorded, plain, "actions with recorded attention", "those without")
+    backbone = subject.probed_backbone
+    roles = policy.roles(seen)[backbone.name]
+    valid = np.stack([row.valid for row in roles])
+    steps = max(own.iterations or 1 for own in policy.streams.values() if own.part == "action")
+    blocks, iterations = ({key[at] for key in mass.by_read} for at in (0, 1))
+    require(iterations >= set(range(steps)), f"iterations {sorted(iterations)}", f"0 to {steps - 1}")
+    require(blocks <= set(range(backbone.layers - 1)), f"blocks {sorted(blocks)}", f"below {backbone.layers - 1}")
+    most = 1 + subject.settings.attention_tolerance
+    for weights, whole in zip(mass.by_read.values(), mass.on(valid).values(), strict=True):
+        require(weights.shape == valid.shape, f"weights of shape {weights.shape}", f"{valid.shape}")
+        require(bool((weights >= 0).all()), "negative weights", "weights from 0 on")
+        require(bool(((whole > 0) & (whole <= most)).all()), f"shares up to {whole.max():.6g}", "shares in (0, 1]")
+        require(np.abs(weights[~valid]).max(initial=0) == 0, "attention to padding", "none")
+    shares = mass.of_role(roles, "image").values()
+    require(all((share > 0).all() for share in shares), "no attention to the picture", "some, from softmax")
+
+
+def _turned(positions: NDArray[np.int64]) -> EditFunction:
+    """An edit that changes the sign at some positions."""
+    own = torch.from_numpy(positions)
+
+    def turn(passing: torch.Tensor) -> torch.Tensor:
+        passing[:, own] = -passing[:, own]
+        return passing
+
+    return turn
+
+
+def _prompt_kv(subject: PolicySubject) -> Stream:
+    if subject.policy.prompt_kv is None:
+        raise SkipTest(f"{subject.policy.card.family} declares no kv stream")
+    return subject.policy.prompt_kv
+
+
+def _captured(subject: PolicySubject, seen: Sequence[Observation], sites: Sequence[Site]) -> ActivationCache:
+    """What one inference leaves at `sites`."""
+    with capture(subject.policy, sites) as tape:
+        subject.run(seen)
+    return tape
+
+
+def _of(kv: Stream, layer: int) -> list[Site]:
+    return [Site(kv.name, layer, quantity) for quantity in KV]
+
+
+def _all(kv: Stream) -> list[Site]:
+    return [site for quantity in KV for site in kv.sites(quantity)]
+
+
+def _edits_from(
+    source: ActivationCache, sites: Sequence[Site]
+) -> tuple[list[Edit], dict[str, NDArray[np.float32]]]:
+    """Edits that put in the first row of `source`, and the arrays they name."""
+    rows = {site: source[site][0].float().cpu().numpy() for site in sites}
+    vectors = {vector_hash(row): row for row in rows.values()}
+    return [Edit("replace", (site,), vector=vector_hash(row)) for site, row in rows.items()], vectors

@@ -1,0 +1,143 @@
+"""Checks of the card and of loading, on copies of the checkpoint."""
+
+import shutil
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file, save_file
+
+from probe_kit.errors import CheckpointError, UsageError, WeightsError
+from probe_kit.hooks.conformance.check import CheckFailedError, SkipTest, check, refused, require
+from probe_kit.hooks.conformance.subject import Subject
+from probe_kit.hooks.family import SIZE
+
+_DAMAGES = {
+    "missing": "a tensor is missing",
+    "extra": "a tensor is there that the network lacks",
+    "shape": "a tensor has another shape",
+    "nan": "a tensor holds NaN",
+}
+
+
+@check(
+    "The card names the weights, their number and the cameras.",
+    "Fill in the ModelCard from what `load_weights` returns.",
+)
+def the_card_names_the_weights(subject: Subject) -> None:
+    card = subject.model.card
+    require(len(card.weights_sha256) == 64, f"weights_sha256 is {card.weights_sha256!r}", "64 hexadecimal digits")
+    require(card.parameters > 0, f"{card.parameters} parameters", "the number of the network")
+    require(bool(card.cameras), "no cameras", "the names of the cameras that the model reads")
+    others = {name for name, value in card.settings.items() if not isinstance(value, str)}
+    require(not others, f"settings {sorted(others)} are not text", "text values")
+
+
+@check(
+    "Every file that the loader reads reaches the card, by content.",
+    "Put `content_hashes(side_files(folder))` into the card's settings.",
+)
+def every_file_that_is_read_reaches_the_card(subject: Subject) -> None:
+    """A space at the end of a configuration makes another identity."""
+    copied = _copy(subject)
+    configuration = copied / subject.settings.configuration
+    if not configuration.is_file():
+        raise SkipTest(f"the checkpoint has no {subject.settings.configuration}")
+    before = subject.load(copied).card
+    configuration.write_text(configuration.read_text(encoding="utf-8") + " ", encoding="utf-8")
+    after = subject.load(copied).card
+    require(before.weights_sha256 == after.weights_sha256, "other hashes of the same weights", "one hash")
+    require(
+        before.settings != after.settings,
+        f"the same settings after a change of {configuration.name}",
+        "settings that hold its hash",
+    )
+
+
+@check(
+    "Every option reaches the card.",
+    "Read the option in the loader and put its value into the card's settings.",
+)
+def every_option_reaches_the_card(subject: Subject) -> None:
+    checkpoint, others = subject.given.checkpoint, subject.given.other_options
+    declared = {own.name for own in subject.family.options} - subject.settings.unloadable_options - {SIZE}
+    require(
+        declared <= others.keys(),
+        f"other values of {sorted(others)}",
+        f"of every option, {sorted(declared)}",
+        "Name another value of every option in the fixture `other_options`.",
+    )
+    if not declared:
+        raise SkipTest("the family declares no option of which another value is known")
+    plain = subject.load(checkpoint).card.settings
+    for name in sorted(declared):
+        settings = subject.load(checkpoint, **{name: others[name]}).card.settings
+        require(settings != plain, f"the same settings with {name}={others[name]!r}", "other settings")
+
+
+@check(
+    "An option that is not declared is refused.",
+    "Declare options as `Family(options=(Option(…),))`; take no **keywords in the loader.",
+)
+def an_option_that_is_not_declared_is_refused(subject: Subject) -> None:
+    with refused("the option nonsense=1", UsageError, says="no model option nonsense"):
+        subject.load(subject.given.checkpoint, nonsense=1)
+
+
+@check(
+    "Untrained networks differ by their seed, repeat by it, and say so in the card.",
+    "Take `random_weights` and `weights_seed` in the loader; `models.initialisation.initialise` draws them.",
+)
+def random_twins_differ_by_their_seed_and_repeat_by_it(subject: Subject) -> None:
+    place = str(subject.given.checkpoint)
+    cards = [
+        subject.family.load(place, random_weights=True, weights_seed=seed, options=subject.settings.options).card
+        for seed in (1, 1, 2)
+    ]
+    hashes = [card.weights_sha256 for card in cards]
+    require(hashes[0] == hashes[1], "two networks of seed 1 with different weights", "the same weights")
+    require(hashes[1] != hashes[2], "networks of the seeds 1 and 2 with the same weights", "other weights")
+    seeds = [card.weights_seed for card in cards]
+    require(seeds == [1, 1, 2], f"cards with weights_seed {seeds}", "[1, 1, 2]")
+    require(all(card.random_weights for card in cards), "a card without random_weights", "random_weights=True")
+
+
+@check(
+    "Weights that are not exactly the network's are refused.",
+    "Load with `read_weights` and `load_weights`, which compare every name, shape and value.",
+)
+def weights_that_are_not_exactly_the_models_are_refused(subject: Subject) -> None:
+    """One tensor is missing, extra, of another shape, or NaN."""
+    for damage, words in _DAMAGES.items():
+        copied = _copy(subject, damage)
+        _damage(copied, damage)
+        with refused(f"a checkpoint in which {words}", WeightsError, CheckpointError):
+            subject.load(copied)
+        shutil.rmtree(copied)
+
+
+def _copy(subject: Subject, name: str = "copy") -> Path:
+    """A copy of the checkpoint. Raises SkipTest where the family loads by no name."""
+    source = subject.given.checkpoint
+    assert subject.family
+    return Path(shutil.copytree(source, subject.given.folder / name))
+
+
+def _damage(folder: Path, damage: str) -> None:
+    """Change one tensor of the last safetensors file of weights."""
+    files = sorted(folder.glob("model*.safetensors"))
+    if not files:
+        raise SkipTest(f"{folder} holds no model*.safetensors to damage")
+    tensors = load_file(files[-1])
+    blocks = [name for name in sorted(tensors) if ".layers." in name or ".blocks." in name] or sorted(tensors)
+    if not blocks:
+        raise CheckFailedError(f"{files[-1].name} holds no tensor", "the weights of the network")
+    name = blocks[0]
+    if damage == "missing":
+        del tensors[name]
+    elif damage == "extra":
+        tensors["not.in.the.network.weight"] = torch.ones(2)
+    elif damage == "shape":
+        tensors[name] = torch.cat([tensors[name], tensors[name]])
+    else:
+        tensors[name] = torch.full_like(tensors[name], torch.nan)
+    save_file(tensors, files[-1])

@@ -1,0 +1,86 @@
+"""`probe-kit check-adapter` on a third party's family: a line per check, exit codes, advice; without pytest."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.support.distributions import install, install_encoder_vla
+from tests.support.encoder_vla.policy import write_checkpoint
+
+WITHOUT_PYTEST = "import sys\nsys.modules['pytest'] = None\n"
+HEAVY = """
+import torch
+from probe_kit.hooks import Family
+
+FAMILY = Family("heavy-vla", "imports torch", None, "heavy_vla:load", needs_checkpoint=True)
+
+
+def load(checkpoint, device="cpu", dtype=None, random_weights=False):
+    return torch.load(checkpoint + "/weights.pt")
+"""
+
+
+def ran(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """The command in a process in which pytest cannot be imported."""
+    (folder / "sitecustomize.py").write_text(WITHOUT_PYTEST, encoding="utf-8")
+    paths = os.pathsep.join([str(folder), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return subprocess.run(
+        [sys.executable, "-m", "probe_kit", "check-adapter", *arguments],
+        capture_output=True, encoding="utf-8", check=False, timeout=300, cwd=folder,
+        env={**os.environ, "PYTHONPATH": paths},
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_sound_adapter_passes_every_check_and_plays_two_episodes(tmp_path: Path) -> None:
+    install_encoder_vla(tmp_path / "theirs")
+    write_checkpoint(tmp_path / "checkpoint")
+    done = ran(tmp_path / "theirs", "encoder-vla", "--checkpoint", str(tmp_path / "checkpoint"))
+    lines = done.stdout.splitlines()
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert {line.split()[0] for line in lines[:-1]} == {"passed", "skipped"}
+    assert lines[0] == "passed   Naming the family imports no torch, so that commands without a model stay fast."
+    assert lines[-2] == "passed   Two episodes are extracted, and every stored site is loaded again."
+    assert "0 failed" in lines[-1]
+    assert "next: probe-kit extract --model encoder-vla" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_broken_adapter_is_told_what_to_change(tmp_path: Path) -> None:
+    folder = install_encoder_vla(tmp_path / "theirs")
+    write_checkpoint(tmp_path / "checkpoint")
+    source = folder / "encoder_vla" / "policy.py"
+    text = source.read_text(encoding="utf-8")
+    assert "Tap(block.norm1, fires)" in text
+    source.write_text(text.replace("Tap(block.norm1, fires)", "Tap(block.norm1, fires + 1)"), encoding="utf-8")
+    done = ran(folder, "encoder-vla", "--checkpoint", str(tmp_path / "checkpoint"), "--json")
+    assert done.returncode == 1, done.stderr
+    answer = json.loads(done.stdout)
+    failed = {own["name"]: own for own in answer["checks"] if own["state"] == "failed"}
+    assert not answer["passed"]
+    first = failed["every_site_of_every_quantity_fires_as_often_as_promised"]
+    assert first["seen"].startswith("SiteNeverFiredError")
+    assert "correct `fires`" in first["change"]
+    assert "two_episodes_are_extracted" in failed
+
+
+@pytest.mark.slow
+def test_a_loader_that_fails_and_a_module_that_imports_torch_are_named(tmp_path: Path) -> None:
+    """Without a model nothing else can be checked, and the line of the adapter is named."""
+    folder = install(tmp_path / "theirs", "heavy-vla", "heavy_vla:FAMILY")
+    (folder / "heavy_vla.py").write_text(HEAVY, encoding="utf-8")
+    (tmp_path / "checkpoint").mkdir()
+    done = ran(folder, "heavy-vla", "--checkpoint", str(tmp_path / "checkpoint"))
+    lines = done.stdout.splitlines()
+    assert done.returncode == 1, done.stderr
+    assert lines[0].startswith("failed   Naming the family imports no torch")
+    assert "`import heavy_vla` imports torch" in lines[1]
+    assert lines[4].startswith("failed   The model loads")
+    assert "FileNotFoundError" in lines[5]
+    assert "heavy_vla.py:" in lines[5]
+    assert lines[-1] == "0 passed, 2 failed, 0 skipped"
+    assert "next: Keep `FAMILY` in a module" in done.stderr

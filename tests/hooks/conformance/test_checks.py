@@ -1,0 +1,343 @@
+"""Every check fails for an adapter that breaks its promise, and says what was seen, expected and to be changed."""
+
+import ast
+import dataclasses
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import count
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from safetensors.torch import load_file
+from torch import Tensor
+
+import probe_kit
+from probe_kit.errors import UsageError
+from probe_kit.hooks import Family, Model, Observation, Roles, Site, Stream, Tap, registry
+from probe_kit.hooks.checkpoints.weights import read_weights
+from probe_kit.hooks.conformance.check import CheckFailedError, SkipTest, check, refused, require_bits
+from probe_kit.hooks.conformance.contract import ANSWER_CHECKS, POLICY_CHECKS
+from probe_kit.hooks.conformance.examples import examples_for
+from probe_kit.hooks.conformance.subject import AnswerSubject, ContractSettings, PolicySubject, Subject
+from probe_kit.hooks.testing import AdapterContract, AnswerModelContract
+from tests.support.encoder_vla.policy import STEPS, WIDTH, EncoderPolicy, EncoderVLA, load, write_checkpoint
+from tests.support.position_models import PositionModel, always, likes
+
+CHECKS = {own.name: own for own in (*POLICY_CHECKS, *ANSWER_CHECKS)}
+
+
+@pytest.fixture(autouse=True)
+def unfused() -> Iterator[None]:
+    before = torch.backends.mha.get_fastpath_enabled()
+    torch.backends.mha.set_fastpath_enabled(False)
+    yield
+    torch.backends.mha.set_fastpath_enabled(before)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_checkpoint(tmp_path_factory.mktemp("encoder") / "checkpoint")
+
+
+@pytest.fixture(scope="module")
+def sound(checkpoint: Path) -> EncoderPolicy:
+    return load(str(checkpoint))
+
+
+class Given:
+    """What checks ask for, of a model that is there."""
+
+    def __init__(self, model: Model, checkpoint: Path, folder: Path) -> None:
+        self.model, self.checkpoint, self.folder = model, checkpoint, folder
+        self.observations = examples_for(model, "Put the cube on the star", "Put the cube on the red shape")
+        self.alike = examples_for(model, "Put the cube on the star", "Put the cube on the cube")
+        self.other_options: Mapping[str, Any] = {}
+
+
+# -- policies --------------------------------------------------------------------------------------------------
+
+
+class Longer(EncoderPolicy):
+    streams = EncoderPolicy.streams | {"expert": Stream("expert", 3, WIDTH, STEPS + 1)}
+
+
+class Narrower(EncoderPolicy):
+    streams = EncoderPolicy.streams | {"backbone": Stream("backbone", 3, WIDTH - 1)}
+
+
+class Nameless(EncoderPolicy):
+    streams = EncoderPolicy.streams | {"expert": Stream("other", 3, WIDTH, STEPS, part="action")}
+
+
+class Turned(EncoderPolicy):
+    """Calls the picture words, and the words picture."""
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        found, other = super().roles(seen), {"image.primary": "language", "language": "image.primary"}
+        turned = [Roles(tuple(span._replace(role=other.get(span.role, span.role)) for span in row.spans))
+                  for row in found["backbone"]]  # fmt: skip
+        return {**found, "backbone": turned}
+
+
+class Misnamed(EncoderPolicy):
+    role_names = EncoderPolicy.role_names | {"backbone": ("image.primary", "padding")}
+
+
+class Elsewhere(EncoderPolicy):
+    """The MLP tapped in front of its last step."""
+
+    def tap(self, site: Site) -> Tap:
+        tap = super().tap(site)
+        return dataclasses.replace(tap, module=self.network.get_submodule(
+            f"{site.stream}.layers.{site.layer}.norm2")) if site.quantity == "mlp" else tap  # fmt: skip
+
+
+class Unchecked(EncoderPolicy):
+    """Takes any site and any number of seeds."""
+
+    def tap(self, site: Site) -> Tap:
+        del site
+        return Tap(self.network.velocity, 1)
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return super().act(seen, [*seeds, *range(len(seen))][: len(seen)])
+
+
+class Copying(EncoderPolicy):
+    """Hands out copies, into which an edit writes in vain."""
+
+    def tap(self, site: Site) -> Tap:
+        return dataclasses.replace(super().tap(site), view=Tensor.clone)
+
+
+class Drifting(EncoderPolicy):
+    calls = count(1)
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return super().act(seen, seeds) + np.float32(1e-3 * next(self.calls))
+
+
+class Drawing(EncoderPolicy):
+    """Noise from the global generator."""
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return super().act(seen, torch.randint(2**31, (len(seeds),)).tolist())
+
+
+class Doubling(EncoderPolicy):
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return super().act(seen, seeds).astype(np.float64)  # type: ignore[return-value]
+
+
+class Mixing(EncoderPolicy):
+    """Rows that know of each other."""
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        actions = super().act(seen, seeds)
+        return np.asarray(actions + actions.mean(axis=0), np.float32)
+
+
+class Boasting(EncoderPolicy):
+    """Declares what it has not."""
+
+    interventions = dataclasses.replace(EncoderPolicy.interventions, unread=("expert",))
+
+
+class Passive(EncoderPolicy):
+    streams = EncoderPolicy.streams | {"expert": Stream("expert", 3, WIDTH, STEPS, part="bridge")}
+
+
+class Otherwise(EncoderPolicy):
+    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return self.act(seen, [seed + 1 for seed in seeds])
+
+
+@pytest.mark.parametrize(
+    ("broken", "name", "said"),
+    [
+        (Longer, "every_site_of_every_quantity_fires_as_often_as_promised", "expert"),
+        (Narrower, "activations_have_the_shape_of_their_stream", "has the shape"),
+        (Nameless, "streams_declare_what_they_are", "the stream 'other' under the key 'expert'"),
+        (Turned, "another_picture_moves_image_positions_only", "another image changes positions with the roles"),
+        (Turned, "another_instruction_moves_language_positions_only", "another language"),
+        (Misnamed, "roles_cover_every_position_and_are_the_declared_ones", "language"),
+        (Elsewhere, "what_blocks_add_makes_the_next_residual", "the sum is off by"),
+        (Unchecked, "an_unknown_site_is_refused", "tap(backbone.999.residual): no error"),
+        (Unchecked, "every_observation_needs_its_seed", "an observation without a seed: no error"),
+        (Copying, "an_identity_edit_changes_nothing_and_zeroing_changes_the_output", "change no output"),
+        (Copying, "an_edit_is_what_a_capture_inside_it_reads", "behind an edit to zeros"),
+        (Copying, "what_is_rewritten_in_a_block_is_read_behind_it", "leave layer 1 as it was"),
+        (Drifting, "capturing_changes_no_output_bit_for_bit", "keeps state between calls"),
+        (Drifting, "hooks_are_gone_after_an_exception", "outputs after the exception differ"),
+        (
+            Drawing,
+            "actions_have_the_contracts_shape_and_come_from_the_seed_alone",
+            "actions of the same seeds differ",
+        ),
+        (Doubling, "actions_have_the_contracts_shape_and_come_from_the_seed_alone", "float64"),
+        (Mixing, "a_batch_equals_its_rows_one_by_one", "numbers of row 0 in a batch are off by"),
+        (Boasting, "the_end_of_an_unread_stream_is_a_control", "differ from those without"),
+        (Passive, "the_action_is_made_in_a_stream", "part='action'"),
+        (Otherwise, "inference_without_acting_equals_that_of_acting", "another activation at expert"),
+    ],
+)
+def test_a_policy_that_breaks_a_promise_fails_its_check(
+    broken: type[EncoderPolicy], name: str, said: str, sound: EncoderPolicy, checkpoint: Path, tmp_path: Path
+) -> None:
+    good = PolicySubject(ContractSettings(), Given(sound, checkpoint, tmp_path))
+    CHECKS[name](good)
+    bad = PolicySubject(ContractSettings(), Given(broken(sound.network, sound.card), checkpoint, tmp_path))
+    with pytest.raises((CheckFailedError, probe_kit.ProbeKitError), match=re.escape(said)) as failed:
+        CHECKS[name](bad)
+    assert isinstance(failed.value, probe_kit.ProbeKitError) or "; change: " in str(failed.value)
+
+
+# -- loading ---------------------------------------------------------------------------------------------------
+
+
+def load_sloppily(checkpoint: str, *_: object, **__: object) -> EncoderPolicy:
+    """Knows one untrained network, and hashes no file. `weights_seed` reaches it unread."""
+    network = EncoderVLA()
+    network.load_state_dict(read_weights(Path(checkpoint)).tensors)
+    card = dataclasses.replace(load(checkpoint).card, settings={})
+    return EncoderPolicy(network.eval(), card)
+
+
+def subject_of(loader: str, given: Given, monkeypatch: pytest.MonkeyPatch) -> Subject:
+    family = Family("encoder-vla", "", None, loader, needs_checkpoint=True)
+    entry = SimpleNamespace(name="encoder-vla", load=lambda: family, value="x:y", dist=None)
+    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    settings = ContractSettings()
+    settings.family = "encoder-vla"
+    return PolicySubject(settings, given)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("every_file_that_is_read_reaches_the_card", "the same settings after a change of config.json"),
+        ("random_twins_differ_by_their_seed_and_repeat_by_it", "one untrained network only"),
+    ],
+)
+def test_a_loader_that_breaks_a_promise_fails_its_check(
+    name: str, said: str, sound: EncoderPolicy, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = Given(sound, checkpoint, tmp_path)
+    CHECKS[name](subject_of("tests.support.encoder_vla.policy:load", given, monkeypatch))
+    given.folder = tmp_path / "again"
+    bad = subject_of("tests.hooks.conformance.test_checks:load_sloppily", given, monkeypatch)
+    with pytest.raises((CheckFailedError, UsageError), match=said):
+        CHECKS[name](bad)
+
+
+def test_weights_that_are_nearly_the_networks_are_found(
+    sound: EncoderPolicy, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The loader compares nothing, so that a missing tensor stays as it was drawn."""
+
+    def load_nearly(_: Subject, place: Path) -> EncoderPolicy:
+        network = EncoderVLA()
+        network.load_state_dict(load_file(place / "model.safetensors"), strict=False)
+        return EncoderPolicy(network.eval(), sound.card)
+
+    own = CHECKS["weights_that_are_not_exactly_the_models_are_refused"]
+    given = Given(sound, checkpoint, tmp_path)
+    subject = subject_of("tests.support.encoder_vla.policy:load", given, monkeypatch)
+    own(subject)
+    monkeypatch.setattr(Subject, "load", load_nearly)
+    given.folder = tmp_path / "again"
+    with pytest.raises(CheckFailedError, match="a checkpoint in which a tensor is missing: no error"):
+        own(subject)
+
+
+# -- models that answer ----------------------------------------------------------------------------------------
+
+
+def test_an_answer_model_without_a_picture_in_it_fails_the_checks_of_pictures(tmp_path: Path) -> None:
+    """It never looks, so that its roles promise a picture that is not read."""
+    subject = AnswerSubject(ContractSettings(), Given(PositionModel(likes("A"), always("A")), tmp_path, tmp_path))
+    CHECKS["a_reading_has_a_logit_per_option_and_their_mass_is_a_share"](subject)
+    CHECKS["what_is_spoken_repeats_and_is_as_long_as_asked"](subject)
+    with pytest.raises(CheckFailedError, match=r"positions with the role image; expected: none.*; change: Build"):
+        CHECKS["without_a_picture_nothing_of_it_is_left"](subject)
+    with pytest.raises(CheckFailedError, match="one call with and without a picture: no error"):
+        CHECKS["questions_with_and_without_a_picture_do_not_go_together"](subject)
+    with pytest.raises(CheckFailedError, match=r"the options A and A: no error.*UsageError.*'same token'"):
+        CHECKS["options_that_begin_alike_are_refused"](subject)
+
+
+# -- the mechanism ---------------------------------------------------------------------------------------------
+
+
+def test_the_contract_classes_have_a_test_per_check_and_no_other() -> None:
+    for contract, checks in ((AdapterContract, POLICY_CHECKS), (AnswerModelContract, ANSWER_CHECKS)):
+        tests = {name for name in dir(contract) if name.startswith("test_")}
+        assert tests == {f"test_{own.name}" for own in checks}
+        assert len(checks) == len({own.name for own in checks}) > 25
+
+
+def test_every_check_is_a_sentence_with_an_advice() -> None:
+    for own in CHECKS.values():
+        for text in (own.sentence, own.change):
+            assert text.endswith("."), text
+            assert text[0].isupper(), text
+        assert len(own.sentence.split()) <= 25
+
+
+def test_pytest_is_imported_by_the_contract_classes_alone() -> None:
+    """The command runs where pytest is not installed."""
+    root = Path(probe_kit.__file__).parent
+    importing = [path.relative_to(root).as_posix() for path in root.rglob("*.py") if "pytest" in imported(path)]
+    assert importing == ["hooks/testing.py"]
+
+
+def imported(path: Path) -> set[str]:
+    """Top-level packages that a module imports, wherever the statement stands."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    names = [each.name for node in ast.walk(tree) if isinstance(node, ast.Import) for each in node.names]
+    names += [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    return {name.partition(".")[0] for name in names}
+
+
+def test_a_failure_carries_the_advice_of_its_check_unless_it_has_its_own() -> None:
+    def fails(change: str) -> Callable[[Any], None]:
+        def body(_: Any) -> None:
+            raise CheckFailedError("this", "that", change)
+
+        return body
+
+    with pytest.raises(CheckFailedError, match="seen: this; expected: that; change: Do it"):
+        check("A promise.", "Do it.")(fails(""))(None)
+    with pytest.raises(CheckFailedError, match="change: Do that"):
+        check("A promise.", "Do it.")(fails("Do that."))(None)
+
+
+def test_an_error_of_another_kind_is_not_taken_for_a_refusal() -> None:
+    with pytest.raises(CheckFailedError, match="no error; expected: KeyError"), refused("it", KeyError):
+        pass
+    with pytest.raises(ValueError, match="other"), refused("it", KeyError):
+        raise ValueError("other")
+    unsaid = pytest.raises(CheckFailedError, match="a message about it that says 'name'")
+    with unsaid, refused("it", KeyError, says="name"):
+        raise KeyError("nothing")
+
+
+def test_numbers_are_compared_bit_for_bit_and_with_their_shape() -> None:
+    ones = np.ones(3, np.float32)
+    require_bits(ones, ones.copy(), "one", "the other")
+    require_bits(ones * np.nan, ones * np.nan, "one", "the other")
+    with pytest.raises(CheckFailedError, match=r"one differ from the other by up to 1\.19e-07"):
+        require_bits(np.nextafter(ones, 2), ones, "one", "the other")
+    with pytest.raises(CheckFailedError, match=r"shape \(3,\); expected: \(2,\)"):
+        require_bits(ones, ones[:2], "one", "the other")
+
+
+def test_without_a_family_the_checks_of_loading_are_skipped(sound: EncoderPolicy, tmp_path: Path) -> None:
+    subject = PolicySubject(ContractSettings(), Given(sound, tmp_path, tmp_path))
+    with pytest.raises(SkipTest, match="no family was named"):
+        CHECKS["an_option_that_is_not_declared_is_refused"](subject)
