@@ -16,14 +16,16 @@ from docs_tables import DATA, PAGES, README, ROOT, filled
 from readme_picture import draw_picture
 
 from probe_kit._terminal.console import counter, progress
-from probe_kit.demo.organisms import TRAINED, Finding, NamedProgress
+from probe_kit.demo.organisms import TRAINED, VLM, Finding, NamedProgress
 from probe_kit.demo.pipeline import PERMUTATIONS, compare_organisms, run_demo
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.columns.sentences import verdict
+from probe_kit.retention.report import write_report
 from probe_kit.retention.rows.row import MEAN
 
-SHOWN = {"report.html": "sample-report.html", "episode.gif": "episode.gif"}
-"""What the docs show as the demo made it."""
+SAMPLE = "sample-report.html"
+SAMPLE_PICTURES = 80
+"""Episodes of the sample report that show their frames, so that it has at most 1 MB."""
 
 
 def main() -> None:
@@ -34,14 +36,14 @@ def main() -> None:
     asked = parser.parse_args()
     with progress() as bar:
         measure(asked.folder, asked.trained_only, lambda stage: counter(bar, stage))
+        write_sample(asked.folder, lambda stage: counter(bar, stage))
     for page in (README, *PAGES):
         page.write_text(
             filled(page.read_text(encoding="utf-8"), json.loads(DATA.read_text(encoding="utf-8"))),
             encoding="utf-8",
         )
     draw_picture(asked.folder, json.loads(DATA.read_text(encoding="utf-8"))["probes"])
-    for made, shown in SHOWN.items():
-        shutil.copyfile(asked.folder / made, ROOT / "docs" / shown)
+    shutil.copyfile(asked.folder / "episode.gif", ROOT / "docs" / "episode.gif")
     sheet = [sys.executable, str(ROOT / "benchmarks" / "env.py"), "sheet", str(ROOT / "docs" / "scenes.png")]
     subprocess.run(sheet, check=True)
 
@@ -67,6 +69,18 @@ def measure(folder: Path, trained_only: bool, stage: NamedProgress) -> None:
         "organisms": findings,
     }
     DATA.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def write_sample(folder: Path, stage: NamedProgress) -> None:
+    """Write the report of `probe-kit demo` without `--compare`, whose probes have a control more.
+
+    The episodes and answers are copies of those in `folder`; the probes are fitted again.
+    """
+    alone = folder / "alone"
+    for name in ("suite", VLM.folder, TRAINED.folder):
+        shutil.copytree(folder / name, alone / name, ignore=shutil.ignore_patterns("probes"), dirs_exist_ok=True)
+    made = run_demo(alone, stage)
+    write_report([made.asked, made.run], ROOT / "docs" / SAMPLE, made.table, pictures=SAMPLE_PICTURES)
 
 
 def _of_trained(row: RetentionRow) -> Finding:

@@ -349,15 +349,16 @@ def _check_doubles(runs: Sequence[RunReader]) -> None:
 def _read_probes(
     runs: Sequence[RunReader], keys: Sequence[str | None]
 ) -> tuple[dict[str, ProbeResults], list[str]]:
-    """Probes by run, and a sentence for every run that has none."""
+    """Probes by run, and a sentence for every run without, but for models that were only asked."""
     results: dict[str, ProbeResults] = {}
     missing = []
     for run, key in zip(runs, keys, strict=True):
         try:
             found = load_results(run, key)
         except NoProbesError as error:
-            shares = "Success rates" if ask_of(run) is None else "Answers"
-            missing.append(f"{shares} only: {error}")
+            if run.streams or ask_of(run) is None:
+                shares = "Success rates" if ask_of(run) is None else "Answers"
+                missing.append(f"{shares} only: {error}")
             continue
         results[str(run.location)] = found
         if not is_current(found.settings, run):

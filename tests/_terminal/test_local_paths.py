@@ -52,7 +52,7 @@ def test_no_path_of_this_machine_stands_in_the_report(tmp_path: Path) -> None:
     page = report_html(own, table)
     assert leaks(page, tmp_path) == []
     assert "Success rates only: acted has no activations to probe" in page
-    assert "Answers only: asked has no activations to probe" in page
+    assert "Answers only" not in page, "a model that was only asked lacks nothing"
     assert "my fine-tune" in page  # of a path its last part is kept
     assert "model.safetensors" in page
 

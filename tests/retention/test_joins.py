@@ -45,7 +45,7 @@ def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Pat
     (joined,) = joins_of(runs, table).found  # type: ignore[arg-type]
     assert [one.name for one in collect_figures(runs, table) if one.subject == "join"] == ["known-used-1"]  # type: ignore[arg-type]
     page = report_html(runs, table)  # type: ignore[arg-type]
-    section = page.split('<section id="join">')[1].split("</section>")[0]
+    section = page.split('<details class="part" id="join">')[1].split("</details>")[0]
     for plain in known_used_tables(joined):
         assert plain.title in section
         for cells in plain.cells:
@@ -66,4 +66,4 @@ def test_runs_that_saw_other_frames_are_not_joined_and_the_report_says_so(tmp_pa
 
 def test_acting_runs_alone_have_no_join(tmp_path: Path) -> None:
     _, policy = pair(tmp_path)
-    assert '<section id="join">' not in report_html([policy])
+    assert 'id="join"' not in report_html([policy])

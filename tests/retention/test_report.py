@@ -18,14 +18,17 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
 from probe_kit.retention import RetentionTable, retention_table
-from probe_kit.retention.columns.glossary import glossary
+from probe_kit.retention.columns.columns import all_columns
+from probe_kit.retention.columns.glossary import TERMS
 from probe_kit.retention.columns.modes import Modes
+from probe_kit.retention.columns.sentences import VERDICT_HELP, CategoryVerdict
+from probe_kit.retention.columns.summary import HEADING_HELP
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.formats.html import HtmlTable, html_tables
 from probe_kit.retention.report import report_html, write_report
 from probe_kit.retention.report.episodes import BLOCK, episode_grid
 from probe_kit.retention.report.provenance import citation
-from probe_kit.retention.report.summaries import _clear_words, summarise
+from probe_kit.retention.report.summaries import _clear_words, read_run
 from probe_kit.train import ArrayRun, load_results
 from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.store import save_results
@@ -70,11 +73,11 @@ def test_every_link_of_the_contents_leads_somewhere(probed_run: ProbedRun) -> No
 
 def test_the_page_opens_with_what_is_encoded_and_used_in_plain_words(probed_run: ProbedRun) -> None:
     page = report_html([probed_run({"color": SIGNAL, "shape": NOISE}, "pi0-tiny")])
-    opening = page[page.index('<section id="summary">') : page.index('<div class="headlines">')]
+    opening = page[page.index('<section id="summary"') : page.index('<details class="part"')]
     assert "Summary: pi0-tiny" in opening
-    color, shape = re.findall(r"<li>(.*?)</li>", opening, re.DOTALL)
-    assert "Color (100 items): the backbone holds the answer (90 %, " in color
-    assert "Shape (100 items): the backbone does not hold it (at most " in shape
+    color, shape = re.findall(r"<li>(.*?)</li>", opening.replace("\u00a0", " "), re.DOTALL)
+    assert "<b>Color (100 items)</b>: the backbone holds the answer (90 %, " in color
+    assert "<b>Shape (100 items)</b>: the backbone does not hold it (at most " in shape
 
 
 def test_random_weights_are_marked_in_summary_figures_and_certificate(probed_run: ProbedRun) -> None:
@@ -94,7 +97,7 @@ def test_names_and_instructions_cannot_become_markup(tmp_path: Path, outcome_tab
 def test_a_run_without_probes_has_a_report_of_its_behaviour(tmp_path: Path, outcome_table: Any) -> None:
     page = report_html([plain_run(tmp_path, outcome_table(6, 4, 2))])
     assert 'id="knowledge"' not in page
-    assert "50.0 %" in page
+    assert "the cube ends right in 50\u00a0%" in page
 
 
 def test_a_report_without_runs_is_an_error() -> None:
@@ -168,7 +171,7 @@ def test_a_leak_is_red_and_named_in_the_warnings(probed_run: ProbedRun) -> None:
     made = titled(rows, "Controls")
     assert made is not None
     assert any(cell.alarm and cell.text.startswith("80.0") for cell in made.body[0])
-    assert any("pixels" in warning for warning in summarise(rows).warnings)
+    assert any("pixels" in warning for warning in read_run(rows).warnings)
     assert titled(table.all_rows, "Controls") is None
 
 
@@ -180,17 +183,13 @@ def test_every_heading_says_what_it_means(probed_run: ProbedRun) -> None:
 
 def test_the_summary_says_in_words_what_the_rows_say(probed_run: ProbedRun) -> None:
     table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE, "time": SIGNAL})])
-    summary = summarise(table.all_rows)
-    words = " ".join(summary.sentences)
-    assert "60.0 % of episodes" in words
-    assert "in the backbone in 2 of 3 categories (all but shape)" in words
-    assert "1 left out: backbone absent, at most " in words
+    words = dict(read_run(table.all_rows).by_category)
     score = table.means[0].backbone.score
     assert score is not None
     assert 0.75 < score < 0.775, "two of 90 % and one that guesses, without the luck of its best site"
-    assert [headline.value for headline in summary.headlines[:2]] == ["60.0 %", f"{100 * score:.1f} %"]
-    assert "120 of 200 episodes" in dict(summary.by_category)["color"]
-    assert "not shown to beat chance" in dict(summary.by_category)["shape"]
+    assert "120 of 200 episodes" in words["color"]
+    assert "not shown to beat chance" in words["shape"]
+    assert "Retention n/a (backbone absent, at most " in words["shape"]
 
 
 def test_what_fails_against_chance_and_controls_is_said_in_a_sentence_that_can_be_true() -> None:
@@ -212,12 +211,11 @@ def test_why_there_is_no_retention_is_the_reason_that_there_is(probed_run: Probe
     table = retention_table([run])
     note = {row.category: row.retention.note for row in table.rows}
     assert note["shape"] == f"n/a (probes {some.key} are of color)"
-    assert f"1 left out: probes {some.key} are of color)" in " ".join(summarise(table.all_rows).sentences)
+    assert f"n/a (probes {some.key} are of color)" in dict(read_run(table.all_rows).by_category)["shape"]
     untested = {place: replace(curve, null=curve.null[:, :0]) for place, curve in results.curves.items()}
     save_results(replace(results, settings=replace(results.settings, seed=2), curves=untested), run.path)
-    summary = summarise(retention_table([run]).all_rows)
-    assert "Retention is not defined: no permutations." in summary.sentences
-    assert summary.headlines[-1].gloss == "no permutations"
+    words = dict(read_run(retention_table([run]).all_rows).by_category)
+    assert "Retention n/a (no permutations)." in words["color"]
 
 
 def test_every_mark_of_evidence_is_said_to_need_the_controls_too(probed_run: ProbedRun) -> None:
@@ -228,14 +226,14 @@ def test_every_mark_of_evidence_is_said_to_need_the_controls_too(probed_run: Pro
     marked = [reading for reading in said if "illed marker" in reading or "Dots" in reading]
     assert len(marked) > 4
     assert all("every control" in reading for reading in marked)
-    assert "every control" in glossary("acts")["n/a"]
+    assert "every control" in TERMS["n/a"]
 
 
 def test_a_policy_that_never_grasps_is_not_said_to_fail_at_knowing(tmp_path: Path, outcome_table: Any) -> None:
     table: RetentionTable = retention_table(
         [plain_run(tmp_path, outcome_table(0, 2, 10).assign(never_moved=True))]
     )
-    (warning,) = summarise(table.all_rows).warnings
+    (warning,) = read_run(table.all_rows).warnings
     assert "does not grasp" in warning
 
 
@@ -245,8 +243,15 @@ def test_the_citation_names_weights_and_suite(probed_run: ProbedRun) -> None:
     assert "2606.19297" in bibtex
 
 
-def test_the_glossary_has_a_sentence_for_every_word() -> None:
-    assert all(meaning.endswith(".") for modes in get_args(Modes) for meaning in glossary(modes).values())
+def test_every_word_has_a_sentence() -> None:
+    columns = [column.help for modes in get_args(Modes) for column in all_columns(modes)]
+    words = HEADING_HELP | VERDICT_HELP | TERMS
+    assert all(meaning.endswith(".") for meaning in (*columns, *words.values()))
+
+
+def test_every_verdict_is_explained() -> None:
+    verdicts = [one for kind in get_args(CategoryVerdict) for one in get_args(kind)]
+    assert set(VERDICT_HELP) == set(verdicts)
 
 
 # -- episodes --------------------------------------------------------------------------------------------------

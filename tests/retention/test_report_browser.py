@@ -1,12 +1,10 @@
-"""The report in a real browser, driven through the WebDriver protocol: no error, tables sort, filters filter."""
+"""The report in a real browser: no error, tables sort, filters filter, sections fold, and nothing is cut off."""
 
+import html
 import json
+import re
 import shutil
-import socket
 import subprocess
-import time
-import urllib.request
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,55 +17,51 @@ from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.retention.report import write_report
 from probe_kit.train import ArrayRun
 
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium (Debian: apt install chromium)"),
+]
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--window-size=1400,1000",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--enable-logging=stderr",
+    "--window-size=1500,1000", "--virtual-time-budget=4000",
 )  # fmt: skip
+READER = """<script>
+window.addEventListener("load", async () => {{
+  const read = async () => {{ {script} }};
+  const answer = await read().catch(error => ({{ error: String(error) }}));
+  window.parent.postMessage(JSON.stringify(answer), "*");
+}});
+</script>"""
+FRAME = """<!doctype html><meta charset="utf-8"><pre id="found"></pre>
+<script>
+window.addEventListener("message", event => {{ document.getElementById("found").textContent = event.data; }});
+</script>
+<iframe style="border:0;width:{width}px;height:900px" src="{source}"></iframe>"""
+"""A page in a frame of any width, and a place for what a script in it sends."""
 
 
-class Browser:
-    """A session of a browser that can open a page, run script in it and read its console."""
+def read(page: Path, script: str, width: int = 1400, dark: bool = False) -> Any:
+    """What the script returns in the page, at a width of its own; the console must stay empty.
 
-    def __init__(self, port: int, profile: Path) -> None:
-        self._base = f"http://127.0.0.1:{port}"
-        self._wait_until_ready()
-        options = {"args": [*FLAGS, f"--user-data-dir={profile}"], "binary": shutil.which("chromium")}
-        asked = {"browserName": "chrome", "goog:chromeOptions": options, "goog:loggingPrefs": {"browser": "ALL"}}
-        answer = self._call("POST", "/session", {"capabilities": {"alwaysMatch": asked}})
-        self._session = f"/session/{answer['sessionId']}"
-
-    def open(self, page: Path) -> None:
-        self._call("POST", f"{self._session}/url", {"url": page.as_uri()})
-
-    def run(self, script: str, *arguments: object) -> Any:
-        return self._call("POST", f"{self._session}/execute/sync", {"script": script, "args": arguments})
-
-    def console(self) -> list[Any]:
-        return self._call("POST", f"{self._session}/se/log", {"type": "browser"})  # type: ignore[no-any-return]
-
-    def resize(self, width: int) -> None:
-        self._call("POST", f"{self._session}/window/rect", {"width": width, "height": 900})
-
-    def quit(self) -> None:
-        self._call("DELETE", self._session)
-
-    def _wait_until_ready(self) -> None:
-        for _ in range(300):
-            try:
-                self._call("GET", "/status")
-            except OSError:
-                time.sleep(0.05)
-            else:
-                return
-        raise AssertionError("chromedriver did not answer within 15 s")
-
-    def _call(self, method: str, path: str, content: object = None) -> Any:
-        body = None if content is None else json.dumps(content).encode()
-        request = urllib.request.Request(
-            self._base + path, body, {"Content-Type": "application/json"}, method=method
-        )
-        with urllib.request.urlopen(request, timeout=60) as answer:
-            return json.load(answer)["value"]
+    A browser's own window cannot be narrow.
+    """
+    inner, outer = page.with_suffix(".read.html"), page.with_suffix(".frame.html")
+    text, end, rest = page.read_text(encoding="utf-8").rpartition("</body>")
+    inner.write_text(f"{text}{READER.format(script=script)}{end}{rest}", encoding="utf-8")
+    outer.write_text(FRAME.format(width=width, source=inner.as_uri()), encoding="utf-8")
+    scheme = f"--blink-settings=preferredColorScheme={0 if dark else 1}"
+    profile = f"--user-data-dir={page.parent / 'profile'}"
+    done = subprocess.run(
+        ["chromium", *FLAGS, scheme, profile, "--dump-dom", outer.as_uri()],
+        capture_output=True, encoding="utf-8", timeout=120, check=True,
+    )  # fmt: skip
+    assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []
+    found = re.search(r'<pre id="found">(.+?)</pre>', done.stdout, re.DOTALL)
+    assert found, done.stdout[-500:]
+    answer = json.loads(html.unescape(found[1]))
+    assert not (isinstance(answer, dict) and "error" in answer), answer
+    return answer
 
 
 @pytest.fixture(scope="module")
@@ -98,66 +92,17 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    for program in ("chromium", "chromedriver"):
-        if shutil.which(program) is None:
-            pytest.skip(f"no {program} on this machine (Debian: apt install chromium chromium-driver)")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    driver = subprocess.Popen(["chromedriver", f"--port={port}"], stdout=subprocess.DEVNULL)
-    try:
-        session = Browser(port, tmp_path_factory.mktemp("profile"))
-        yield session
-        session.quit()
-    finally:
-        driver.terminate()
-        driver.wait()
-
-
-@pytest.fixture
-def page(browser: Browser, report: Path) -> Browser:
-    browser.open(report)
-    return browser
-
-
-def test_the_page_opens_without_a_word_on_the_console(page: Browser) -> None:
-    assert page.run("return document.title") == "pi0 · probe_kit report"
-    broken = "return [...document.images].filter(image => image.complete && !image.naturalWidth).length"
-    assert page.run(broken) == 0
-    fetched = "return performance.getEntriesByType('resource').map(entry => entry.name)"
-    assert [name for name in page.run(fetched) if not name.startswith("data:")] == []
-    assert page.console() == []
-
-
-def test_a_click_on_a_heading_sorts_and_a_second_one_turns_it_round(page: Browser) -> None:
-    column = """
-        const table = document.querySelector("#behaviour table.sortable");
-        const heading = [...table.tHead.rows[0].cells].find(cell => cell.textContent.trim() === arguments[0]);
-        for (let click = 0; click < arguments[1]; click++) heading.firstElementChild.click();
-        const read = row => row.cells[heading.cellIndex].dataset.sort;
-        return [heading.getAttribute("aria-sort"), [...table.tBodies[0].rows].map(read), table.tFoot.rows.length];
-    """
-    assert page.run(column, "category", 2) == ["descending", ["living_world", "color"], 1]
-    order, values, _ = page.run(column, "wrong\u00a0%", 1)
-    assert order == "ascending"
-    assert [float(value) for value in values] == sorted(float(value) for value in values)
-    assert page.console() == []
-
-
-@pytest.fixture
-def comparison(browser: Browser, report: Path) -> Iterator[Browser]:
-    """The report of two runs of long names; the window is as wide as before afterwards."""
+def comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of two runs of long names."""
+    folder = tmp_path_factory.mktemp("two")
     table = pd.concat([hits(), hits().assign(category="shape", item_id=lambda t: "s" + t["item_id"])])
     table["group_id"] = table["item_id"]
     table["episode_id"] = table["item_id"] + ":" + table["layout"].str[0]
     runs = []
     for name, outcome in (("a-policy-of-a-long-name", "correct"), ("another-policy-of-a-long-name", "wrong")):
         own = table.assign(outcome=[outcome, "oob", "correct", "wrong"] * (len(table) // 4))
-        runs.append(ArrayRun(report.parent / name, name, "suite@1#0123456789ab", own.reset_index(drop=True), {}))
-    browser.open(write_report(runs, report.parent / "two.html"))
-    yield browser
-    browser.resize(1400)
+        runs.append(ArrayRun(folder / name, name, "suite@1#0123456789ab", own.reset_index(drop=True), {}))
+    return write_report(runs, folder / "two.html")
 
 
 def hits() -> pd.DataFrame:
@@ -174,74 +119,198 @@ def hits() -> pd.DataFrame:
     )
 
 
+def test_the_page_opens_whole_and_fetches_nothing(report: Path) -> None:
+    title, broken, fetched = read(
+        report,
+        """
+        const images = [...document.images];
+        return [document.title, images.filter(image => image.complete && !image.naturalWidth).length,
+                window.performance.getEntriesByType("resource").map(entry => entry.name)];
+        """,
+    )
+    assert title == "pi0 · probe_kit report"
+    assert broken == 0
+    assert [name for name in fetched if not name.startswith("data:")] == []
+
+
+def test_a_click_on_the_arrows_of_a_heading_sorts_and_a_second_one_turns_it_round(report: Path) -> None:
+    (order, categories, means), (upwards, values, _) = read(
+        report,
+        """
+        const table = document.querySelector("#behaviour table.sortable");
+        function sorted(name, clicks) {
+          const heading = [...table.tHead.rows[0].cells].find(cell => cell.textContent.trim() === name);
+          for (let click = 0; click < clicks; click++) heading.querySelector("button").click();
+          const key = row => row.cells[heading.cellIndex].dataset.sort;
+          return [heading.getAttribute("aria-sort"), [...table.tBodies[0].rows].map(key), table.tFoot.rows.length];
+        }
+        return [sorted("category", 2), sorted("wrong\u00a0%", 1)];
+        """,
+    )
+    assert (order, categories, means) == ("descending", ["living_world", "color"], 1)
+    assert upwards == "ascending"
+    assert [float(value) for value in values] == sorted(float(value) for value in values)
+
+
 WIDE = """
-    return [...document.querySelectorAll(".scroll")].filter(one => one.offsetParent).map(one => {
-      const said = getComputedStyle(one.parentElement.querySelector(".cue")).display !== "none";
+    for (const one of document.querySelectorAll("details")) one.open = true;
+    await new Promise(done => setTimeout(done, 200));
+    const boxes = [...document.querySelectorAll(".scroll")].filter(one => one.offsetParent).map(one => {
+      const said = window.getComputedStyle(one.parentElement.querySelector(".cue")).display !== "none";
       const rest = one.scrollWidth - one.clientWidth;
       one.scrollLeft = rest;
-      const last = one.querySelector("thead th:last-child").getBoundingClientRect();
-      const first = one.querySelector("tbody td").getBoundingClientRect();
+      const cells = one.querySelector("tbody");
       const box = one.getBoundingClientRect();
+      const last = (one.querySelector("thead th:last-child") ?? one.lastElementChild).getBoundingClientRect();
+      const first = cells ? cells.querySelector("td").getBoundingClientRect() : box;
       return [rest > 1, said, last.right <= box.right + 1, first.left >= box.left - 1];
     });
+    return [document.documentElement.scrollWidth, window.innerWidth, boxes];
 """
 
 
 @pytest.mark.parametrize("width", [1400, 400])
-def test_a_column_beside_the_page_is_announced_and_can_be_reached(comparison: Browser, width: int) -> None:
-    comparison.resize(width)
-    across = "return [document.documentElement.scrollWidth, window.innerWidth]"
-    page_width, window = comparison.run(across)
-    assert page_width <= window, "the page itself never scrolls sideways"
-    time.sleep(0.1)  # one frame, in which sizes are watched
-    found = comparison.run(WIDE)
-    assert found
-    assert width == 1400 or any(wide for wide, *_ in found)
-    for wide, said, reached, first_stays in found:
+@pytest.mark.parametrize("name", ["report", "comparison"])
+def test_the_page_never_scrolls_sideways_and_what_is_wide_is_announced(
+    request: pytest.FixtureRequest, name: str, width: int
+) -> None:
+    """With every section open; a table's last column can be reached, and its first one stays."""
+    page_width, window, boxes = read(request.getfixturevalue(name), WIDE, width)
+    assert page_width <= window == width
+    assert boxes
+    assert width == 1400 or any(wide for wide, *_ in boxes)
+    for wide, said, reached, first_stays in boxes:
         assert said == wide
         assert reached
         assert first_stays
-    assert comparison.console() == []
 
 
-def test_sorting_keeps_differences_below_runs_and_a_third_click_undoes_it(comparison: Browser) -> None:
-    script = """
+def test_sorting_keeps_differences_below_runs_and_a_third_click_undoes_it(comparison: Path) -> None:
+    before, up, down, again = read(
+        comparison,
+        """
         const table = document.querySelector("#behaviour table.sortable");
         const rows = () => [...table.tBodies[0].rows].map(row => row.className);
         const before = rows();
-        const button = table.tHead.rows[0].cells[1].firstElementChild;
-        const seen = [0, 1, 2].map(() => { button.click(); return rows(); });
-        return [before, ...seen];
-    """
-    before, up, down, again = comparison.run(script)
+        const button = table.tHead.rows[0].cells[1].querySelector("button");
+        return [before, ...[0, 1, 2].map(() => { button.click(); return rows(); })];
+        """,
+    )
     assert before == ["", "", "difference"] * 2
     assert up == down == [""] * 4 + ["difference"] * 2
     assert again == before
 
 
-def test_the_title_names_every_run(comparison: Browser) -> None:
-    title = comparison.run("return document.querySelector('h1').textContent")
+def test_the_title_names_every_run(comparison: Path) -> None:
+    title = read(comparison, "return document.querySelector('h1').textContent")
     assert title == "a-policy-of-a-long-name and another-policy-of-a-long-name"
 
 
-def test_filters_show_exactly_the_episodes_they_name(page: Browser) -> None:
-    choose = """
-        for (const [name, value] of Object.entries(arguments[0]))
-          document.getElementById("filters").elements[name].value = value;
-        document.getElementById("filters").dispatchEvent(new Event("input"));
-        return [...document.querySelectorAll("#grid .card")].map(card => card.dataset.id);
-    """
-    assert len(page.run(choose, {})) == 48, "one page of cards"
-    everything = {"category": "", "outcome": "", "layout": "", "words": ""}
-    wanted = [f"{n // 2}:{'os'[n % 2]}" for n in range(60) if n % 3 == 0 and n % 2 == 1 and n < 40]
-    picked = {"category": "color", "outcome": "correct", "layout": "swapped"}
-    assert page.run(choose, everything | picked) == wanted
-    assert page.run(choose, everything | {"words": "PICTURE 29"}) == ["29:o", "29:s"]
-    assert page.run(choose, everything | {"category": "living_world", "words": "picture 3 "}) == []
-    assert "0 match, 60 in all" in page.run("return document.getElementById('count').textContent")
-    page.run(choose, everything)
-    page.run("document.getElementById('more').click()")
-    assert page.run("return document.querySelectorAll('#grid .card').length") == 60
-    assert page.run("return document.getElementById('more').hidden")
-    assert page.run("return document.querySelectorAll('#grid img').length") == 30
-    assert page.console() == []
+def test_filters_show_exactly_the_episodes_they_name(report: Path) -> None:
+    at_first, picked, words, none, said, *whole = read(
+        report,
+        """
+        const form = document.getElementById("filters");
+        function choose(values) {
+          const all = { category: "", outcome: "", layout: "", words: "" };
+          for (const [name, value] of Object.entries({ ...all, ...values }))
+            form.elements[name].value = value;
+          form.dispatchEvent(new window.Event("input"));
+          return [...document.querySelectorAll("#grid .card")].map(card => card.dataset.id);
+        }
+        const found = [choose({}).length, choose({ category: "color", outcome: "correct", layout: "swapped" }),
+          choose({ words: "PICTURE 29" }), choose({ category: "living_world", words: "picture 3 " }),
+          document.getElementById("count").textContent];
+        choose({});
+        const more = document.getElementById("more");
+        more.click();
+        return [...found, document.querySelectorAll("#grid .card").length, more.hidden,
+          document.querySelectorAll("#grid img").length];
+        """,
+    )
+    assert at_first == 48, "one page of cards"
+    assert picked == [f"{n // 2}:{'os'[n % 2]}" for n in range(60) if n % 3 == 0 and n % 2 == 1 and n < 40]
+    assert words == ["29:o", "29:s"]
+    assert none == []
+    assert "0 match, 60 in all" in said
+    assert whole == [60, True, 30]
+
+
+def test_sections_are_folded_and_open_for_links_for_the_button_and_for_print(report: Path) -> None:
+    folded, linked, printed, afterwards, unfolded = read(
+        report,
+        """
+        const open = () => [...document.querySelectorAll("details")].filter(one => one.open).map(one => one.id);
+        const folded = open();
+        document.querySelector("#summary th a").click();
+        await new Promise(done => setTimeout(done, 200));
+        const linked = open();
+        window.dispatchEvent(new window.Event("beforeprint"));
+        const printed = [...document.querySelectorAll("details")].every(one => one.open);
+        window.dispatchEvent(new window.Event("afterprint"));
+        const afterwards = open();
+        document.getElementById("unfold").click();
+        const unfolded = [...document.querySelectorAll(".part")].every(one => one.open);
+        return [folded, linked, printed, afterwards, unfolded];
+        """,
+    )
+    assert folded == []
+    assert linked == afterwards == ["words"]
+    assert printed
+    assert unfolded
+
+
+def test_what_has_the_focus_shows_it_and_the_first_of_all_skips_the_contents(report: Path) -> None:
+    first, hidden, shown, outlines = read(
+        report,
+        """
+        for (const one of document.querySelectorAll("details")) one.open = true;
+        const reached = "a[href], button, summary, [tabindex='0'], select, input";
+        const reachable = [...document.querySelectorAll(reached)];
+        const skip = reachable[0];
+        const hidden = skip.getBoundingClientRect().bottom;
+        skip.focus({ focusVisible: true });
+        const shown = skip.getBoundingClientRect().top;
+        const outlines = reachable.filter(one => one.offsetParent).map(one => {
+          one.focus({ focusVisible: true });
+          return [one.outerHTML.slice(0, 80), window.getComputedStyle(one).outlineStyle];
+        });
+        return [skip.getAttribute("href"), hidden, shown, outlines];
+        """,
+    )
+    assert first == "#summary"
+    assert hidden < 0 <= shown
+    assert len(outlines) > 10
+    assert [name for name, style in outlines if style == "none"] == []
+
+
+CONTRAST = """
+    for (const one of document.querySelectorAll("details")) one.open = true;
+    const parse = colour => colour.match(/[\\d.]+/g).map(Number);
+    const linear = v => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4;
+    const light = ([r, g, b]) => .2126 * linear(r / 255) + .7152 * linear(g / 255) + .0722 * linear(b / 255);
+    function ground(one) {
+      for (let up = one; up; up = up.parentElement) {
+        const colour = parse(window.getComputedStyle(up).backgroundColor);
+        if (colour.length === 3 || colour[3] === 1) return colour;
+      }
+      return [255, 255, 255];
+    }
+    const low = [];
+    for (const one of document.querySelectorAll("body *")) {
+      const own = [...one.childNodes].some(node => node.nodeType === 3 && node.textContent.trim());
+      if (!own || !one.offsetParent || ["SCRIPT", "OPTION", "SELECT", "INPUT"].includes(one.tagName)) continue;
+      const [a, b] = [light(parse(window.getComputedStyle(one).color)), light(ground(one))];
+      const ratio = (Math.max(a, b) + .05) / (Math.min(a, b) + .05);
+      if (ratio < 4.5) low.push([one.outerHTML.slice(0, 90), ratio]);
+    }
+    return [window.getComputedStyle(document.body).backgroundColor, low];
+"""
+
+
+@pytest.mark.parametrize(("dark", "paper"), [(False, "rgb(255, 255, 255)"), (True, "rgb(20, 23, 26)")])
+def test_every_word_can_be_read_in_both_colour_schemes(comparison: Path, dark: bool, paper: str) -> None:
+    """The contrast that WCAG asks for of text (AA): 4.5."""
+    found, low = read(comparison, CONTRAST, dark=dark)
+    assert found == paper
+    assert low == []

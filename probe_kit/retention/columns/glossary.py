@@ -1,10 +1,4 @@
-"""What every number of the tables means: the help of every column, and further terms."""
-
-from collections.abc import Mapping
-from types import MappingProxyType
-
-from probe_kit.retention.columns.columns import all_columns
-from probe_kit.retention.columns.modes import Modes
+"""Terms of the tables that are no column; the meaning of a column is declared with it."""
 
 TERMS = {
     "call": ("Which inference of an episode was probed, counted from 0: call 0 comes before anything has moved."),
@@ -24,11 +18,7 @@ TERMS = {
         "Difference of two runs on the same questions, which count as pairs, with its 95 % interval. Zero inside "
         "it: they may be equal."
     ),
+    "against": ("Before a verdict: the same, away from the correct picture."),
     "random weights": ("The model is untrained. It shows the numbers of a model that knows nothing."),
 }
 """Terms that are no column."""
-
-
-def glossary(modes: Modes) -> Mapping[str, str]:
-    """Heading or term to meaning, for tables of policies, of models that were asked, or of both."""
-    return MappingProxyType({column.heading: column.help for column in all_columns(modes)} | TERMS)

@@ -32,6 +32,12 @@ _LEGENDS = {
     "retention": "Retention: share of the backbone's signal left in the action",
 }
 """What a column shows."""
+HEADING_HELP = {
+    heading: f"{meaning[:1].upper()}{meaning[1:]}."
+    for heading, legend in _LEGENDS.items()
+    for meaning in [legend.partition(": ")[2]]
+}
+"""The same as entries of the glossary."""
 
 
 @dataclass(frozen=True)

@@ -410,6 +410,6 @@ def _without_signal(rows: Sequence[CategoryCounts]) -> list[str]:
     if not dull:
         return []
     return [
-        f"In {', '.join(dull)} probes beat neither chance nor every control: nothing is encoded there, and counts "
-        "of encoded items are those of a probe that guesses."
+        f"In {', '.join(dull)} probes are not shown to exceed chance and every control: nothing is shown to be "
+        "encoded there, and counts of encoded items can be those of a probe that guesses."
     ]

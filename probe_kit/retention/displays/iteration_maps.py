@@ -209,7 +209,8 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
                     yield ReportFigure(
                         f"{one.stem}-iteration-maps{view_suffix(view, views)}",
                         in_view("Layer × iteration", view, views), "probes",
-                        "The action is made in several iterations (flow-matching steps or action tokens). Dark "
-                        f"cells: the answer can be read at that layer and iteration. {DOTS}.",
+                        "The action is made in several iterations (flow-matching steps or action tokens). The "
+                        "further a cell's colour is from that of chance, the better the answer can be read "
+                        f"there. {DOTS}.",
                         one.position, partial(iteration_maps, one.results, view, stream),
                     )  # fmt: skip

@@ -182,6 +182,6 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
             "knowledge-action", f"Knowledge and {'answers' if answers else 'action'}", "retention",
             "Each point is one category: how well the answer can be read inside the model (across) and how often "
             f"the model {_DOES[modes]} (up). Points far below the line are knowledge that does not reach the "
-            f"{'answer' if answers else 'hand'}.",
+            f"{'answer' if answers else 'action'}.",
             None, lambda: figure_of(KnowledgeActionDisplay.from_table(source.table)),
         )  # fmt: skip

@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 
 _LOOKS: Mapping[str, tuple[str, str]] = {
     "111": (GREEN, ""),
-    "101": ("#7FCEB9", "..."),
+    "101": ("#7FCEB9", "\\\\\\"),
     "011": (SKY, ""),
-    "001": (BLUE, "..."),
+    "001": (BLUE, "\\\\\\"),
     "110": (VERMILION, ""),
     "100": (ORANGE, "///"),
     "010": (PURPLE, "///"),
     "000": ("#D9D9D9", ""),
     "1-1": (GREEN, ""),
-    "0-1": (SKY, "..."),
+    "0-1": (SKY, "\\\\\\"),
     "1-0": (VERMILION, "///"),
     "0-0": ("#D9D9D9", ""),
 }
@@ -127,7 +127,7 @@ def known_used_figures(joins: Sequence[KnownUsedTable]) -> Iterator[ReportFigure
         yield ReportFigure(
             f"known-used-{number}", "Answered, encoded, acted on", "join",
             "Every question once: does the VLM answer right, does a probe read it in the policy, and does "
-            "the action follow, each in both layouts. Red is lost: answered and encoded, not acted on.",
+            "the action follow, each in both layouts. What is answered and encoded, but not acted on, is lost.",
             None, partial(_known_used, joined),
         )  # fmt: skip
 

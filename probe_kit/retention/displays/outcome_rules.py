@@ -118,7 +118,8 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     if runs:
         yield ReportFigure(
             "outcome-rules", "The same episodes by every outcome rule", "behaviour",
-            "What counts as an answer decides the success rate. A black mark is what a policy that does nothing "
-            "would score by that rule: where there is one, the untouched cube already counts as put on a picture.",
+            "What counts as an answer decides the success rate. An upright mark is what a policy that does "
+            "nothing would score by that rule: where there is one, the untouched cube already counts as put on a "
+            "picture.",
             None, lambda: figure_of(OutcomeRulesDisplay.from_runs(runs)),
         )  # fmt: skip

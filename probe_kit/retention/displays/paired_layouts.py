@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 # Name, colour, hatch: distinct without colour too.
 _PARTS = (
     ("right in both layouts", GREEN, ""),
-    ("right in one", SKY, "..."),
+    ("right in one", SKY, "\\\\\\"),
     ("wrong picture in both", VERMILION, "///"),
     ("none right, otherwise", "#D9D9D9", ""),
 )

@@ -1,11 +1,13 @@
 """Tables of the report: cells with what they show, what they sort by, and their heat."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from probe_kit.retention.columns.columns import Column
 from probe_kit.retention.columns.glossary import TERMS
 from probe_kit.retention.columns.lines import TableRow
+from probe_kit.retention.columns.summary import HEADING_HELP
 from probe_kit.retention.columns.tables import Table, cell_text, tables_of
 from probe_kit.retention.columns.text import ABOVE_CHANCE, difference_name, model_name
 from probe_kit.retention.columns.text_table import TextTable
@@ -34,23 +36,25 @@ class HtmlCell:
 
     @property
     def value(self) -> str:
-        """The text without an interval in square brackets at its end."""
-        return self.text.removesuffix(self.limits).rstrip()
+        """The text without an interval in square brackets."""
+        before, _, after = self.text.partition(self.limits) if self.limits else (self.text, "", "")
+        return f"{before.rstrip()}{after}"
 
     @property
     def limits(self) -> str:
         """That interval with its brackets, empty without one: it may go to a line of its own."""
-        start = self.text.find("[")
-        return self.text[start:] if start > 0 and self.text.endswith("]") else ""
+        found = re.search(r"(?<!^)\[[^\]]*\]", self.text)
+        return found[0] if found else ""
 
 
 @dataclass(frozen=True)
 class HtmlColumn:
-    """explanation: shown on pointing at the heading."""
+    """word: in the glossary. explanation: its entry there, shown on pointing at the heading; empty without one."""
 
     name: str
     explanation: str
     numeric: bool
+    word: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,7 +89,10 @@ def plain_tables(tables: Sequence[TextTable]) -> list[HtmlTable]:
     return [
         HtmlTable(
             table.title,
-            tuple(HtmlColumn(_unbroken(name), "", name not in _WORDS) for name in table.columns),
+            tuple(
+                HtmlColumn(_unbroken(name), HEADING_HELP.get(name, ""), name not in _WORDS, name)
+                for name in table.columns
+            ),
             tuple(tuple(HtmlCell(cell, cell) for cell in cells) for cells in table.cells if MEAN not in cells[:2]),
             tuple(tuple(HtmlCell(cell, cell) for cell in cells) for cells in table.cells if MEAN in cells[:2]),
             (f"{table.note[:1].upper()}{table.note[1:]}.",) if table.note else (),
@@ -94,7 +101,7 @@ def plain_tables(tables: Sequence[TextTable]) -> list[HtmlTable]:
     ]
 
 
-_WORDS = ("model", "category", "prompt")
+_WORDS = ("model", "run", "category", "prompt", "verdict")
 """Columns of plain tables that hold no numbers."""
 
 
@@ -113,10 +120,10 @@ def _table(table: Table) -> HtmlTable:
 
 
 def _name_headings(table: Table) -> list[HtmlColumn]:
-    named = [HtmlColumn("category", "Kind of question, and of several runs which one.", False)]
+    named = [HtmlColumn("category", "Kind of question, and of several runs which one.", False, "category")]
     if table.by_view:
-        named.append(HtmlColumn("view", "How the tokens of an episode became one vector.", False))
-        named.append(HtmlColumn("call", TERMS["call"], True))
+        named.append(HtmlColumn("view", "How the tokens of an episode became one vector.", False, "view"))
+        named.append(HtmlColumn("call", TERMS["call"], True, "call"))
     return named
 
 
@@ -135,7 +142,7 @@ def _names(table: Table, row: TableRow, several: bool) -> list[HtmlCell]:
 
 def _heading(column: Column, rows: Sequence[RetentionRow]) -> HtmlColumn:
     numeric = column.difference is not None or any(column.text(row)[:1].isdigit() for row in rows)
-    return HtmlColumn(_unbroken(column.heading), column.help, numeric)
+    return HtmlColumn(_unbroken(column.heading), column.help, numeric, column.heading)
 
 
 def _unbroken(name: str) -> str:

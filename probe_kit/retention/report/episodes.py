@@ -1,10 +1,11 @@
 """Episodes as the report's grid needs them: what was asked, how it ended, first and last frame."""
 
 from base64 import b64encode
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from probe_kit.extract.run_layout import CAPTURE_ONLY
 from probe_kit.extract.store.thumbnails import read_thumbnail
 from probe_kit.train.data.run_reader import RunReader
 
@@ -18,9 +19,10 @@ BLOCK = 48
 
 @dataclass(frozen=True)
 class EpisodeGrid:
-    """cards: one per episode; `picture` is its place among the pictures, None if it has none.
+    """cards: one per episode, with how many `frames` it shows and the place of its `picture`, None without one.
 
-    pictures: base64 of the WebPs, in blocks of `BLOCK`. note: what was left out and why, empty if nothing.
+    Where only the first frame is shown, it may be the left `half` of that picture.
+    pictures: base64 of the WebPs, each once, in blocks of `BLOCK`. note: what was left out and why, or empty.
     """
 
     cards: tuple[dict[str, Any], ...]
@@ -28,14 +30,20 @@ class EpisodeGrid:
     note: str
     block: int = BLOCK
 
+    def picture(self, card: Mapping[str, Any]) -> str:
+        """The base64 of a card's WebP."""
+        block, place = divmod(int(card["picture"]), self.block)
+        return self.pictures[block][place]
+
 
 @dataclass(frozen=True)
 class _Listed:
-    """An episode, its item's place among the items of its run, and its picture."""
+    """An episode, its item's place among the items of its run, its picture, and the hash of its first frame."""
 
     card: dict[str, Any]
     rank: int
     picture: bytes | None
+    first_frame: str
 
     @property
     def key(self) -> tuple[str, str]:
@@ -58,11 +66,31 @@ def episode_grid(
     listed = [one for name, run in zip(names, runs, strict=True) for one in _listed(name, run, stride)]
     stride = _fitting(listed, stride, picture_bytes)
     kept = _with_pictures(listed, stride)
-    places = {one.key: place for place, one in enumerate(kept)}
-    cards = tuple({**one.card, "picture": places.get(one.key)} for one in listed)
-    encoded = [b64encode(one.picture).decode() for one in kept if one.picture is not None]
+    shown = _without_repeats(kept)
+    distinct = list(dict.fromkeys(picture for picture, _ in shown.values()))
+    places = {picture: place for place, picture in enumerate(distinct)}
+    cards = tuple(
+        {**one.card, "picture": places[shown[one.key][0]], "half": shown[one.key][1]}
+        if one.key in shown
+        else {**one.card, "picture": None}
+        for one in listed
+    )
+    encoded = [b64encode(picture).decode() for picture in distinct]
     blocks = tuple(tuple(encoded[start : start + BLOCK]) for start in range(0, len(encoded), BLOCK))
     return EpisodeGrid(cards, blocks, _note(len(kept), total, stride, pictures, picture_bytes))
+
+
+def _without_repeats(kept: Sequence[_Listed]) -> dict[tuple[str, str], tuple[bytes, bool]]:
+    """By episode its picture, and whether it shows the left half of one.
+
+    A model that did not act has the first frame alone: another episode's picture holds the same one on the left.
+    """
+    pairs = {one.first_frame: one.picture for one in reversed(kept) if one.card["frames"] == 2 and one.first_frame}
+    found = {}
+    for one in kept:
+        pair = pairs.get(one.first_frame) if one.card["frames"] == 1 else None
+        found[one.key] = (pair or one.picture or b"", pair is not None)
+    return found
 
 
 def _listed(name: str, run: RunReader, stride: int) -> Iterator[_Listed]:
@@ -81,11 +109,11 @@ def _listed(name: str, run: RunReader, stride: int) -> Iterator[_Listed]:
             "instruction": row.get("instruction") or "",
             "side": row["side_correct"],
             "answer": row.get("target_concept") or "",
-            "other": row.get("distractor_concept") or "",
             "unmoved": bool(row.get("never_moved", False)),
             "asked": "parse" in row,
+            "frames": 1 if "parse" in row or row["outcome"] == CAPTURE_ONLY else 2,
         }
-        yield _Listed(card, rank, picture)
+        yield _Listed(card, rank, picture, str(row.get("first_frame_sha256") or ""))
 
 
 def _with_pictures(listed: Sequence[_Listed], stride: int) -> list[_Listed]:
@@ -96,7 +124,7 @@ def _fitting(listed: Sequence[_Listed], step: int, most: int) -> int:
     """The smallest multiple of `step` that keeps at most so many bytes of pictures, or no more than one item's."""
     last = max((one.rank for one in listed), default=0) + step
     for stride in range(step, last, step):
-        if sum(len(one.picture or b"") for one in _with_pictures(listed, stride)) <= most:
+        if sum(map(len, {one for one, _ in _without_repeats(_with_pictures(listed, stride)).values()})) <= most:
             return stride
     return last
 

@@ -30,7 +30,7 @@
 
   for (const table of document.querySelectorAll("table.sortable")) {
     [...table.tHead.rows[0].cells].forEach((cell, column) =>
-      cell.firstElementChild.addEventListener("click", () => sort(table, column)));
+      cell.querySelector("button")?.addEventListener("click", () => sort(table, column)));
   }
 
   // -- wide tables say that there is more to the side --------------------------------------------------------------
@@ -48,13 +48,47 @@
     cue(scroll);
   }
 
+  // -- folded sections open for links that lead into them, for the button and for print; afterwards they are as before
+  function reveal() {
+    const target = location.hash && document.getElementById(decodeURIComponent(location.hash.slice(1)));
+    if (!target) return;
+    for (let one = target; one; one = one.parentElement) if (one.tagName === "DETAILS") one.open = true;
+    target.scrollIntoView();
+  }
+
+  window.addEventListener("hashchange", reveal);
+  document.addEventListener("click", (event) => {
+    const link = event.target.closest?.('a[href^="#"]');
+    if (link && link.hash === location.hash) reveal();
+  });
+
+  const folded = document.querySelectorAll("details");
+  const parts = [...document.querySelectorAll("details.part")];
+  const unfold = document.getElementById("unfold");
+  unfold.hidden = false;
+  unfold.addEventListener("click", () => {
+    const open = parts.some((part) => !part.open);
+    for (const part of parts) part.open = open;
+    unfold.textContent = open ? "Fold all sections" : "Open all sections";
+  });
+
+  let closed = [];
+  window.addEventListener("beforeprint", () => {
+    closed = [...folded].filter((one) => !one.open);
+    for (const one of closed) one.open = true;
+  });
+  window.addEventListener("afterprint", () => {
+    for (const one of closed) one.open = false;
+  });
+
   // -- episodes: a page of cards at a time, made when they are wanted --------------------------------------------
   const PAGE = 48;
-  const OUTCOMES = { correct: "✓ correct", wrong: "✗ wrong picture", oob: "○ on neither" };
+  const OUTCOMES = { correct: "✓ correct", wrong: "✗ wrong picture", oob: "○ on neither", capture_only: "captured only" };
   const ANSWERS = { correct: "✓ right answer", wrong: "✗ wrong answer", oob: "○ no answer read" };
-  const EITHER = { correct: "✓ correct", wrong: "✗ wrong", oob: "○ neither" };
+  const EITHER = { correct: "✓ correct", wrong: "✗ wrong", oob: "○ neither", capture_only: "captured only" };
   const source = document.getElementById("cards");
-  const cards = JSON.parse(source.textContent);
+  const every = JSON.parse(source.textContent);
+  const cards = [...every.filter((card) => card.picture !== null), ...every.filter((card) => card.picture === null)];
   const outcomes = cards.every((card) => card.asked) ? ANSWERS : cards.some((card) => card.asked) ? EITHER : OUTCOMES;
   const block = Number(source.dataset.block);
   const blocks = document.querySelectorAll("script.pictures");
@@ -77,13 +111,14 @@
   }
 
   function draw(card) {
-    const frames = element("div", { className: "frames" });
     const shown = card.picture !== null;
+    const still = card.frames === 1;
+    const frames = element("div", { className: ["frames", still ? "one" : "", card.half ? "half" : ""].join(" ").trim() });
     if (shown) {
-      const alt = `first and last frame: ${card.instruction}`;
+      const alt = `${still ? "first frame" : "first and last frame"}: ${card.instruction}`;
       frames.append(
         element("img", { alt, src: `data:image/webp;base64,${picture(card.picture)}`, loading: "lazy", decoding: "async" }),
-        element("i", { textContent: "first" }), element("i", { textContent: "last" }));
+        ...(still ? [] : [element("i", { textContent: "first" }), element("i", { textContent: "last" })]));
     }
     const outcome = (card.asked ? ANSWERS : OUTCOMES)[card.outcome] + (card.unmoved ? ", cube never moved" : "");
     const answer = card.answer ? `answer: ${card.answer}, ${card.side}` : `answer: ${card.side}`;
@@ -93,7 +128,7 @@
       element("span", { className: "outcome", textContent: outcome }),
       element("br", {}),
       element("small", { textContent: `${answer} · ${where}`, title: `${card.run} ${card.id}` }));
-    const made = element("article", { className: `card ${card.outcome}` }, ...(shown ? [frames] : []), text);
+    const made = element("article", { className: `card ${card.outcome}${shown && still ? " still" : ""}` }, ...(shown ? [frames] : []), text);
     made.dataset.id = card.id;
     return made;
   }
@@ -126,4 +161,5 @@
   form.addEventListener("submit", (event) => event.preventDefault());
   more.addEventListener("click", showMore);
   filter();
+  reveal();
 })();

@@ -9,7 +9,6 @@ from probe_kit._system.drafts import write_whole
 from probe_kit._terminal.local_paths import without_places
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.conditions import wording_tables
-from probe_kit.retention.columns.glossary import glossary
 from probe_kit.retention.columns.known_used_table import known_used_tables
 from probe_kit.retention.columns.modes import Modes, modes_of
 from probe_kit.retention.columns.summary import summary_table
@@ -19,10 +18,12 @@ from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.formats.heat import heat_key
 from probe_kit.retention.formats.html import HtmlTable, html_tables, plain_tables
 from probe_kit.retention.joins import joins_of
-from probe_kit.retention.report.episodes import PICTURES, episode_grid
+from probe_kit.retention.report.episodes import PICTURES, EpisodeGrid, episode_grid
+from probe_kit.retention.report.opening import Question, opening_curve, opening_question, opening_row
 from probe_kit.retention.report.pictures import data_uri
 from probe_kit.retention.report.provenance import citation, provenance
-from probe_kit.retention.report.summaries import Summary, summarise
+from probe_kit.retention.report.summaries import RunInWords, read_run
+from probe_kit.retention.report.words import words_of
 from probe_kit.retention.rows.outcome_rules import under_rule
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable, retention_table
@@ -78,34 +79,44 @@ def report_html(
     rows = table.all_rows
     modes = modes_of(rows)
     places = tuple(place for run in runs for place in (run.location.address, str(run.location)))
+    tables = {subject: _tables(rows, table, subject) for subject in ("behaviour", "retention", "controls")}
+    summary = plain_tables([summary_table(table.summary, table.differences)])
+    shown_names = [without_places(name, places) for name in names]
+    grid = episode_grid(as_judged, shown_names, pictures)
+    in_words = _in_words(table)
+    question, curve = _opening(table, runs, shown_names, grid, places)
     return _render(
         places,
         modes=modes,
         answered=_ANSWERED[modes],
+        did="What it answers" if modes == "answers" else "What it does",
+        reached="What reaches the answer" if modes == "answers" else "What reaches the action",
         title=listed(names),
         suites=list(dict.fromkeys(run.suite for run in runs)),
         version=__version__,
-        random_weights=any(run.random_weights for run in runs),
         finding=table.summary,
-        summary=plain_tables([summary_table(table.summary, table.differences)]),
-        summaries=_summaries(table),
+        summary=summary,
+        question=question,
+        curve=curve,
+        in_words=in_words,
+        warnings=[(views[0].name, warning) for views in in_words for warning in views[0].warnings],
         notes=table.notes,
-        tables={subject: _tables(rows, table, subject) for subject in ("behaviour", "retention", "controls")},
+        tables=tables,
         wordings=plain_tables(wording_tables(table.wordings)),
         further=plain_tables(table.further_tables),
         joined=plain_tables([one for joined in joins.found for one in known_used_tables(joined)]),
         join_notes=[*joins.refused, *dict.fromkeys(note for joined in joins.found for note in joined.notes)],
         pictures={
-            subject: _pictures(exhibits, subject, names)
-            for subject in ("behaviour", "probes", "retention", "join")
+            subject: _pictures(exhibits, subject, names, places)
+            for subject in ("behaviour", "probes", "retention", "interventions", "join")
         },
-        grid=episode_grid(as_judged, [without_places(name, places) for name in names], pictures),
+        grid=grid,
         several=len(runs) > 1,
         provenance=[
             provenance(name, run, table.results.get(str(run.location)))
             for name, run in zip(names, runs, strict=True)
         ],
-        glossary=glossary(modes),
+        words=words_of([*summary, *(one for own in tables.values() for one in own)]),
         heat=heat_key(),
         sentence=sentence,
         bibtex=bibtex,
@@ -141,16 +152,34 @@ def _tables(rows: Sequence[RetentionRow], table: RetentionTable, subject: str) -
     return [one for one in html_tables(rows, table.differences, table.unpaired) if one.subject == subject]
 
 
-def _summaries(table: RetentionTable) -> list[list[Summary]]:
-    """Per run, one summary per view."""
-    found: dict[tuple[str | None, str], list[Summary]] = {}
+def _opening(
+    table: RetentionTable,
+    runs: Sequence[RunReader],
+    names: Sequence[str],
+    grid: EpisodeGrid,
+    places: tuple[str, ...],
+) -> tuple[Question | None, Picture | None]:
+    """The question and the curve that stand beside the summary."""
+    row = opening_row(table)
+    if row is None:
+        return None, None
+    position = [str(run.location) for run in runs].index(str(row.run.location))
+    question, curve = opening_question(row, names[position], grid), opening_curve(row, table, position)
+    if curve is None:
+        return question, None
+    return question, Picture(curve.title, names[position], curve.reading, *data_uri(curve, places), False)
+
+
+def _in_words(table: RetentionTable) -> list[list[RunInWords]]:
+    """Per run, its sentences per view."""
+    found: dict[tuple[str | None, str], list[RunInWords]] = {}
     for mean in table.means:
         own = [
             r
             for r in table.rows
             if (r.group, r.run.location, r.view) == (mean.group, mean.run.location, mean.view)
         ]
-        found.setdefault((mean.group, mean.run.location), []).append(summarise([*own, mean]))
+        found.setdefault((mean.group, mean.run.location), []).append(read_run([*own, mean]))
     return list(found.values())
 
 
@@ -160,7 +189,9 @@ def listed(names: Sequence[str]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def _pictures(exhibits: Sequence[ReportFigure], subject: str, names: Sequence[str]) -> list[list[Picture]]:
+def _pictures(
+    exhibits: Sequence[ReportFigure], subject: str, names: Sequence[str], places: tuple[str, ...]
+) -> list[list[Picture]]:
     """Figures of one subject by kind: those of several runs side by side.
 
     All but the first of a kind and run are extra, to be unfolded, and so are those of single runs that another
@@ -176,7 +207,7 @@ def _pictures(exhibits: Sequence[ReportFigure], subject: str, names: Sequence[st
         extra = any(other.run == run and other.title.partition(",")[0] == kind for other in before)
         extra |= exhibit.run is not None and f"{kind} side by side" in together
         found.setdefault(exhibit.title, []).append(
-            Picture(exhibit.title, run, exhibit.reading, *data_uri(exhibit), extra)
+            Picture(exhibit.title, run, exhibit.reading, *data_uri(exhibit, places), extra)
         )
     return list(found.values())
 

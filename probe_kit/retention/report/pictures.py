@@ -1,31 +1,79 @@
 """Figures as data that lies in the page itself."""
 
+import re
 from base64 import b64encode
 from io import BytesIO
+from urllib.parse import quote
+from xml.etree import ElementTree
 
+from probe_kit._terminal.local_paths import without_places
 from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.report_figures import caption_of
 
-SVG_LIMIT = 600_000
+SVG_LIMIT = 150_000
 """Bytes; a figure of more is kept as pixels."""
+PIXELS_PER_INCH = 200
+_SVG, _XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
+_ROUNDED = ("d", "x", "y")
+"""Attributes in points, of which a hundredth cannot be seen."""
+_FONTS = re.compile(r"'[^;]*sans-serif")
+"""The fonts of a text, the first of them matplotlib's; a page has those of the machine that shows it."""
+_IN_URI = " !$'()*+,-./:;=?@[]_`{|}~"
+"""What a URI in double quotes may hold as it is."""
 
 
-def data_uri(exhibit: ReportFigure) -> tuple[str, str]:
-    """The drawn figure as SVG, or PNG if that would be large, with its caption. A figure gives the same bytes."""
+def data_uri(exhibit: ReportFigure, places: tuple[str, ...] = ()) -> tuple[str, str]:
+    """The drawn figure as SVG, or WebP if that would be large, with its caption. A figure gives the same bytes.
+
+    Its ground is transparent, so that the page's colour is behind it. Of `places` and other absolute paths in
+    its words the last part is left.
+    """
     import matplotlib as mpl
+    from matplotlib.text import Text
 
-    from probe_kit.retention.displays.base.shown_figure import PRINT_DPI
-
-    with exhibit.drawn() as figure, mpl.rc_context({"svg.hashsalt": "probe_kit", "svg.fonttype": "path"}):
-        svg = BytesIO()
-        figure.savefig(svg, format="svg", metadata={"Date": None})
-        if svg.tell() <= SVG_LIMIT:
-            return encode("image/svg+xml", svg.getvalue()), caption_of(figure)
-        png = BytesIO()
-        figure.savefig(png, format="png", dpi=PRINT_DPI, metadata={"Software": None})
-        return encode("image/png", png.getvalue()), caption_of(figure)
+    with (
+        exhibit.drawn() as figure,
+        mpl.rc_context({"svg.hashsalt": "probe_kit", "svg.fonttype": "none", "savefig.transparent": True}),
+    ):
+        for words in figure.findobj(Text):
+            words.set_text(without_places(words.get_text(), places))
+        file = BytesIO()
+        figure.savefig(file, format="svg", metadata={"Date": None})
+        svg = compact_svg(file.getvalue())
+        if len(svg) <= SVG_LIMIT:
+            return f"data:image/svg+xml,{quote(svg, safe=_IN_URI)}", caption_of(figure)
+        file = BytesIO()
+        pixels = {"lossless": True, "method": 6}
+        figure.savefig(file, format="webp", dpi=PIXELS_PER_INCH, pil_kwargs=pixels)
+        return encode("image/webp", file.getvalue()), caption_of(figure)
 
 
 def encode(kind: str, content: bytes) -> str:
     """A data URI of bytes of some media type."""
     return f"data:{kind};base64,{b64encode(content).decode()}"
+
+
+def compact_svg(svg: bytes) -> bytes:
+    """The same drawing without metadata, comments, line breaks, names that nothing uses, and fine decimals."""
+    ElementTree.register_namespace("", _SVG)
+    ElementTree.register_namespace("xlink", _XLINK)
+    root = ElementTree.fromstring(svg)
+    for metadata in root.findall(f"{{{_SVG}}}metadata"):
+        root.remove(metadata)
+    used = set(re.findall(r"#([\w-]+)", svg.decode()))
+    for element in root.iter():
+        element.text, element.tail = ((text or "").strip() or None for text in (element.text, element.tail))
+        if element.get("id") not in used:
+            element.attrib.pop("id", None)
+        for name in _ROUNDED:
+            if name in element.attrib:
+                element.set(name, _rounded(element.attrib[name]))
+        if "style" in element.attrib:
+            element.set("style", _FONTS.sub("sans-serif", element.attrib["style"]))
+    return ElementTree.tostring(root)
+
+
+def _rounded(numbers: str) -> str:
+    """Numbers and letters of a path, of two decimals each and without needless spaces."""
+    short = re.sub(r"-?\d+\.\d+(?!e)", lambda found: f"{float(found[0]):.2f}".rstrip("0").rstrip("."), numbers)
+    return re.sub(r"\s*([A-Za-z])\s*", r"\1", re.sub(r"\s+", " ", short)).strip()

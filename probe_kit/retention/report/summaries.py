@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.modes import RATE, modes_of
-from probe_kit.retention.columns.text import NOT_ACTED, is_vlm, model_name, percent
+from probe_kit.retention.columns.text import is_vlm, model_name, percent
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -15,62 +14,27 @@ _MOSTLY = 0.5  # share of episodes above which something is said first
 
 
 @dataclass(frozen=True)
-class Headline:
-    """One number of a run's summary, and what it is."""
-
-    value: str
-    name: str
-    gloss: str
-
-
-@dataclass(frozen=True)
-class Summary:
-    """A run and view in a few numbers and sentences. warnings: what would be misread without them."""
+class RunInWords:
+    """A run and view in sentences, beside the summary. warnings: what would be misread without them."""
 
     name: str
     view: str | None
     random_weights: bool
-    headlines: tuple[Headline, ...]
-    sentences: tuple[str, ...]
     warnings: tuple[str, ...]
     by_category: tuple[tuple[str, str], ...]
 
 
-def summarise(rows: Sequence[RetentionRow]) -> Summary:
-    """The summary of one run and view. rows: its categories, and their mean."""
+def read_run(rows: Sequence[RetentionRow]) -> RunInWords:
+    """One run and view in sentences. rows: its categories, and their mean."""
     mean = next(row for row in rows if row.category == MEAN)
     single = [row for row in rows if row.category != MEAN]
-    return Summary(
+    return RunInWords(
         name=model_name(mean).replace(" (random weights)", ""),
         view=mean.view,
         random_weights=mean.run.random_weights,
-        headlines=tuple(_headlines(mean, single)),
-        sentences=tuple(_sentences(mean, single)),
         warnings=tuple(_warnings(mean, single)),
         by_category=tuple((spell(row.category), " ".join(read_row(row))) for row in single),
     )
-
-
-def _headlines(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[Headline]:
-    rate = Headline(f"{percent(mean.success.sr)} %", RATE[modes_of([mean])].lower(), "guessing: 50 %")
-    found = [
-        Headline(NOT_ACTED, "success rate", "it captured activations only and did not act")
-        if mean.run.capture_only
-        else rate
-    ]
-    if mean.backbone.score is not None:
-        found.append(Headline(f"{percent(mean.backbone.score)} %", "backbone", "mean of categories"))
-    if mean.action.score is not None:
-        found.append(Headline(f"{percent(mean.action.score)} %", mean.run.action_name, "mean of categories"))
-    if mean.backbone.score is not None and mean.action.score is not None:
-        found.append(_retention_headline(mean, rows))
-    return found
-
-
-def _retention_headline(mean: RetentionRow, rows: Sequence[RetentionRow]) -> Headline:
-    if not mean.retention.defined or mean.retention.value is None:
-        return Headline("n/a", "retention", _why_not(rows))
-    return Headline(f"{mean.retention.value:.2f}", "retention", _interval_words(mean))
 
 
 def _interval_words(row: RetentionRow) -> str:
@@ -78,73 +42,6 @@ def _interval_words(row: RetentionRow) -> str:
         return "no interval"
     low, high = row.retention.ci
     return "no limits" if low is None or high is None else f"95 % interval {low:.2f} to {high:.2f}"
-
-
-def _sentences(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
-    found = [_behaviour(mean, rows)]
-    if any(row.backbone.score is not None for row in rows):
-        found.append(_knowledge(rows))
-    if any(row.retention.published is not None for row in rows):
-        found.append(_retention(mean, rows))
-    if mean.controls.probe_minus_sr is not None and any(row.backbone.has_signal for row in rows):
-        found.append(
-            f"On average the backbone's best probe is right {abs(100 * mean.controls.probe_minus_sr):.0f} points "
-            f"{'more' if mean.controls.probe_minus_sr >= 0 else 'less'} often than {_what_is_judged(mean)}."
-        )
-    return found
-
-
-def _behaviour(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
-    if mean.run.capture_only:
-        return "The model was captured at the first picture of every episode and did not act: no success rate."
-    knows = [row for row in rows if row.success.regime == Regime.KNOWLEDGE]
-    fails = [row for row in rows if row.success.regime == Regime.FAILURE]
-    right = "It answers right in" if is_vlm(mean) else "The cube ended on the correct picture in"
-    text = f"{right} {percent(mean.success.sr)} % of episodes, averaged over categories. "
-    text += f"In {_of(knows, rows)} that is more than guessing explains"
-    return text + (f"; in {_of(fails, rows)} it is less." if fails else ".")
-
-
-def _what_is_judged(mean: RetentionRow) -> str:
-    return "its answers" if is_vlm(mean) else "the policy"
-
-
-def _knowledge(rows: Sequence[RetentionRow]) -> str:
-    backbone = [row for row in rows if row.backbone.has_signal]
-    expert = [row for row in rows if row.action.has_signal]
-    text = f"A linear probe reads the answer above {_judge(rows)} in the backbone in {_of(backbone, rows)}"
-    if any(row.action.score is not None for row in rows):
-        text += f", and in the {rows[0].run.action_name} in {_of(expert, rows)}"
-    return f"{text}."
-
-
-def _judge(rows: Sequence[RetentionRow]) -> str:
-    """What had to be beaten."""
-    names = [
-        name
-        for name in ("random-features", "untrained")
-        if any(row.backbone.exceeds.get(name) is not None for row in rows)
-    ]
-    *first, last = ["chance", *names]
-    return f"{', '.join(first)} and {last}" if names else "chance (no control was run)"
-
-
-def _retention(mean: RetentionRow, rows: Sequence[RetentionRow]) -> str:
-    counted = [row for row in rows if row.retention.defined]
-    if not counted or mean.retention.value is None:
-        return f"Retention is not defined: {_why_not(rows)}."
-    left = f" ({len(mean.left_out)} left out: {_why_not(rows)})" if mean.left_out else ""
-    return (
-        f"Of what can be read in the backbone above chance, a share of {mean.retention.value:.2f} can still be "
-        f"read in the {mean.run.action_name} ({_interval_words(mean)}), "
-        f"over {_of(counted, rows, names=False)}{left}."
-    )
-
-
-def _why_not(rows: Sequence[RetentionRow]) -> str:
-    """What keeps categories from having a retention, each reason once."""
-    notes = [row.retention.note for row in rows if not row.retention.defined]
-    return "; ".join(dict.fromkeys(note.removeprefix("n/a (").removesuffix(")") for note in notes))
 
 
 def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
@@ -224,6 +121,8 @@ def read_row(row: RetentionRow) -> list[str]:
         )
     if row.retention.defined and row.retention.value is not None:
         found.append(f"Retention {row.retention.value:.2f} ({_interval_words(row)}).")
+    elif row.retention.note:
+        found.append(f"Retention {row.retention.note}.")
     return found
 
 
@@ -253,10 +152,10 @@ def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
     return prefix + ", ".join(spell(row.category) for row in shown)
 
 
-def _of(part: Sequence[RetentionRow], rows: Sequence[RetentionRow], names: bool = True) -> str:
+def _of(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
     """How many of the categories, and which if not all."""
     noun = "category" if len(rows) == 1 else "categories"
     if len(part) == len(rows):
         return f"all {len(rows)} {noun}" if len(rows) > 1 else "the only category"
-    named = f" ({_names(part, rows)})" if part and names else ""
+    named = f" ({_names(part, rows)})" if part else ""
     return f"{len(part) or 'none'} of {len(rows)} {noun}{named}"

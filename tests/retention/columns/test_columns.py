@@ -11,8 +11,8 @@ from rich.console import Console
 
 from probe_kit.retention import Difference, RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, all_columns, averaged_fields, share
-from probe_kit.retention.columns.glossary import glossary
 from probe_kit.retention.formats.html import html_tables
+from probe_kit.retention.report.words import words_of
 from probe_kit.train import ArrayRun
 
 ProbedRun = Callable[..., ArrayRun]
@@ -55,7 +55,7 @@ def test_a_new_column_is_one_declaration_and_stands_in_every_format(
 ) -> None:
     """The worked example of CONTRIBUTING: the field is in `SuccessRate`, the column is declared."""
     new = share("success.layout_mean", "layout mean %", "Mean of the success rates of both layouts.")
-    for text in (*every_form(table).values(), *glossary("both")):
+    for text in every_form(table).values():
         assert "layout mean" not in text
     first, *others = TABLES["Success rate"]
     group = ColumnGroup(first.title, (*first.columns, new))
@@ -64,7 +64,8 @@ def test_a_new_column_is_one_declaration_and_stands_in_every_format(
     for form, text in every_form(again).items():
         assert "layout mean" in text, form
     assert again.means[0].success.layout_mean == again.rows[0].success.layout_mean == 0.6, "means average it too"
-    assert glossary("both")["layout mean %"] == new.help
+    words = words_of(html_tables(again.all_rows)).entries["Success rate"]
+    assert [word.meaning for word in words if word.name == "layout mean %"] == [new.help]
     assert json.loads(again.to_json())[0]["success"]["layout_mean"] == 0.6
     assert again.to_frame()["success.layout_mean"].tolist() == [0.6, 0.6]
     assert again.success["layout_mean"].tolist() == [0.6, 0.6]

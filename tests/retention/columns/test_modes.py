@@ -85,16 +85,24 @@ def test_a_run_of_answers_is_described_as_answering(shown: Mapping[str, str], na
 
 def test_the_summary_says_how_many_answers_are_right(shown: Mapping[str, str]) -> None:
     share = 100 * RIGHT["color"].mean()
-    assert f"It answers right in {share:.1f} % of episodes" in shown["report"]
+    assert f"the VLM answers right in {share:.0f}\u00a0%" in shown["report"]
 
 
 def test_a_policy_is_described_as_before_and_a_mixture_as_both(tmp_path: Path) -> None:
     policy = acted(tmp_path, RIGHT)
+<<<<<<< HEAD
     alone, both = formats([policy]), formats([policy, vlm(tmp_path)])
     assert "The cube ended on the correct picture in" in alone["report"]
     assert "It answers right in" not in alone["report"]
     assert "The cube ended on the correct picture in" in both["report"]
     assert "It answers right in" in both["report"]
+=======
+    alone, both = formats([policy]), formats([policy, reader(tmp_path)])
+    assert "the cube ends right in" in alone["report"]
+    assert "the VLM answers right in" not in alone["report"]
+    assert "the cube ends right in" in both["report"]
+    assert "the VLM answers right in" in both["report"]
+>>>>>>> 3655b41 (The report opens with its finding, folds the rest, and reads in the dark, on a phone and on paper)
     for name in FORMATS:
         assert re.search(r"success rate", alone[name], re.I), name
         assert not re.search(r"accuracy of answers", alone[name], re.I), name

@@ -166,7 +166,7 @@ def test_probes_that_beat_nothing_are_said_to_encode_nothing(runs: tuple[SaidRun
     vlm, policy = runs
     found = match_runs(vlm, policy, probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75))
     assert [row.has_signal for row in found.rows] == [True, False, None]
-    assert any(note.startswith("In shape probes beat neither") for note in found.notes)
+    assert any(note.startswith("In shape probes are not shown to exceed") for note in found.notes)
 
 
 def test_frames_that_differ_or_have_no_hash_are_refused(runs: tuple[SaidRun, SaidRun]) -> None:

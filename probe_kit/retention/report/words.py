@@ -1,0 +1,59 @@
+"""The glossary of a page: what the words of its tables mean, and where each is explained."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from probe_kit.retention.columns.glossary import TERMS
+from probe_kit.retention.columns.sentences import VERDICT_HELP
+from probe_kit.retention.formats.html import HtmlTable
+
+_AGAINST = "against: "
+"""Before a verdict of the opposite direction."""
+
+
+@dataclass(frozen=True)
+class Word:
+    """An entry. place: its id in the page."""
+
+    name: str
+    meaning: str
+    place: str
+
+
+@dataclass(frozen=True)
+class Words:
+    """entries: by what they stand in.
+
+    headings: the place of a column's word and meaning; two tables may give a word two meanings. values: the place
+    of a cell's text that is a word.
+    """
+
+    entries: Mapping[str, tuple[Word, ...]]
+    headings: Mapping[tuple[str, str], str]
+    values: Mapping[str, str]
+
+
+def words_of(tables: Sequence[HtmlTable]) -> Words:
+    """The words of all columns of `tables` and of the verdicts in them, and terms that are neither."""
+    cells = {cell.value for table in tables for row in (*table.body, *table.foot) for cell in row}
+    groups: dict[str, dict[tuple[str, str], None]] = {}
+    for table in tables:
+        title, _, _ = table.title.partition(":")
+        own = {(column.word, column.explanation): None for column in table.columns if column.explanation}
+        groups.setdefault(title, {}).update({word: None for word in own if word not in _all(groups)})
+    said = {_word(cell) for cell in cells}
+    groups["Verdicts"] = {(name, text): None for name, text in VERDICT_HELP.items() if name in said}
+    groups["Further terms"] = {word: None for word in TERMS.items() if word not in _all(groups)}
+    places = {word: f"word-{number}" for number, word in enumerate(_all(groups))}
+    entries = {title: tuple(Word(*word, places[word]) for word in own) for title, own in groups.items() if own}
+    of_values = {name: place for (name, text), place in places.items() if (VERDICT_HELP | TERMS).get(name) == text}
+    return Words(entries, places, {cell: of_values[_word(cell)] for cell in cells if _word(cell) in of_values})
+
+
+def _word(cell: str) -> str:
+    """A verdict without its direction, side and bound."""
+    return cell.removeprefix(_AGAINST).partition(" (")[0]
+
+
+def _all(groups: Mapping[str, Mapping[tuple[str, str], None]]) -> list[tuple[str, str]]:
+    return [word for own in groups.values() for word in own]
