@@ -35,6 +35,37 @@ def test_the_picture_shows_the_probes_whose_numbers_are_printed() -> None:
     assert "trained" in {row["organism"] for row in data["organisms"]}
 
 
+@pytest.fixture(scope="module")
+def sample() -> str:
+    return (DOCS / "sample-report.html").read_text(encoding="utf-8")
+
+
+def test_the_sample_report_has_at_most_one_megabyte_and_no_path(sample: str) -> None:
+    assert len(sample.encode()) <= 1_000_000
+    assert re.findall(r"(?<![\w.])/(?:home|tmp|work|root|Users)/", sample) == []
+
+
+def test_the_sample_report_is_of_the_probes_and_numbers_that_are_printed(sample: str) -> None:
+    data = json.loads(DATA.read_text(encoding="utf-8"))
+    assert f"probes {data['probes']}" in sample
+    for row in (one for one in data["organisms"] if one["organism"] == "trained"):
+        cells = re.search(rf"<tr><td[^>]*>{row['category'].title()}</td>.*?</tr>", sample)
+        assert cells, row["category"]
+        shown = re.findall(r'data-heading="(\w+)[^"]*" data-sort="([\d.]+|n/a)', cells[0])
+        whole = {name: f"{100 * row[key]:.0f}" for name, key in (("backbone", "backbone"), ("success", "sr"))}
+        retention = "n/a" if row["retention"] is None else f"{row['retention']:.2f}"
+        assert dict(shown) | whole | {"action": f"{100 * row['action']:.0f}", "retention": retention} == dict(
+            shown
+        )
+
+
+def test_the_controls_of_the_sample_report_are_those_of_the_demo(sample: str) -> None:
+    """`demo --compare` adds an untrained network to the controls of the same run."""
+    assert "random-features" in sample
+    assert "untrained\u00a0%" not in sample
+    assert "untrained network" not in sample
+
+
 def test_no_page_repeats_the_demos_numbers_outside_its_tables() -> None:
     """A number in two places is soon two numbers."""
     data = json.loads(DATA.read_text(encoding="utf-8"))

@@ -36,7 +36,7 @@ HEADING_HELP = {
     heading: f"{meaning[:1].upper()}{meaning[1:]}."
     for heading, legend in _LEGENDS.items()
     for meaning in [legend.partition(": ")[2]]
-}
+} | {"verdict": "What all numbers of the category say together."}
 """The same as entries of the glossary."""
 
 

@@ -159,7 +159,7 @@ def _opening(
     grid: EpisodeGrid,
     places: tuple[str, ...],
 ) -> tuple[Question | None, Picture | None]:
-    """The question and the curve that stand beside the summary."""
+    """The question and the curve of the first screen."""
     row = opening_row(table)
     if row is None:
         return None, None

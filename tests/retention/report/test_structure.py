@@ -1,0 +1,191 @@
+"""The page as a parser reads it: what stands on the first screen, what is folded, and where links lead."""
+
+from dataclasses import dataclass, field
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.retention import retention_table
+from probe_kit.retention.columns.sentences import VERDICT_HELP
+from probe_kit.retention.report import report_html
+from probe_kit.retention.report.episodes import episode_grid
+from tests.retention.asked_runs import acted, asked
+from tests.retention.conftest import runs_in
+
+SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7], [0.5, 0.65]])
+NOISE = ([0.5, 0.52, 0.5], [[0.5, 0.5], [0.5, 0.51]])
+VOID = {"img", "meta", "br", "input"}
+
+
+@dataclass
+class Element:
+    """An element of a page. text: of itself and its children."""
+
+    tag: str
+    attributes: dict[str, str]
+    parents: tuple["Element", ...]
+    text: str = ""
+    children: list["Element"] = field(default_factory=list)
+
+    def inside(self, tag: str) -> list["Element"]:
+        return [parent for parent in self.parents if parent.tag == tag]
+
+
+class Page(HTMLParser):
+    """All elements of a page in order. Raises AssertionError where an element is not closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[Element] = []
+        self._open: list[Element] = []
+        self.feed(text)
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = Element(tag, {name: value or "" for name, value in attrs}, tuple(self._open))
+        self.elements.append(found)
+        if self._open:
+            self._open[-1].children.append(found)
+        if tag not in VOID:
+            self._open.append(found)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop().tag == tag
+
+    def handle_data(self, data: str) -> None:
+        for one in self._open:
+            one.text += data
+
+    def all(self, tag: str) -> list[Element]:
+        return [one for one in self.elements if one.tag == tag]
+
+    def named(self, name: str) -> Element:
+        (found,) = [one for one in self.elements if one.attributes.get("id") == name]
+        return found
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Page:
+    """Of a run with frames whose backbone holds Color and not Shape."""
+    run = runs_in(tmp_path_factory.mktemp("runs"))({"shape": NOISE, "color": SIGNAL})
+    for number in range(len(run.episodes)):
+        frame = np.full((12, 16, 3), number % 250, np.uint8)
+        locate(run.path).write(thumbnail_key(number), as_thumbnail((frame, frame)))
+    return Page(report_html([run]))
+
+
+def test_every_link_leads_somewhere_and_every_place_is_named_once(page: Page) -> None:
+    places = [one.attributes["id"] for one in page.elements if "id" in one.attributes]
+    assert len(places) == len(set(places))
+    links = [one.attributes["href"] for one in page.all("a")]
+    assert len(links) > 20
+    assert [link for link in links if link.removeprefix("#") not in places] == []
+
+
+def test_the_first_screen_is_question_summary_sentences_one_picture_and_one_curve(page: Page) -> None:
+    before = page.elements[: page.elements.index(page.all("details")[0])]
+    lead = next(one.text for one in before if one.attributes.get("class") == "lead")
+    assert lead.startswith("What does it know")
+    (table,) = [one for one in before if one.tag == "table"]
+    assert "verdict" in table.text
+    assert [one.text.partition(" ")[0] for one in before if one.tag == "li" and not one.inside("nav")] == [
+        "Shape",
+        "Color",
+    ]
+    picture, curve = [one for one in before if one.tag == "img"]
+    assert picture.attributes["src"].startswith("data:image/webp")
+    assert curve.attributes["src"].startswith("data:image/svg+xml")
+    assert "color" in curve.attributes["alt"], "the category that has something to show"
+
+
+def test_everything_else_is_folded_under_headings(page: Page) -> None:
+    sections = [one for one in page.all("details") if one.attributes.get("class") == "part"]
+    assert [one.attributes["id"] for one in sections][-4:] == ["episodes", "settings", "words", "cite"]
+    for section in sections:
+        assert "open" not in section.attributes
+        summary = section.children[0]
+        assert (summary.tag, [one.tag for one in summary.children]) == ("summary", ["h2"])
+    main = [one for one in page.all("h2") if not one.inside("details")]
+    assert [one.text for one in main] == ["Summary"]
+
+
+def test_a_heading_and_a_verdict_lead_to_their_meaning(page: Page) -> None:
+    headings = [one for one in page.all("th") if one.attributes.get("scope") == "col"]
+    links = [link for one in headings for link in one.children[0].children if link.tag == "a"]
+    assert len(links) > len(headings) / 2
+    for link in links:
+        entry = page.named(link.attributes["href"].removeprefix("#"))
+        assert entry.tag == "dt"
+        assert entry.text.replace(" ", "") == link.text.replace("\u00a0", "").replace(" ", "")
+    (verdict,) = [one for one in page.all("a") if one.inside("td") and one.text == "encoded, not acted on"]
+    place = page.named(verdict.attributes["href"].removeprefix("#"))
+    siblings = place.parents[-1].children
+    assert siblings[siblings.index(place) + 1].text == VERDICT_HELP["encoded, not acted on"]
+
+
+def test_keyboard_and_screen_readers_reach_everything(page: Page) -> None:
+    body = page.all("body")[0]
+    skip = body.children[0]
+    assert (skip.tag, skip.attributes["href"]) == ("a", "#summary")
+    assert "tabindex" in page.named("summary").attributes
+    assert all(one.attributes["alt"] for one in page.all("img"))
+    assert all(one.text.strip() or one.attributes.get("aria-label") for one in page.all("button"))
+    assert all(one.inside("label") for one in page.elements if one.tag in ("select", "input"))
+    scrolled = [one for one in page.elements if "scroll" in one.attributes.get("class", "").split()]
+    assert scrolled
+    assert all(one.attributes["tabindex"] == "0" and one.attributes["aria-label"] for one in scrolled)
+
+
+def test_the_page_has_rules_for_the_dark_for_narrow_screens_and_for_print(page: Page) -> None:
+    style = page.all("style")[0].text
+    assert "@media screen and (prefers-color-scheme: dark)" in style, "paper is white, whatever the screen is"
+    assert "@media print" in style
+    assert "@media (max-width: 40rem)" in style
+    (scheme,) = [one for one in page.all("meta") if one.attributes.get("name") == "color-scheme"]
+    assert scheme.attributes["content"] == "light dark"
+
+
+RIGHT = {"color": np.random.default_rng(0).random((20, 2)) < 0.85}
+
+
+def test_a_model_that_only_answers_lacks_nothing_and_moves_no_cube(tmp_path: Path) -> None:
+    run = asked(tmp_path, RIGHT)
+    assert retention_table([run]).notes == ()
+    page = Page(report_html([run]))
+    assert [one.text for one in page.elements if one.attributes.get("class") in ("warning", "remark")] == []
+    seen = "".join(one.text for one in page.all("main") if one).replace(page.all("script")[0].text, "")
+    assert "the VLM answers right in" in seen
+    assert "cube" not in "".join(
+        one.text for one in page.elements if one.tag in ("li", "p", "dd", "figcaption", "th")
+    )
+
+
+def test_an_episode_of_both_kinds_of_model_shares_its_picture(tmp_path: Path) -> None:
+    """The VLM's frame is the left half of the policy's picture, which stands in the page once."""
+    vlm, policy = asked(tmp_path, RIGHT), acted(tmp_path, RIGHT)
+    for number in range(len(policy.episodes)):
+        first, last = (np.full((12, 16, 3), shade, np.uint8) for shade in (3 * number, 255))
+        locate(vlm.path).write(thumbnail_key(number), as_thumbnail((first,)))
+        locate(policy.path).write(thumbnail_key(number), as_thumbnail((first, last)))
+    grid = episode_grid([vlm, policy], ["vlm", "policy"])
+    count = len(policy.episodes)
+    assert sum(map(len, grid.pictures)) == count
+    for said, done in zip(grid.cards[:count], grid.cards[count:], strict=True):
+        assert (said["frames"], said["half"], done["frames"], done["half"]) == (1, True, 2, False)
+        assert grid.picture(said) == grid.picture(done)
+    alone = episode_grid([vlm], ["vlm"])
+    assert {(card["frames"], card["half"]) for card in alone.cards} == {(1, False)}
+
+
+def test_equal_pictures_stand_in_the_page_once(tmp_path: Path) -> None:
+    run = acted(tmp_path, RIGHT)
+    frame = np.full((12, 16, 3), 7, np.uint8)
+    for number in range(len(run.episodes)):
+        locate(run.path).write(thumbnail_key(number), as_thumbnail((frame, frame)))
+    grid = episode_grid([run], ["policy"])
+    assert sum(map(len, grid.pictures)) == 1
+    assert {card["picture"] for card in grid.cards} == {0}
