@@ -17,11 +17,12 @@ import pytest
 from probe_kit.errors import UsageError
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
+from probe_kit.intervene.kinds.image_swap.verdict import Behaviour
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.columns import all_columns
 from probe_kit.retention.columns.glossary import TERMS
 from probe_kit.retention.columns.modes import Modes
-from probe_kit.retention.columns.sentences import VERDICT_HELP, CategoryVerdict
+from probe_kit.retention.columns.sentences import VERDICT_HELP, Readable
 from probe_kit.retention.columns.summary import HEADING_HELP
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.formats.html import HtmlTable, html_tables
@@ -250,8 +251,7 @@ def test_every_word_has_a_sentence() -> None:
 
 
 def test_every_verdict_is_explained() -> None:
-    verdicts = [one for kind in get_args(CategoryVerdict) for one in get_args(kind)]
-    assert set(VERDICT_HELP) == set(verdicts)
+    assert set(VERDICT_HELP) == {*get_args(Readable), *get_args(Behaviour)}
 
 
 # -- episodes --------------------------------------------------------------------------------------------------

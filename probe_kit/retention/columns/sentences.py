@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from probe_kit.intervene.kinds.image_swap.verdict import UNTESTED, Behaviour, UseVerdict
+from probe_kit.intervene.kinds.image_swap.verdict import UNTESTED, UseVerdict
 from probe_kit.intervene.store.settings import FIRST_CHUNK
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.text import is_vlm, number, percent
@@ -23,7 +23,7 @@ Readable = Literal[
 ]
 """What success rate, answers and probes say where no image swap is stored: these never say *used*."""
 _HELD = "The backbone holds the answer"
-_READABLE_HELP: dict[Readable, str] = {
+_READABLE_HELP = {
     "known": "The VLM answers right more often than guessing explains.",
     "unknown": "It is not shown that the VLM answers right more often than guessing explains.",
     "encoded": f"{_HELD}; the model did not act.",
@@ -33,15 +33,15 @@ _READABLE_HELP: dict[Readable, str] = {
     "absent": "The backbone's best site can be at most as accurate as a stated limit, 65 % by default.",
     "not shown": "Neither shown nor absent: more items would tell.",
 }
-_BEHAVIOUR_HELP: dict[Behaviour, str] = {
-    "used": "A swap of the pictures turns the action, in at least half of the episodes and by half of the reach.",
-    "partly used, one-sided": "A swap turns the action where the answer lies on the named side, and not elsewhere.",
-    "partly used, graded": "A swap turns the action, in fewer than half of the episodes or by less than half of the reach.",
-    "moves with it, does not decide": "A swap moves the action by more than a tenth of the reach, and does not turn it.",
-    "not used": "A swap moves the action by less than a tenth of the reach, and another category's answer is used.",
+_BEHAVIOUR_HELP = {
+    "used": "A swap turns the action, in at least half of the episodes and by at least half of the reach.",
+    "partly used, one-sided": "A swap turns the action where the answer lies on the named side only.",
+    "partly used, graded": "A swap turns the action in fewer episodes, or by less, than where it is used.",
+    "moves with it, does not decide": "A swap moves the action by a tenth of the reach, and does not turn it.",
+    "not used": "A swap moves the action by less than a tenth of the reach; another category is used.",
     "inconclusive": "The numbers do not decide whether the answer is used; the sentence says what is missing.",
 }
-VERDICT_HELP: dict[str, str] = {**_READABLE_HELP, **_BEHAVIOUR_HELP}
+VERDICT_HELP = _READABLE_HELP | _BEHAVIOUR_HELP
 """What each verdict says, as an entry of the glossary."""
 
 
