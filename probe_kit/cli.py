@@ -15,6 +15,7 @@ import typer.core
 from probe_kit._terminal.console import marked, out, say
 from probe_kit._terminal.error_reporting import report_error
 from probe_kit._terminal.interruption import begun
+from probe_kit._terminal.panelled_help import PanelledHelp
 from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.check_adapter.command import check_adapter
 from probe_kit.demo.commands import demo
@@ -71,6 +72,8 @@ class Commands(typer.core.TyperGroup):
         except _FOR_TYPER:
             raise
         except (Exception, KeyboardInterrupt, SystemExit) as error:  # no caller above handles it
+            if isinstance(error.__context__, BrokenPipeError):  # rich ends the process where help has no reader
+                raise error.__context__ from None
             raise typer.Exit(report_error(error)) from error
 
     def _run(self, ctx: Any) -> Any:
@@ -157,6 +160,10 @@ for command in (
 ):
     app.command()(command)
 app.command(cls=KindHelp)(intervene)
+for group in (app, suite_app, run_app):
+    for registered in group.registered_commands:
+        if registered.cls is not KindHelp:
+            registered.cls = PanelledHelp
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -13,6 +13,7 @@ import typer
 from typer.testing import CliRunner
 
 from probe_kit._terminal.options import Format, read_categories
+from probe_kit._terminal.panelled_help import HELP_ALL
 from probe_kit.cli import app, commands_of
 from probe_kit.env.robot.arm_models import ARMS
 from probe_kit.env.scoring.rules import RULES
@@ -88,7 +89,7 @@ REQUIRED = {
 
 def help_of(command: str) -> str:
     """Help with every line break and frame removed, so that no wrapping hides a text."""
-    shown = CliRunner().invoke(app, [*command.split(), "--help"], env={"COLUMNS": "300"}).stdout
+    shown = CliRunner().invoke(app, [*command.split(), HELP_ALL], env={"COLUMNS": "300"}).stdout
     return " ".join(re.sub(r"[│╭╮╰╯─]", " ", shown).split())
 
 

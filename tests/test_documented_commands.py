@@ -51,7 +51,12 @@ OTHER_PROGRAMS = {
 }
 """Programs that are not ours, and why their lines are not typed by this test."""
 
-OF_OTHERS = {"--help": "every program's", "--gpus": "docker's", "--length": "b2sum's"}
+OF_OTHERS = {
+    "--help": "every program's",
+    "--help-all": "every command's",
+    "--gpus": "docker's",
+    "--length": "b2sum's",
+}
 """Options in the text that are no command's of ours, and no benchmark's."""
 OF_BENCHMARKS = {
     option

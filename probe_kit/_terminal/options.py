@@ -16,10 +16,12 @@ from probe_kit._terminal.console import split, whole_number
 from probe_kit.errors import UsageError
 from probe_kit.scene_names import SceneName
 
-speed_option = partial(typer.Option, rich_help_panel="Speed and hardware (no effect on results beyond rounding)")
+speed_option = partial(typer.Option, rich_help_panel="Speed and hardware")
 """Declares an option in the panel of options that change no number."""
+further_option = partial(typer.Option, rich_help_panel="Further settings")
+"""Declares an option that is seldom needed, in no panel of its own."""
 _weights_option = partial(typer.Option, rich_help_panel="Model weights")
-_planning_option = partial(typer.Option, rich_help_panel="Planning and resuming")
+_resuming_option = partial(typer.Option, rich_help_panel="Resuming")
 
 
 class Names(tuple[str, ...]):
@@ -95,7 +97,7 @@ def read_size(text: str) -> tuple[int, int]:
 # -- what to read -----------------------------------------------------------------------------------------------
 
 RunFolder = Annotated[str, typer.Argument(help="Run folder or URL.", metavar="RUN")]
-Partial = Annotated[bool, typer.Option("--partial", help="Accept unfinished runs.")]
+Partial = Annotated[bool, further_option("--partial", help="Accept unfinished runs.")]
 SuiteFolder = Annotated[
     Path | None, typer.Option("--suite", help="Suite folder. Default: the embedded suite.", metavar="FOLDER")
 ]
@@ -106,14 +108,14 @@ Categories = Annotated[
 Items = Annotated[int | None, typer.Option("--items", help="Number of items per category. Default: all.")]
 Wording = Annotated[
     str | None,
-    typer.Option(
+    further_option(
         "--wording", help="Wording to analyse in a run with several wordings. Default: the first of the run."
     ),
 ]
 Scene = Annotated[
-    SceneName | None, typer.Option("--scene", help="Scene preset. Default: that of the protocol or the model.")
+    SceneName | None, further_option("--scene", help="Scene preset. Default: that of the protocol or the model.")
 ]
-Seed = Annotated[int, typer.Option("--seed", help="Random seed. The same seed gives the same result.")]
+Seed = Annotated[int, further_option("--seed", help="Random seed. The same seed gives the same result.")]
 
 # -- model ------------------------------------------------------------------------------------------------------
 
@@ -162,13 +164,14 @@ InferenceLimit = Annotated[
 
 # -- planning and output ----------------------------------------------------------------------------------------
 
-DryRun = Annotated[bool, _planning_option("--dry-run", help="Print the plan and stop.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.")]
 AllowMixed = Annotated[
     bool,
-    _planning_option(
+    _resuming_option(
         "--allow-mixed", help="Resume a run that was started with other library versions or on another device."
     ),
 ]
-Force = Annotated[bool, _planning_option("--force", help="Start even if disk space seems insufficient.")]
+Force = Annotated[bool, _resuming_option("--force", help="Start even if disk space seems insufficient.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+WholeTable = Annotated[bool, typer.Option("--details", help="Print every column, in several tables if need be.")]
 Format = Annotated[Literal["table", "json", "csv"], typer.Option("--format", help="Format of the printed result.")]

@@ -1,7 +1,7 @@
-"""Console tables that split instead of truncating numbers: columns that do not fit move below."""
+"""Console tables that never truncate numbers: columns that do not fit move below, or are left out by name."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -61,7 +61,8 @@ class ResponsiveTable:
 
     A row that has nothing to say in one of several tables, all its cells there being empty, is left out of it.
 
-    names: of the rows, under the heading `name`; styles: one per row. caption: under the last table.
+    names: of the rows, under the heading `name`; styles: one per row. caption: under the last table. splits:
+    whether columns that do not fit stand in further tables; else the caption names them.
     """
 
     title: str
@@ -70,25 +71,49 @@ class ResponsiveTable:
     names: tuple[str, ...]
     styles: tuple[str, ...]
     parts: tuple[Part, ...]
+    splits: bool = True
 
     @property
     def width(self) -> int:
         """Columns of a console on which it is one table."""
-        return max(Cell(name).width for name in (self.name, *self.names)) + sum(part.width for part in self.parts)
+        return self._name_width + sum(part.width for part in self.parts)
+
+    @property
+    def _name_width(self) -> int:
+        return max(Cell(name).width for name in (self.name, *self.names))
 
     def __rich_console__(self, _: "Console", options: "ConsoleOptions") -> "Iterator[RenderableType]":
         from rich.text import Text
 
+        shown = self if self.splits else self._fitted(options.max_width)
         yield Text(self.title, style="italic")
-        yield from self._tables(options.max_width)
-        if self.caption:
-            yield Text(self.caption, style="dim")
+        yield from shown._tables(options.max_width)
+        if shown.caption:
+            yield Text(shown.caption, style="dim")
         yield Text()
+
+    def _fitted(self, width: int) -> "ResponsiveTable":
+        """One table with the columns that fit, the first ones first; the caption names the others."""
+        room, parts, missing = width - self._name_width, [], []
+        for part in self.parts:
+            kept = []
+            for column, heading in enumerate(part.headings):
+                if (needed := part.only([column]).width) <= room:
+                    kept.append(column)
+                    room -= needed
+                else:
+                    missing.append(heading)
+            parts.append(part.only(kept))
+        if not any(part.headings for part in parts):
+            return self
+        left_out = f"with --details or more room: {', '.join(dict.fromkeys(missing))}" if missing else ""
+        caption = "; ".join(filter(None, (self.caption, left_out)))
+        return replace(self, parts=tuple(part for part in parts if part.headings), caption=caption)
 
     def _tables(self, width: int) -> "Iterator[Table | RenderableType]":
         from rich.text import Text
 
-        room = width - max(Cell(name).width for name in (self.name, *self.names))
+        room = width - self._name_width
         if any(part.only([column]).width > room for part in self.parts for column in range(len(part.headings))):
             yield from self._lists()
             return

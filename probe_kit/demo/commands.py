@@ -1,11 +1,14 @@
 """`probe-kit demo`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from probe_kit._terminal.console import counter, out, progress
+
+if TYPE_CHECKING:
+    from probe_kit.demo.pipeline import Demo
 
 
 def demo(
@@ -38,6 +41,11 @@ def demo(
         return
     with progress() as bar:
         made = run_demo(out_folder, lambda stage: counter(bar, stage))
+    print_demo(made)
+
+
+def print_demo(made: "Demo") -> None:
+    """Where to look, and last the finding, which stays in view."""
     out.print(made.next_steps(), soft_wrap=True)
     out.print()
-    out.print(made.table.to_rich())  # last: the finding stays in view
+    out.print(made.table.to_rich())

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from probe_kit._terminal.console import whole_number
-from probe_kit._terminal.options import Names, choices, read_size, some_of, speed_option
+from probe_kit._terminal.options import Names, choices, further_option, read_size, some_of, speed_option
 from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, Tokens, VideoChoice
 from probe_kit.extract.vqa.phrases import Picture, Query
@@ -17,7 +17,7 @@ from probe_kit.hooks.contract.protocol import ProtocolName
 from probe_kit.scene_names import ArmName, Rendering
 from probe_kit.suite.ladder import WORDINGS
 
-_scene_option = partial(typer.Option, rich_help_panel="Scene (stored with the run)")
+_scene_option = partial(typer.Option, rich_help_panel="Scene")
 _storage_option = partial(typer.Option, rich_help_panel="Stored data")
 _control_option = partial(typer.Option, rich_help_panel="Controls")
 _STARTING = ("out_folder", "dry_run", "force")
@@ -97,7 +97,7 @@ EvenItems = Annotated[
 ]
 Wordings = Annotated[
     Names | None,
-    typer.Option(
+    further_option(
         "--wordings",
         parser=some_of(WORDINGS),
         metavar=f"{choices(WORDINGS)},…",
@@ -107,7 +107,7 @@ Wordings = Annotated[
 ]
 Protocol = Annotated[
     ProtocolName | None,
-    typer.Option(
+    further_option(
         "--protocol",
         help="Use scene, checkpoint and options of a published protocol. Your options take precedence.",
     ),
@@ -124,17 +124,19 @@ Label = Annotated[
 ]
 Execute = Annotated[
     int | None,
-    typer.Option("--execute", help="Number of actions executed per inference. Default: set by protocol or model."),
+    further_option(
+        "--execute", help="Number of actions executed per inference. Default: set by protocol or model."
+    ),
 ]
 CaptureOnly = Annotated[
     bool,
-    typer.Option(
+    further_option(
         "--no-act", help="Capture the first inference of each episode without acting. There is no success rate."
     ),
 ]
 Dtype = Annotated[
     hook_family.Dtype | None,
-    typer.Option("--dtype", help="Data type of the weights. Default: the data type of the checkpoint."),
+    further_option("--dtype", help="Data type of the weights. Default: the data type of the checkpoint."),
 ]
 Prompts = Annotated[
     Names,

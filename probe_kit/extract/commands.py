@@ -62,6 +62,10 @@ def extract(
     """Run a model in every episode and store its activations.
 
     The same command resumes an interrupted run. Other settings in the same folder are an error.
+
+    \b
+    probe-kit extract --model pi0-tiny --items 12 --out runs/mine
+    probe-kit extract --model pi0 --categories color,shape --dry-run
     """
     chosen = own.settings_of(locals())
     from probe_kit.extract import ExtractSettings, prepare

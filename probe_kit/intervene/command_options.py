@@ -6,12 +6,12 @@ from typing import Annotated
 import typer
 
 from probe_kit._terminal.console import split
-from probe_kit._terminal.options import LISTED, Names, choices, one_of
+from probe_kit._terminal.options import LISTED, Names, choices, further_option, one_of
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.intervene.kinds.registry import KINDS
 
-_inside_option = partial(typer.Option, rich_help_panel="Inside the network (their meaning for each kind is below)")
+_inside_option = partial(typer.Option, rich_help_panel="Inside the network")
 
 
 class Numbers(tuple[float, ...]):
@@ -72,7 +72,7 @@ TargetSide = Annotated[
 ]
 ReadoutName = Annotated[
     Readout,
-    typer.Option(
+    further_option(
         "--readout",
         help="first-chunk: measure the first inference. per-step: measure every inference along the unedited "
         "episode (teacher-forced), for policies with one action per inference.",
@@ -80,7 +80,7 @@ ReadoutName = Annotated[
 ]
 SceneFiles = Annotated[
     list[str] | None,
-    typer.Option(
+    further_option(
         "--scene-file",
         metavar="NAME=FILE",
         help="File of the scene, if the run had one: background=FILE or arm_urdf=FILE. Repeat for several.",

@@ -3,13 +3,14 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import typer.core
+import typer
 from rich.console import Console
 from rich.panel import Panel
 from rich.text import Text
 
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, print_json_text, print_text, progress, say
+from probe_kit._terminal.panelled_help import PanelledHelp
 from probe_kit.intervene import command_options as own
 from probe_kit.intervene.kinds.registry import KINDS, intervention_of
 
@@ -20,12 +21,20 @@ if TYPE_CHECKING:
     from probe_kit.intervene.results.results import InterventionResult
 
 
-class KindHelp(typer.core.TyperCommand):
-    """Help with a panel for every kind."""
+class KindHelp(PanelledHelp):
+    """Help with the kinds; `--help-all` has a panel for each."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """The options, then what each kind does and what the options mean to it."""
+        """The most used options, then a line per kind."""
         super().format_help(ctx, formatter)
+        width = max(map(len, KINDS)) + 1
+        for name, kind in KINDS.items():
+            typer.echo(f" {name:{width}}{kind.summary}")
+        typer.echo()
+
+    def format_whole_help(self, ctx: Any, formatter: Any) -> None:
+        """All options, then what each kind does and what the options mean to it."""
+        super().format_whole_help(ctx, formatter)
         for name, kind in KINDS.items():
             lines = [f"--{option.replace('_', '-')}: {meaning}" for option, meaning in kind.options.items()]
             text = Text("\n".join([kind.summary, *lines]))
@@ -55,11 +64,15 @@ def intervene(
     device: common.Device = "cpu",
     style: common.Format = "table",
     partial: common.Partial = False,
+    details: common.WholeTable = False,
 ) -> None:
     """Test whether decodable information is used: change one input or activation and measure the action.
 
-    Replays the first inference of every episode, or all of them with --kind closed-loop. The result is stored in
-    the run, and `retention` reads it. The same command resumes an interrupted intervention and loads a stored one.
+    The result is stored in the run, and `retention` reads it. Run it again to resume.
+
+    \b
+    probe-kit intervene runs/mine
+    probe-kit intervene runs/mine --kind interchange --sites "backbone.*"
     """
     from probe_kit.extract import open_run
     from probe_kit.hooks.contract.options import read_pairs
@@ -76,7 +89,7 @@ def intervene(
     files = {name: Path(str(place)) for name, place in read_pairs(scene_files or []).items()}
     source = ReplaySource(suite, checkpoint, read_pairs(model_options or []), weights_seed, device, files)
     result = _run(opened, intervention, source)
-    _show(result, style)
+    print_result(result, style, details)
     say(marked("stored as {}; next: [bold]probe-kit retention {}[/]", result.key, run))
 
 
@@ -105,12 +118,16 @@ def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "I
     return result
 
 
-def _show(result: "InterventionResult", style: common.Format) -> None:
+def print_result(result: "InterventionResult", style: common.Format = "table", details: bool = False) -> None:
+    """Its table, the notes, and last the finding. details: print every column."""
     if style == "json":
         print_json_text(result.to_json())
     elif style == "csv":
         print_text(result.to_csv())
     else:
-        out.print(result.to_rich())
+        out.print(result.to_rich(details))
     for note in result.notes:
         say(marked("[yellow]note:[/] {}", note))
+    if style == "table":
+        for sentence in result.sentences:
+            out.print(sentence)

@@ -15,10 +15,9 @@ from probe_kit.scene_names import RuleName
 if TYPE_CHECKING:
     from probe_kit.retention.estimators.retention import Iterations
 
-RUNS = "Runs and probes"
+RUNS = "Probes"
 RULES = "Outcome rule"
 VLM_RUNS = "VLM runs"
-OUTPUT = "Output"
 
 
 class Radii(tuple[float, ...]):
@@ -63,9 +62,7 @@ Runs = Annotated[
 ]
 Groups = Annotated[
     list[str] | None,
-    typer.Option(
-        "--group", metavar="NAME=RUN,RUN", help="Compare groups of models. Repeat per group.", rich_help_panel=RUNS
-    ),
+    typer.Option("--group", metavar="NAME=RUN,RUN", help="Compare groups of models. Repeat per group."),
 ]
 Against = Annotated[
     str | None,
@@ -73,7 +70,6 @@ Against = Annotated[
         "--against",
         metavar="NAME",
         help="Run or group that all others are compared with. Default: the first run; of groups every pair.",
-        rich_help_panel=RUNS,
     ),
 ]
 ProbeKeys = Annotated[
@@ -169,16 +165,15 @@ Details = Annotated[
         parser=some_of((*get_args(Section), "all")),
         metavar=f"{choices((*get_args(Section), 'all'))},…",
         help="Tables to print above the summary, comma-separated.",
-        rich_help_panel=OUTPUT,
     ),
 ]
 NO_DETAILS = Names()
-Style = Annotated[TableFormat, typer.Option("--format", help="Format of the result.", rich_help_panel=OUTPUT)]
+Style = Annotated[TableFormat, typer.Option("--format", help="Format of the result.")]
 Html = Annotated[
     Path | None,
-    typer.Option("--html", metavar="FILE", help="Write a report that needs no network.", rich_help_panel=OUTPUT),
+    typer.Option("--html", metavar="FILE", help="Write a report that needs no network."),
 ]
 Figures = Annotated[
     Path | None,
-    typer.Option("--figures", metavar="FOLDER", help="Write all figures as PNG and PDF.", rich_help_panel=OUTPUT),
+    typer.Option("--figures", metavar="FOLDER", help="Write all figures as PNG and PDF."),
 ]

@@ -1,18 +1,16 @@
 """`probe-kit train`, and how `probe-kit run show` lists what it stored."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 from rich.text import Text
 
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, progress, say, split
-from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
 from probe_kit.train import command_options as own
 
 if TYPE_CHECKING:
-    import pandas as pd
     from rich.table import Table
 
     from probe_kit.train import Baseline, ProbeResults, RunReader
@@ -38,6 +36,7 @@ def train(
     jobs: own.Jobs = None,
     device: own.SolverDevice = None,
     ray: common.RayAddress = None,
+    details: common.WholeTable = False,
 ) -> None:
     """Fit linear probes at every site and store their scores in the run.
 
@@ -46,14 +45,16 @@ def train(
     """
     from probe_kit.extract import open_run
     from probe_kit.train import train_probes
+    from probe_kit.train.results.best_sites import best_sites_sentences, best_sites_table
 
     opened = open_run(run, allow_partial=partial).in_wording(wording)
     control = None if untrained is None else open_run(untrained, allow_partial=partial).in_wording(wording)
     left_out: dict[int, Exception] = {}
+    fitted: list[ProbeResults] = []
     for number in _calls(call, opened):
         try:
             with progress() as bar:
-                results = train_probes(
+                found = train_probes(
                     opened,
                     categories,
                     views,
@@ -77,14 +78,17 @@ def train(
                 raise
             left_out[number] = error
             continue
-        _print_peaks(results, opened.random_weights)
+        fitted.append(found)
+    out.print(best_sites_table(fitted, opened.random_weights, splits=details))
     for number, reason in left_out.items():
         say(marked("[yellow]left out:[/] call {}: {}", number, reason))
-    if not results.controls.excess:
+    if not fitted[0].controls.excess:
         say(
             "signal is judged against chance only: add the control random-features, or a --untrained by random "
             "weights"
         )
+    for sentence in best_sites_sentences(fitted[0]):
+        out.print(sentence)
     say(marked("next: [bold]probe-kit retention {}[/]", run))
 
 
@@ -155,48 +159,3 @@ def _calls(text: str, run: "RunReader") -> list[int]:
     if not found or not all(part.isdecimal() for part in found):
         raise UsageError(f"--call {text!r}; expected numbers from 0, comma-separated, or all")
     return list(dict.fromkeys(map(int, found)))
-
-
-def _print_peaks(results: "ProbeResults", random_weights: bool) -> None:
-    from probe_kit.train.results.summary import SITE_HEADINGS, best_sites
-
-    mark = ", RANDOM WEIGHTS" if random_weights else ""
-    mark += f", call {results.settings.call}"
-    peaks = best_sites(results.scores).sort_values(["category", "stream"], kind="stable")
-    for view in results.settings.views:
-        best = [row for _, row in peaks[peaks["view"] == view].iterrows()]
-        headings = (*SITE_HEADINGS, "exceeds", "n")
-        table = ResponsiveTable(
-            title=f"Best site per stream, view {view}{mark}",
-            caption="+: as many other sites tie with it",
-            name="category",
-            names=tuple(str(row["category"]) for row in best),
-            styles=("",) * len(best),
-            parts=(Part("Best sites", headings, tuple(_peak_cells(row) for row in best)),),
-        )
-        out.print(table)
-
-
-def _peak_cells(row: "pd.Series") -> tuple[Cell, ...]:
-    from probe_kit.train.results.summary import site_cells
-
-    return tuple(map(Cell, (*site_cells(row), _exceeded(row), str(row["n"]))))
-
-
-def _exceeded(best: "pd.Series[Any]") -> str:
-    """The controls that a site is shown to exceed, and those that it is not shown to exceed."""
-    from pandas import isna
-
-    from probe_kit.statistics.significance import SIGNIFICANCE
-
-    chance = None if isna(best["p_fwe"]) else best["p_fwe"] < SIGNIFICANCE
-    tried = {
-        "chance": chance,
-        "random-features": best["exceeds_random_features"],
-        "untrained": best["exceeds_untrained"],
-    }
-    tested = {name: bool(better) for name, better in tried.items() if not isna(better)}
-    shown, missed = (
-        ", ".join(name for name, better in tested.items() if better == want) for want in (True, False)
-    )
-    return "; ".join(filter(None, [shown, f"not shown: {missed}" if missed else ""])) or "–"

@@ -81,6 +81,12 @@ class TableContext:
     verdicts: Mapping[str, CategoryVerdict]
 
 
+def category_name(category: str) -> str:
+    """A category at the beginning of a sentence."""
+    spelt = category.replace("_", " ")
+    return f"{spelt[:1].upper()}{spelt[1:]}"
+
+
 # -- names of conditions -------------------------------------------------------------------------------------
 
 
@@ -210,6 +216,23 @@ def test_against_controls(
     seed = derive_seed("sign flips", suite, str(outcomes.categories[0]))
     for at, own, *tests in zip(tested, beyond, *max_t(beyond, outcomes.items, outcomes.groups, seed), strict=True):
         found[at] = ControlTest(controls[at], own, *map(float, tests))
+    return found
+
+
+def count_edits(found: Sequence[str], tried: int, most: int = 3) -> str:
+    """How many of the edits that were tried, and the first of them by name."""
+    if not found:
+        return f"none of {tried}"
+    named, further = found[:most], len(found) - most
+    return f"{len(found)} of {tried} ({', '.join(named)}{f' and {further} more' if further > 0 else ''})"
+
+
+def by_category[Row: EffectRow](rows: Sequence[Row]) -> dict[str, list[Row]]:
+    """Rows of edits by category, controls and clean conditions left out."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        if not row.is_control:
+            found.setdefault(row.category, []).append(row)
     return found
 
 

@@ -15,7 +15,8 @@ class Kind:
     name: on the command line and in settings. summary: a line of help. options: of sites, roles, direction,
     controls, coefficients, target_side and seed those that it takes, and what each means to it.
     build: (run, **options) → `Intervention`; may load torch. effects: `Measurement` → rows. table: (rows,
-    `TableContext`) → table of a terminal. notes: (rows, `Measurement`) → sentences for a reader; may be missing.
+    `TableContext`) → table of a terminal. sentences: (rows, `TableContext`) → the finding, one per category.
+    notes: (rows, `Measurement`) → what a reader must know, in sentences; may be missing, like `sentences`.
     keys_in_use: run → keys of the stored interventions that tables and figures read; missing if none reads them.
     has_verdict: whether its rows are classified by `classify_use`. is_descriptive: whether it edits nothing and
     tests nothing.
@@ -26,6 +27,7 @@ class Kind:
     build: str
     effects: str
     table: str
+    sentences: str = ""
     notes: str = ""
     options: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     keys_in_use: str = ""
@@ -33,7 +35,7 @@ class Kind:
     is_descriptive: bool = False
 
     def function(self, part: str) -> Callable[..., Any]:
-        """What `build`, `effects`, `table`, `notes` or `keys_in_use` names, imported now."""
+        """What `build`, `effects`, `table`, `sentences`, `notes` or `keys_in_use` names, imported now."""
         module, _, name = str(getattr(self, part)).partition(":")
         found: Callable[..., Any] = attrgetter(name)(import_module(module))
         return found

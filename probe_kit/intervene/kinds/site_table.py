@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit.intervene.kinds.base import TableContext
+from probe_kit.intervene.kinds.base import TableContext, by_category, category_name, count_edits
 from probe_kit.intervene.kinds.site_effects import PatchEffect
+from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
@@ -43,6 +44,24 @@ def site_table(rows: Sequence[PatchEffect], context: TableContext) -> "Responsiv
             ),
         ),
     )
+
+
+def site_sentences(rows: Sequence[PatchEffect], _: TableContext) -> list[str]:
+    """One per category: which edits carry half of what the image swap does, or move the action at all."""
+    return [f"{category_name(name)}: {_finding(own)}." for name, own in by_category(rows).items()]
+
+
+def _finding(rows: Sequence[PatchEffect]) -> str:
+    if all(row.effect is None for row in rows):
+        moved = [row for row in rows if row.p_fwe is not None and row.p_fwe < SIGNIFICANCE]
+        moved = sorted(moved, key=lambda row: -row.mean_displacement)
+        named = [f"{row.name} {100 * row.mean_displacement:+.1f} cm" for row in moved]
+        return (
+            f"edits that move the action to the target side beyond their controls: {count_edits(named, len(rows))}"
+        )
+    found = sorted((row for row in rows if row.is_localised), key=lambda row: -(row.effect or 0.0))
+    named = [f"{row.name} {row.effect:.2f}" for row in found]
+    return f"edits that carry half of the image swap's effect: {count_edits(named, len(rows))}"
 
 
 def _cells(row: PatchEffect) -> "tuple[Cell, ...]":

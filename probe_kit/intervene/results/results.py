@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -159,12 +159,20 @@ class InterventionResult:
         """
         return csv_of_frame(self.table)
 
-    def to_rich(self) -> "ResponsiveTable":
-        """The table for a terminal."""
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What was found, a sentence per category; none of a kind that only describes."""
+        return tuple(self._kind.function("sentences")(self.effects, self._context)) if self._kind.sentences else ()
+
+    def to_rich(self, details: bool = True) -> "ResponsiveTable":
+        """The table for a terminal. details: split it where it is wide, else leave columns out by name."""
+        table: ResponsiveTable = self._kind.function("table")(self.effects, self._context)
+        return replace(table, splits=details)
+
+    @property
+    def _context(self) -> TableContext:
         subject = f"{self.label}{' (random weights)' if self.random_weights else ''} on {self.suite}"
-        context = TableContext(self.measurement, subject, self.verdicts)
-        table: ResponsiveTable = self._kind.function("table")(self.effects, context)
-        return table
+        return TableContext(self.measurement, subject, self.verdicts)
 
 
 def load_effects(run: RunReader, key: str | None = None, kind: str | None = None) -> InterventionResult:

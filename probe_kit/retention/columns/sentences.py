@@ -3,9 +3,10 @@
 from typing import Literal
 
 from probe_kit.intervene.kinds.image_swap.verdict import UNTESTED, UseVerdict
+from probe_kit.intervene.kinds.image_swap.words import describe_swap
 from probe_kit.intervene.store.settings import FIRST_CHUNK
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.text import is_vlm, number, percent
+from probe_kit.retention.columns.text import is_vlm, percent
 from probe_kit.retention.estimators.stream_scores import Limits
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
@@ -260,7 +261,8 @@ def _accuracy(part: StreamPart) -> str:
 
 def _acted(row: RetentionRow) -> str:
     """What the action does when the pictures are swapped, and where the cube ends."""
-    swap = _swapped(row)
+    use = row.image_swap.use
+    swap = "" if use is None else describe_swap(row.image_swap, use)
     if row.success.sr is None:
         why = "the model did not act" if row.run.capture_only else "there is no success rate"
         return f"{swap}; {why}" if swap else why
@@ -272,26 +274,6 @@ def _agrees(row: RetentionRow) -> bool:
     """Whether the image swap lets expect the success rate."""
     use = row.image_swap.use
     return use is None or (use.behaviour == "inconclusive" and not use.is_bounded) or use.is_used == knows(row)
-
-
-def _swapped(row: RetentionRow) -> str:
-    """What a swap of the pictures does to the action; empty without one."""
-    swap, use = row.image_swap, row.image_swap.use
-    if use is None:
-        return ""
-    low, high = (_whole(limit) for limit in swap.net_follow_rate_ci or (None, None))
-    followed, net = f"in {_whole(swap.follow_rate)} % of episodes", f"net of reversals {low} to {high} %"
-    moved = f"moved by {number(swap.reach_share)} of its reach"
-    if use.behaviour == "used" and not use.reversed:
-        return f"the action follows a swap of the pictures {followed} ({net})"
-    if use.behaviour == "used":
-        reversed_ = f"in {_whole(swap.reversal_rate)} % of episodes"
-        return f"the action goes against the pictures, swapped or not, {reversed_}"
-    if use.is_bounded:
-        return f"the action does not follow a swap of the pictures ({followed}, {net}, {moved})"
-    if use.behaviour == "inconclusive":
-        return f"whether the action follows a swap of the pictures is open ({followed}, {net}, {moved})"
-    return f"the action follows a swap of the pictures in part ({followed}, {net}, {moved})"
 
 
 # -- text ---------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from probe_kit.intervene.kinds.kind import Kind
 
 KIND = Kind(
     name="attention",
-    summary="Share of the acting stream's attention on images, tiles, instruction and state (descriptive).",
+    summary="Shares of the acting stream's attention (descriptive).",
     build="probe_kit.intervene.kinds.attention.intervention:AttentionReadout.from_options",
     effects="probe_kit.intervene.kinds.attention.attention_mass:measured_attention",
     table="probe_kit.intervene.kinds.attention.table:attention_table",

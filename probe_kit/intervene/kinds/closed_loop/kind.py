@@ -4,10 +4,11 @@ from probe_kit.intervene.kinds.kind import Kind
 
 KIND = Kind(
     name="closed-loop",
-    summary="Interchange at the best place in every inference, with whole episodes played again.",
+    summary="Interchange at every inference; whole episodes are played.",
     build="probe_kit.intervene.results.best_targets:build_closed_loop",
     effects="probe_kit.intervene.kinds.closed_loop.effects:measured_closed_loop",
     table="probe_kit.intervene.kinds.closed_loop.table:closed_loop_table",
+    sentences="probe_kit.intervene.kinds.closed_loop.table:closed_loop_sentences",
     notes="probe_kit.intervene.kinds.closed_loop.effects:disruption_notes",
     options={
         "sites": "default the last place, of each category, that the newest interchange localised",

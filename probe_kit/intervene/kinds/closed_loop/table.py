@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit.intervene.kinds.base import TableContext
+from probe_kit.intervene.kinds.base import TableContext, by_category, category_name, count_edits
 from probe_kit.intervene.kinds.closed_loop.effects import MIN_IN_ZONE_RATIO, ClosedLoopEffect
 from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST
 from probe_kit.intervene.store.answers import CLEAN
@@ -43,6 +43,21 @@ def closed_loop_table(rows: Sequence[ClosedLoopEffect], context: TableContext) -
             ),
         ),
     )
+
+
+def closed_loop_sentences(rows: Sequence[ClosedLoopEffect], _: TableContext) -> list[str]:
+    """One per category: at which places the cube turns to the other picture."""
+    return [f"{category_name(name)}: {_finding(own)}." for name, own in by_category(rows).items()]
+
+
+def _finding(rows: Sequence[ClosedLoopEffect]) -> str:
+    edits = [row for row in rows if row.place != CLEAN]
+    found = [f"{row.name} {row.net:+.2f}" for row in edits if row.finding == "confirmed"]
+    disrupted = [row.name for row in edits if row.finding == "task disrupted"]
+    turned = (
+        f"edits that turn the cube to the other picture beyond their controls: {count_edits(found, len(edits))}"
+    )
+    return turned + (f"; that disrupt the task: {count_edits(disrupted, len(edits))}" if disrupted else "")
 
 
 def _ends(row: ClosedLoopEffect) -> "tuple[Cell, ...]":

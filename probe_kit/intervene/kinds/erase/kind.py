@@ -4,10 +4,11 @@ from probe_kit.intervene.kinds.kind import Kind
 
 KIND = Kind(
     name="erase",
-    summary="Remove the linearly decodable answer from each token (weaker evidence than interchange).",
+    summary="Remove the decodable answer (weaker than interchange).",
     build="probe_kit.intervene.kinds.erase.intervention:ConceptErasure.from_options",
     effects="probe_kit.intervene.kinds.erase.effects:measured_erasure",
     table="probe_kit.intervene.kinds.erase.table:erasure_table",
+    sentences="probe_kit.intervene.kinds.erase.table:erasure_sentences",
     notes="probe_kit.intervene.kinds.erase.effects:erasure_notes",
     options={
         "sites": "where tokens are erased, one site each; required",

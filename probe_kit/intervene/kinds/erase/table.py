@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit.intervene.kinds.base import TableContext
+from probe_kit.intervene.kinds.base import TableContext, by_category, category_name, count_edits
 from probe_kit.intervene.kinds.erase.effects import ErasureEffect
 
 if TYPE_CHECKING:
@@ -41,6 +41,19 @@ def erasure_table(rows: Sequence[ErasureEffect], context: TableContext) -> "Resp
             ),
         ),
     )
+
+
+def erasure_sentences(rows: Sequence[ErasureEffect], _: TableContext) -> list[str]:
+    """One per category: which erasures take the answer from the action."""
+    return [f"{category_name(name)}: {_finding(own)}." for name, own in by_category(rows).items()]
+
+
+def _finding(rows: Sequence[ErasureEffect]) -> str:
+    tried = [row for row in rows if row.finding != "identity patch"]
+    if tried and all(row.finding == "no baseline effect" for row in tried):
+        return "the unedited action does not go to the correct picture, so that nothing can be lost"
+    found = [f"{row.name} keeps {row.kept:.2f}" for row in tried if row.finding == "effect"]
+    return f"erasures that take the answer from the action beyond their controls: {count_edits(found, len(tried))}"
 
 
 def _action_cells(row: ErasureEffect) -> "tuple[Cell, ...]":

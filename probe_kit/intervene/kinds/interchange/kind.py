@@ -4,10 +4,11 @@ from probe_kit.intervene.kinds.kind import Kind
 
 KIND = Kind(
     name="interchange",
-    summary="Activation patching: where inside does the swapped image pass?",
+    summary="Activation patching: where does the swapped image pass?",
     build="probe_kit.intervene.kinds.interchange.intervention:Interchange.from_options",
     effects="probe_kit.intervene.kinds.site_effects:measured_patches",
     table="probe_kit.intervene.kinds.site_table:site_table",
+    sentences="probe_kit.intervene.kinds.site_table:site_sentences",
     options={
         "sites": "where tokens are patched; default backbone.*",
         "roles": "of the patched tokens; default all,image,language",

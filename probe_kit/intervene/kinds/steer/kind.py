@@ -4,10 +4,11 @@ from probe_kit.intervene.kinds.kind import Kind
 
 KIND = Kind(
     name="steer",
-    summary="Add a direction to the tokens of one role, with controls of the same norm.",
+    summary="Add a direction to tokens, with controls of the same norm.",
     build="probe_kit.intervene.kinds.steer.intervention:Steering.from_options",
     effects="probe_kit.intervene.kinds.site_effects:measured_patches",
     table="probe_kit.intervene.kinds.site_table:site_table",
+    sentences="probe_kit.intervene.kinds.site_table:site_sentences",
     notes="probe_kit.intervene.kinds.site_effects:large_change_notes",
     options={
         "sites": "where tokens are moved; required",

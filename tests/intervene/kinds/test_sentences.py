@@ -1,0 +1,164 @@
+"""The sentence of each kind of intervention about a category."""
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import pytest
+
+from probe_kit.intervene.kinds.base import Measurement, TableContext
+from probe_kit.intervene.kinds.closed_loop.effects import ClosedLoopEffect
+from probe_kit.intervene.kinds.closed_loop.table import closed_loop_sentences
+from probe_kit.intervene.kinds.erase.effects import ErasureEffect
+from probe_kit.intervene.kinds.erase.table import erasure_sentences
+from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
+from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict, classify_use
+from probe_kit.intervene.kinds.image_swap.words import image_swap_sentences, instruction_swap_sentences
+from probe_kit.intervene.kinds.registry import KINDS
+from probe_kit.intervene.kinds.site_effects import PatchEffect
+from probe_kit.intervene.kinds.site_table import site_sentences
+from probe_kit.intervene.store.answers import CLEAN
+
+SWAPS = {
+    "follows": (0.92, 0.02, (0.6, 1.0), 0.001, 1.0, 0.9, (0.8, 1.0)),
+    "reverses": (0.0, 0.9, (-1.0, -0.6), 1.0, 0.001, -0.9, (-1.0, -0.8)),
+    "does not follow": (0.04, 0.02, (-0.1, 0.12), 0.6, 0.6, 0.01, (-0.02, 0.03)),
+    "open": (0.2, 0.1, (-0.1, 0.42), 0.3, 0.9, 0.1, (-0.1, 0.3)),
+    "in part": (0.2, 0.0, (0.05, 0.35), 0.01, 0.99, 0.2, (0.15, 0.3)),
+}
+"""Follow and reversal rate, interval of the net rate, p and its mirror, share of the reach and its interval."""
+SAID = {
+    "follows": "the action follows a swap of the pictures in 92 % of episodes (net of reversals 60 to 100 %).",
+    "reverses": "the action goes against the pictures, swapped or not, in 90 % of episodes.",
+    "does not follow": "the action does not follow a swap of the pictures (in 4 % of episodes, net of reversals "
+    "-10 to 12 %, moved by 0.01 of its reach).",
+    "open": "whether the action follows a swap of the pictures is open (in 20 % of episodes, net of reversals -10 "
+    "to 42 %, moved by 0.10 of its reach).",
+    "in part": "the action follows a swap of the pictures in part (in 20 % of episodes, net of reversals 5 to 35 "
+    "%, moved by 0.20 of its reach).",
+}
+
+
+def swap(response: str) -> ImageSwapEffect:
+    follow, reversal, ci, p, reversal_p, share, share_ci = SWAPS[response]
+    return ImageSwapEffect(
+        category="public_info", n_episodes=48, n_items=24, n_groups=12, follow_rate=follow, reversal_rate=reversal,
+        net_follow_rate=follow - reversal, net_follow_rate_ci=ci, follow_p=p, reversal_p=reversal_p,
+        median_displacement=0.1, reach=0.3, reach_source="actions", reach_share=share, reach_share_ci=share_ci,
+        moved_share=abs(share), left_reached=follow - reversal, right_reached=follow - reversal,
+    )  # fmt: skip
+
+
+def context(verdict: UseVerdict | None) -> TableContext:
+    verdicts = {} if verdict is None else {"public_info": verdict}
+    return TableContext(cast("Measurement", None), "", verdicts)
+
+
+@pytest.mark.parametrize("response", SWAPS)
+@pytest.mark.parametrize("encoded", [True, False, None])
+@pytest.mark.parametrize("control", ["color", None])
+def test_an_image_swap_is_described_by_what_the_action_does_and_then_its_verdict(
+    response: str, encoded: bool | None, control: str | None
+) -> None:
+    found = classify_use(encoded, swap(response), control)
+    (sentence,) = image_swap_sentences([swap(response)], context(found))
+    assert sentence == f"Public info (24 items): {SAID[response]} {found.sentence}"
+
+
+def test_an_instruction_swap_is_described_without_a_verdict() -> None:
+    (sentence,) = instruction_swap_sentences([swap("reverses")], context(None))
+    assert sentence == (
+        "Public info (24 items): the action follows a swap of the instruction in 0 % of episodes and does the "
+        "reverse in 90 % (net -100 to -60 %)."
+    )
+
+
+COMMON: dict[str, Any] = {
+    "category": "color", "role": "image", "direction": "", "is_control": False, "n_episodes": 48, "n_items": 24,
+    "net_ci": (0.0, 1.0), "max_action_change": 1.0, "fires": 1, "no_op_fires": 0, "relative_change": 0.5,
+}  # fmt: skip
+
+
+def patch(place: str, effect: float | None, p: float, centimetres: float = 3.0) -> PatchEffect:
+    return PatchEffect(
+        **COMMON, place=place, coefficient="", effect=effect, net=0.4, net_left=0.4, net_right=0.4,
+        mean_displacement=centimetres / 100, control_displacement=None, t=2.0, p=p, p_fwe=p,
+    )  # fmt: skip
+
+
+CARRY, MOVE = "edits that carry half of the image swap's effect", "edits that move the action to the target side"
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        (
+            [patch("backbone.01", 0.97, 0.001), patch("backbone.02", 0.6, 0.01), patch("backbone.03", 0.9, 0.4)],
+            f"{CARRY}: 2 of 3 (backbone.01 image 0.97, backbone.02 image 0.60).",
+        ),
+        ([patch("backbone.01", 0.2, 0.001)], f"{CARRY}: none of 1."),
+        (
+            [patch("backbone.01", None, 0.001), patch("backbone.02", None, 0.2)],
+            f"{MOVE} beyond their controls: 1 of 2 (backbone.01 image +3.0 cm).",
+        ),
+        ([patch("backbone.01", None, 0.5)], f"{MOVE} beyond their controls: none of 1."),
+        (
+            [patch(f"kv.{at:02d}", 0.9, 0.001) for at in range(5)],
+            f"{CARRY}: 5 of 5 (kv.00 image 0.90, kv.01 image 0.90, kv.02 image 0.90 and 2 more).",
+        ),
+    ],
+)
+def test_edits_of_sites_are_counted_and_the_largest_are_named(rows: Sequence[PatchEffect], said: str) -> None:
+    assert site_sentences(rows, context(None)) == [f"Color: {said}"]
+
+
+def closed_loop(place: str, net: float, p: float | None, disrupted: bool = False) -> ClosedLoopEffect:
+    return ClosedLoopEffect(
+        **COMMON, place=place, correct=0.5, wrong=0.5, in_zone=1.0, wrong_in_zone=0.5, net=net, net_left=net,
+        net_right=net, control_net=0.0, gained=1, lost=0, p_mcnemar=0.1, t=1.0, p=p, p_fwe=p, disrupted=disrupted,
+    )  # fmt: skip
+
+
+TURN = "edits that turn the cube to the other picture beyond their controls"
+
+
+def test_closed_loops_say_what_is_confirmed_and_what_disrupts_the_task() -> None:
+    rows = [closed_loop(CLEAN, 0.0, None), closed_loop("backbone.02", 0.8, 0.001), closed_loop("kv.01", 0.1, 0.5)]
+    assert closed_loop_sentences(rows, context(None)) == [f"Color: {TURN}: 1 of 2 (backbone.02 image +0.80)."]
+    rows = [closed_loop(CLEAN, 0.0, None), closed_loop("backbone.02", 0.8, None, disrupted=True)]
+    assert closed_loop_sentences(rows, context(None)) == [
+        f"Color: {TURN}: none of 1; that disrupt the task: 1 of 1 (backbone.02 image)."
+    ]
+
+
+def erasure(kept: float | None, p: float) -> ErasureEffect:
+    common = COMMON | {"direction": "leace"}
+    return ErasureEffect(
+        **common, place="backbone.02", right_before=1.0, right=0.5, kept=kept, net=0.5, mean_displacement=0.1,
+        control_kept=0.9, control_net=0.0, control_displacement=0.0, p=p, p_fwe=p, probe_accuracy_before=1.0,
+        probe_accuracy=0.5,
+    )  # fmt: skip
+
+
+TAKE = "erasures that take the answer from the action beyond their controls"
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        (erasure(0.1, 0.001), f"{TAKE}: 1 of 1 (backbone.02 image leace keeps 0.10)."),
+        (erasure(0.8, 0.3), f"{TAKE}: none of 1."),
+        (
+            erasure(None, 0.3),
+            "the unedited action does not go to the correct picture, so that nothing can be lost.",
+        ),
+    ],
+)
+def test_erasures_say_what_is_lost(row: ErasureEffect, said: str) -> None:
+    (sentence,) = erasure_sentences([row], context(None))
+    assert sentence == f"Color: {said}"
+
+
+def test_every_kind_that_tests_something_says_what_it_found() -> None:
+    for kind in KINDS.values():
+        assert bool(kind.sentences) != kind.is_descriptive, kind.name
+        assert not kind.sentences or callable(kind.function("sentences"))
