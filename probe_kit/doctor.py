@@ -19,6 +19,7 @@ from typing import Any, Literal
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
+from probe_kit._system.installing import install_command
 from probe_kit.errors import SceneError
 
 State = Literal["ok", "note", "missing"]
@@ -174,9 +175,7 @@ def _scene() -> list[Finding]:
         return [Finding("simulator", "missing", complaint, advice)]
     simulator = Finding("simulator", "ok", f"pybullet {found['pybullet']} with numpy")
     if not found["numpy"]:
-        advice = (
-            "`uv sync --reinstall-package pybullet`, or `pip install --no-build-isolation pybullet` with numpy"
-        )
+        advice = f"Build it again beside numpy: `{install_command(rebuild='pybullet')}`"
         seen = f"pybullet {found['pybullet']} without numpy: pictures cost three times as much"
         simulator = Finding("simulator", "note", seen, advice)
     drawn = (
@@ -188,7 +187,7 @@ def _scene() -> list[Finding]:
 def _policy() -> list[Finding]:
     found, complaint = _try("let_policy_act")
     if found is None:
-        return [Finding("policy", "missing", complaint, "Install again: `uv sync`, or `pip install probe-kit`")]
+        return [Finding("policy", "missing", complaint, f"Install again: `{install_command()}`")]
     acted = f"pi0-tiny acts (torch {found['torch']}, lerobot {found['lerobot']})"
     return [Finding("policy", "ok", acted), _gpu(found["gpus"])]
 
@@ -266,9 +265,7 @@ def _extra(name: str, packages: list[str]) -> Finding:
     here = {package: _installed(package) for package in packages}
     lacking = [package for package, found in here.items() if found is None]
     if lacking:
-        return Finding(
-            f"extra {name}", "note", f"without {', '.join(lacking)}", f"`pip install 'probe-kit[{name}]'`"
-        )
+        return Finding(f"extra {name}", "note", f"without {', '.join(lacking)}", f"`{install_command(name)}`")
     return Finding(f"extra {name}", "ok", ", ".join(f"{package} {found}" for package, found in here.items()))
 
 

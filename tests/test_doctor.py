@@ -11,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from probe_kit import doctor
+from probe_kit._system.installing import install_command
 from probe_kit.cli import app
 from probe_kit.doctor import Finding, State
 
@@ -118,9 +119,7 @@ def test_a_machine_without_a_gpu_is_noted_and_one_with_is_described() -> None:
 def test_an_extra_lacks_what_is_not_installed() -> None:
     assert doctor._extra("demo", ["numpy"]).state == "ok"
     lacking = doctor._extra("demo", ["numpy", "no-such-distribution"])
-    assert lacking == Finding(
-        "extra demo", "note", "without no-such-distribution", "`pip install 'probe-kit[demo]'`"
-    )
+    assert lacking == Finding("extra demo", "note", "without no-such-distribution", f"`{install_command('demo')}`")
 
 
 def test_available_memory_is_that_of_the_system() -> None:

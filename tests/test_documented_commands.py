@@ -255,7 +255,7 @@ STAND_INS = {
 NOT_TYPED = {
     r"^cd probe_kit": "this is that checkout",
     r"^\. \.venv": "this runs in that environment",
-    r"^pip install": "the extras are installed here",
+    r"^\./with-uv --extra": "the extras are installed here",
     r"with-uv probe-kit demo": "minutes; tests/test_cli.py types it",
     r"with-uv pytest": "is what runs this",
     r"^python benchmarks/intervention_acceptance": "hours",

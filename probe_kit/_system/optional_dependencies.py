@@ -3,6 +3,7 @@
 from importlib import import_module
 from typing import Any
 
+from probe_kit._system.installing import install_command
 from probe_kit.errors import MissingExtraError
 
 
@@ -12,5 +13,5 @@ def require(module: str, extra: str) -> Any:
         return import_module(module)
     except ImportError as error:
         raise MissingExtraError(
-            f"this needs {module.partition('.')[0]}, which is not installed; `pip install 'probe-kit[{extra}]'`"
+            f"this needs {module.partition('.')[0]}, which is not installed; `{install_command(extra)}`"
         ) from error

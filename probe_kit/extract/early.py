@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from probe_kit._system.installing import install_command
 from probe_kit.errors import DiskSpaceError, MissingExtraError, UsageError
 from probe_kit.extract.run_layout import RUN_FILE
 from probe_kit.extract.settings import AskSettings, RunSettings, check_other_settings
@@ -25,7 +26,7 @@ def check_model(settings: RunSettings, scripted: tuple[str, ...]) -> None:
     scripted: names of models that are none. Raises UnknownModelError and what `Family.check` raises.
     """
     if settings.ray is not None and find_spec("ray") is None:
-        raise MissingExtraError("--ray needs ray, which is not installed; `pip install 'probe-kit[ray]'`")
+        raise MissingExtraError(f"--ray needs ray, which is not installed; `{install_command('ray')}`")
     from probe_kit.hooks.registry import find_family, known_families
 
     asked = isinstance(settings, AskSettings)

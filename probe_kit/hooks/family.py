@@ -10,6 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from probe_kit._system.installing import install_command
 from probe_kit._system.machine import check_device_name, what_is_here
 from probe_kit.errors import CheckpointError, MissingExtraError, UnsupportedInterventionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
@@ -163,7 +164,7 @@ class Family:
         check_device_name(device)
         for module, extra in self._missing_packages():
             raise MissingExtraError(
-                f"{self.name} needs {module}, which is not installed; `pip install 'probe-kit[{extra}]'`"
+                f"{self.name} needs {module}, which is not installed; `{install_command(extra)}`"
             )
         place = self.place(checkpoint, chosen.get(SIZE))
         if place is None and self.needs_checkpoint:

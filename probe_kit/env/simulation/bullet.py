@@ -11,6 +11,8 @@ from tempfile import TemporaryFile
 from threading import Lock
 from typing import Any
 
+from probe_kit._system.installing import install_command
+
 _GREETING = b"pybullet build time:"
 _importing = Lock()
 
@@ -61,8 +63,8 @@ class BulletClient:
         if not pybullet.isNumpyEnabled():
             warnings.warn(
                 "pybullet was compiled without numpy: a picture comes back as nested tuples and costs three times "
-                "as much. Reinstall it with numpy present: `uv sync --reinstall-package pybullet`, or "
-                "`pip install --no-build-isolation pybullet` after `pip install numpy setuptools wheel`.",
+                "as much. Build it again beside numpy: "
+                f"`{install_command(rebuild='pybullet')}`.",
                 stacklevel=2,
             )
         self._pybullet = pybullet

@@ -1,0 +1,51 @@
+"""The command that installs something for the Python that runs."""
+
+import shlex
+import shutil
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+_ROOT = Path(__file__).parents[2]
+
+
+def install_command(extra: str = "", rebuild: str = "") -> str:
+    """Shell command that installs probe_kit again, with an extra or with one package built anew.
+
+    In a checkout's own environment it is `./with-uv`, which brings uv. Elsewhere it is the pip of the running
+    Python, or `uv pip` where that Python has none. rebuild: a package that needs numpy while it is compiled.
+    """
+    if _is_of_checkout():
+        options = [f"--extra {extra}"] * bool(extra) + [f"--reinstall-package {rebuild}"] * bool(rebuild)
+        return " ".join([_with_uv(), *options, "probe-kit doctor"])
+    if rebuild:
+        again = "--force-reinstall" if _has_pip() else "--reinstall"
+        return f"{_installer()} {again} --no-build-isolation {rebuild}"
+    name = f"probe-kit[{extra}]" if extra else "probe-kit"
+    return f"{_installer()} {shlex.quote(name)}"
+
+
+def _is_of_checkout() -> bool:
+    """Whether the running Python is the environment that `with-uv` makes in its folder."""
+    return (_ROOT / "with-uv").is_file() and Path(sys.prefix).resolve().is_relative_to(_ROOT.resolve())
+
+
+def _with_uv() -> str:
+    return "./with-uv" if Path.cwd() == _ROOT else shlex.quote(str(_ROOT / "with-uv"))
+
+
+def _has_pip() -> bool:
+    return find_spec("pip") is not None
+
+
+def _installer() -> str:
+    if _has_pip():
+        return f"{_python()} -m pip install"
+    return f"uv pip install --python {_python()}"
+
+
+def _python() -> str:
+    """The running Python as a shell finds it."""
+    name = Path(sys.executable).name
+    found = shutil.which(name)
+    return name if found is not None and Path(found) == Path(sys.executable) else shlex.quote(sys.executable)
