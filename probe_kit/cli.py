@@ -25,7 +25,7 @@ from probe_kit.extract.commands import extract
 from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
-from probe_kit.hooks.commands import new_adapter, verify
+from probe_kit.hooks.commands import new_adapter, verify, words
 from probe_kit.intervene.commands import KindHelp, intervene
 from probe_kit.intervene.show_command import show
 from probe_kit.retention.commands import retention
@@ -143,6 +143,7 @@ app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
 app.add_typer(study_app, name="study")
 run_app.command()(show)
+suite_app.command()(words)
 for command in (
     extract,
     ask,

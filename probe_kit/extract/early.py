@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,6 +43,17 @@ def check_model(settings: RunSettings, scripted: tuple[str, ...]) -> None:
         settings.checkpoint, device, settings.dtype, settings.random_weights, settings.options,
         settings.weights_seed,
     )  # fmt: skip
+
+
+def check_words(settings: RunSettings, texts: Iterable[str], scripted: tuple[str, ...]) -> None:
+    """Refuse instructions, or objects of questions, with words that the model does not know; imports no torch.
+
+    Raises InstructionError naming the words.
+    """
+    from probe_kit.hooks.registry import find_family
+
+    if settings.model not in scripted:
+        find_family(settings.model, scripted).check_words(texts, settings.checkpoint)
 
 
 def check_place(settings: RunSettings, suite: "Suite", location: "Location") -> None:

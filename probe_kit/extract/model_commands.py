@@ -56,7 +56,7 @@ def models(
 
 
 def _listed(rows: list[dict[str, Any]]) -> Text:
-    """A line per model, cut at the width of the console."""
+    """A line per model, its description cut behind a word where the console ends."""
     lines = [(row["model"], row["does"], _in_a_word(row["ready"]), row["description"]) for row in rows]
     lines = [("model", "does", "ready", "what it is"), *lines]
     widths = [max(len(line[column]) for line in lines) for column in range(3)]
@@ -64,7 +64,7 @@ def _listed(rows: list[dict[str, Any]]) -> Text:
         "  ".join([*(f"{cell:{width}}" for cell, width in zip(line, widths, strict=False)), line[3]])
         for line in lines
     ]
-    cut = [line if len(line) <= out.width else f"{line[: out.width - 1]}…" for line in shown]
+    cut = [line if len(line) <= out.width else f"{line[: out.width - 1].rpartition(' ')[0]} …" for line in shown]
     return Text("\n".join([*cut, "A page per model: probe-kit models NAME"]))
 
 

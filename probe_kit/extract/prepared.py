@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.calibration import Calibration, calibrated
-from probe_kit.extract.early import check_model, check_place
+from probe_kit.extract.early import check_model, check_place, check_words
 from probe_kit.extract.plan import Plan, instructions_of, make_plan, plan_episodes, skipped_items
 from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.rollout.answer_controller import AnswerController
@@ -123,8 +123,9 @@ def check_run(settings: RunSettings, location: Location | None = None, loaded: b
         check_model(settings, tuple(SCRIPTED))
     check_meaningless(settings)
     suite = _suite(settings)
-    if isinstance(settings, AskSettings):
-        phrases(suite, settings.query, settings.seed)
+    texts = _texts(settings, suite)
+    if not loaded:
+        check_words(settings, texts, tuple(SCRIPTED))
     if location is not None:
         check_place(settings, suite, location)
     return suite
@@ -135,6 +136,13 @@ def _suite(settings: RunSettings) -> Suite:
         # Of a category drawn alone every item is the same: drawing all eleven takes half a minute.
         return default_suite(settings.categories).select(None, settings.items)
     return load_suite(settings.suite).select(settings.categories, settings.items)
+
+
+def _texts(settings: RunSettings, suite: Suite) -> tuple[str, ...]:
+    """What the model will read: instructions, or the objects of questions."""
+    if not isinstance(settings, AskSettings):
+        return instructions_of(plan_episodes(suite, settings.seed, settings.asked_wordings))
+    return tuple(dict.fromkeys(phrase.text for phrase in phrases(suite, settings.query, settings.seed).values()))
 
 
 def _asking(settings: AskSettings, suite: Suite, answer_model: "AnswerModel | None") -> AnswerController:

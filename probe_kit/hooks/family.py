@@ -1,7 +1,7 @@
 """A model family: its name, loader, verification, options and requirements. Imports no torch."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from probe_kit._system.installing import install_command
 from probe_kit._system.machine import check_device_name, what_is_here
-from probe_kit.errors import CheckpointError, MissingExtraError, UnsupportedInterventionError, UsageError
+from probe_kit.errors import (
+    CheckpointError,
+    InstructionError,
+    MissingExtraError,
+    UnsupportedInterventionError,
+    UsageError,
+)
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
 from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
 from probe_kit.hooks.contract.card import ModelCard, SourceWeights
@@ -53,7 +59,8 @@ class Family:
     none, and then only the loader knows one when it sees it. instead: for other such types that people may take
     for one of them, what to do. needs_checkpoint: nothing is there by default. protocols: published protocols that
     use the family, by name, with what they use it with. interventions: what of them its policy supports.
-    home: the scene it acts in, or is asked about, when none is named.
+    home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
+    `words_in`, of a family whose default checkpoint knows few words; empty for one that reads any text.
     Raises UsageError if an option is not declared as an `Option`.
     """
 
@@ -82,6 +89,7 @@ class Family:
     sizes: tuple[tuple[str, str], ...] = ()
     interventions: Interventions = ALL_EDITS
     home: DefaultScene = BRIDGE
+    vocabulary: str = ""
 
     def __post_init__(self) -> None:
         for option in self.options:
@@ -95,6 +103,22 @@ class Family:
             said = f"A released size ({', '.join(names)}) instead of --checkpoint."
             size = Option(SIZE, str, said, names[0], names)
             object.__setattr__(self, "options", (*self.options, size))
+
+    def check_words(self, texts: Iterable[str], checkpoint: str | None = None) -> None:
+        """Raise InstructionError for a text with a word that the default checkpoint does not know."""
+        if not self.vocabulary or checkpoint is not None:
+            return
+        own = import_module(self.vocabulary)
+        known = set(own.known_words())
+        unknown = {text: [word for word in own.words_in(text) if word not in known] for text in texts}
+        bad = {text: words for text, words in unknown.items() if words}
+        if bad:
+            text, words = next(iter(bad.items()))
+            more = f", and {len(bad) - 1} further texts have such words" if len(bad) > 1 else ""
+            raise InstructionError(
+                f"{self.name} does not know {', '.join(map(repr, words))} in {text!r}{more}. `probe-kit suite "
+                "words` lists the words it knows; other models read any text"
+            )
 
     def load(
         self,

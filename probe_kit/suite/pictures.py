@@ -11,6 +11,8 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from probe_kit.errors import SuiteError
 
+RESTORE = "Restore the suite's files or build it again."
+"""What to do about a picture of a suite."""
 WHITE = (255, 255, 255)
 LARGEST_PICTURE = 8192
 """Pixels of the longer side: a few kilobytes can claim to be a picture that fills all memory once decoded."""
@@ -58,8 +60,7 @@ def load_picture(path: Path, pixels: str | None = None) -> Image.Image:
     picture = decode_picture(path)
     if pixels is not None and (found := pixels_sha256(picture)) != pixels:
         raise SuiteError(
-            f"{path}: has other pixels than its suite says (expected {pixels[:12]}, found {found[:12]}). "
-            "Restore the suite's files or build it again."
+            f"{path}: has other pixels than its suite says (expected {pixels[:12]}, found {found[:12]}). {RESTORE}"
         )
     return letterboxed(picture)
 
@@ -71,7 +72,7 @@ def decode_picture(path: Path) -> Image.Image:
     `LARGEST_PICTURE`, or has more than 8 bits per channel.
     """
     if not path.is_file():
-        raise SuiteError(f"{path}: there is no such picture. Restore the suite's files or build it again.")
+        raise SuiteError(f"{path}: there is no such picture. {RESTORE}")
     try:
         with _headers_of_bombs(), Image.open(path) as image:
             _check_huge(image, path)
@@ -80,9 +81,7 @@ def decode_picture(path: Path) -> Image.Image:
             _check_deep(image, path)
             return on_white(ImageOps.exif_transpose(image))
     except _DECODING_ERRORS as error:
-        raise SuiteError(
-            f"{path}: not a picture that Pillow can decode ({error}). Restore the suite's files or build it again."
-        ) from error
+        raise SuiteError(f"{path}: not a picture that Pillow can decode ({error}). {RESTORE}") from error
 
 
 @contextmanager

@@ -1,13 +1,9 @@
 """Word-level tokenizer of the embedded VLM: the grammar of the embedded suite and of questions."""
 
 import json
+import re
+from collections.abc import Collection
 from pathlib import Path
-
-from tokenizers import Regex, Tokenizer
-from tokenizers.models import WordLevel
-from tokenizers.normalizers import Lowercase
-from tokenizers.pre_tokenizers import Sequence, Split
-from tokenizers.processors import TemplateProcessing
 
 from probe_kit.suite.generators import vocabulary
 
@@ -23,15 +19,31 @@ _OF_QUESTIONS = (
 WORDS = tuple(dict.fromkeys((*SPECIAL, *_OF_QUESTIONS, *vocabulary())))
 VOCABULARY = -(-len(WORDS) // 64) * 64
 """Rows of an embedding table for them."""
+_ISOLATED = r'\n|"|[.,:?](?=\s|$)'
+"""What is a word of its own wherever it stands; not the colon in 7:30."""
+
+
+def known_words() -> Collection[str]:
+    """The words of an instruction or question that the embedded models know, in small letters."""
+    return [word for word in WORDS if word not in SPECIAL]
+
+
+def words_in(text: str) -> list[str]:
+    """The words of a text as the tokenizer separates them, in small letters."""
+    return [word for word in re.sub(_ISOLATED, r" \g<0> ", text.lower()).split(" ") if word]
 
 
 def write_tokenizer(folder: Path, most: int) -> None:
     """tokenizer.json and its card in `folder`. most: tokens of an instruction."""
+    from tokenizers import Regex, Tokenizer
+    from tokenizers.models import WordLevel
+    from tokenizers.normalizers import Lowercase
+    from tokenizers.pre_tokenizers import Sequence, Split
+    from tokenizers.processors import TemplateProcessing
+
     tokenizer = Tokenizer(WordLevel({word: index for index, word in enumerate(WORDS)}, unk_token="<unk>"))
     tokenizer.normalizer = Lowercase()
-    tokenizer.pre_tokenizer = Sequence(
-        [Split(Regex(r'\n|"|[.,:?](?=\s|$)'), "isolated"), Split(" ", "removed")]  # not the colon in 7:30
-    )
+    tokenizer.pre_tokenizer = Sequence([Split(Regex(_ISOLATED), "isolated"), Split(" ", "removed")])
     tokenizer.post_processor = TemplateProcessing(
         single="<bos> $A", special_tokens=[("<bos>", SPECIAL.index("<bos>"))]
     )

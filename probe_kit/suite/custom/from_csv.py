@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
-from probe_kit.errors import UsageError
+from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.suite.card import new_suite
 from probe_kit.suite.categories import check_slug
@@ -19,6 +19,7 @@ from probe_kit.suite.custom.own_items import Origin, Shown, Terms, check_broken,
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item, Side
 from probe_kit.suite.manifest import check_foreign_folder, save_suite
+from probe_kit.suite.pictures import RESTORE
 from probe_kit.suite.suite import Suite
 
 COLUMNS = ("instruction", "correct", "wrong")
@@ -71,14 +72,30 @@ def suite_from_csv(
     pictures: dict[str, bytes] = {}
     drawn: list[tuple[Row, Shown, Shown]] = []
     for row in rows:
-        correct, wrong = shown(row.correct, row.object), shown(row.wrong, row.other_object)
+        correct, wrong = (_shown(table, row, column) for column in ("correct", "wrong"))
         pictures |= {correct.file_name: correct.png, wrong.file_name: wrong.png}
         drawn.append((row, correct, wrong))
     items = list(_items(name, version, drawn, terms))
     groups = {item.item_id: row.group for item, row in zip(items, rows, strict=True) if row.group}
     suite = new_suite(name, version, with_groups(items, groups), {"rows": len(rows)})
-    check_broken(suite)
+    lines = {item.item_id: f"{table}, line {row.line}" for item, row in zip(items, rows, strict=True)}
+    check_broken(suite, lines)
     return save_suite(suite, pictures, statistics_of(suite), folder)
+
+
+def _shown(table: Path, row: Row, column: str) -> Shown:
+    """A row's picture. Raises SuiteError naming line, column and the folder that was searched."""
+    path, phrase = (row.correct, row.object) if column == "correct" else (row.wrong, row.other_object)
+    where = f"{table}, line {row.line}, column {column}"
+    if not path.is_file():
+        written = path.relative_to(table.parent) if path.is_relative_to(table.parent) else path
+        raise SuiteError(
+            f"{where}: there is no picture {written} in {path.parent.resolve()}. Paths are relative to the table"
+        )
+    try:
+        return shown(path, phrase)
+    except SuiteError as error:
+        raise SuiteError(f"{where}: {str(error).replace(RESTORE, 'Give another file.')}") from error
 
 
 def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> Iterator[Row]:
@@ -92,9 +109,11 @@ def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> Iterator[Row]:
     missing = [column for column in COLUMNS if column not in columns]
     unknown = [column for column in columns if column not in (*COLUMNS, *FURTHER)]
     if missing or unknown:
+        wrong = [f"lacks {', '.join(missing)}"] * bool(missing)
+        wrong += [f"has {', '.join(map(repr, unknown))}, which no table has"] * bool(unknown)
         raise UsageError(
-            f"{table} has the columns {', '.join(columns) or 'none'}; expected {', '.join(COLUMNS)} and, where "
-            f"wanted, {', '.join(FURTHER)}"
+            f"{table}, line 1, {' and '.join(wrong)}; expected {', '.join(COLUMNS)} and, where wanted, "
+            f"{', '.join(FURTHER)}"
         )
     seen: dict[tuple[str, Path, Path], int] = {}
     for record in reader:
@@ -114,16 +133,22 @@ def _row(record: Mapping[str | None, str | None], line: int, table: Path, catego
     cells = {str(column): (value or "").strip() for column, value in record.items()}
     empty = [column for column in COLUMNS if not cells[column]]
     if empty:
-        raise UsageError(f"{where} has no {' and no '.join(empty)}; every question needs {', '.join(COLUMNS)}")
+        columns = f"column{'s' * (len(empty) > 1)} {' and '.join(empty)}"
+        raise UsageError(f"{where}, {columns}: it is empty; every question needs {', '.join(COLUMNS)}")
     asked = cells.get("object") or _object_of(cells["instruction"])
     if asked is None or asked not in cells["instruction"]:
         raise UsageError(
-            f"{where}: no target can be parsed from {cells['instruction']!r}. Write it as "
+            f"{where}, column instruction: no target can be parsed from {cells['instruction']!r}. Write it as "
             "'Put the cube on the …', or name the words in a column `object`"
         )
     correct, wrong = (table.parent / cells[column] for column in ("correct", "wrong"))
     other = cells.get("other_object") or f"what {wrong.stem} shows"
-    slug = check_slug(cells.get("category") or category)
+    try:
+        slug = check_slug(cells.get("category") or category)
+    except UsageError as error:
+        if not cells.get("category"):
+            raise
+        raise UsageError(f"{where}, column category: {error}") from error
     return Row(line, cells["instruction"], correct, wrong, cells.get("group", ""), slug, asked, other)
 
 

@@ -2,8 +2,9 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from unicodedata import normalize
 
 from PIL import Image
@@ -129,9 +130,17 @@ def _of_side(side: Side, picture: Shown) -> dict[str, str]:
     }
 
 
-def check_broken(suite: Suite) -> None:
-    """Raise SuiteError for a broken rule of the format; rules about files are left out, none is written yet."""
-    findings = [finding for rule in LOADING_RULES if rule is not pictures_unchanged for finding in rule(suite)]
+def check_broken(suite: Suite, places: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Raise SuiteError for a broken rule of the format; rules about files are left out, none is written yet.
+
+    places: by item, where a user wrote it.
+    """
+    findings = [
+        replace(finding, where=places.get(finding.where.removeprefix("item "), finding.where))
+        for rule in LOADING_RULES
+        if rule is not pictures_unchanged
+        for finding in rule(suite)
+    ]
     if findings:
         raise SuiteError(
             f"these questions break the rules of the format:\n{listing(findings)}\n"

@@ -11,6 +11,7 @@ from probe_kit.suite import Suite, Terms, suite_from_csv, validate_suite
 from probe_kit.suite.commands import app
 
 TERMS = Terms("CC0-1.0", "nobody")
+NEEDED = "instruction,correct,wrong"
 FRUIT = ("yellow", "green", "red", "orange", "brown", "purple")
 
 
@@ -91,20 +92,20 @@ def test_two_rows_over_the_same_pictures_that_ask_the_other_way_round_are_twins(
 @pytest.mark.parametrize(
     ("header", "line", "message"),
     [
-        ("instruction,correct", "x,y", "expected instruction, correct, wrong"),
-        ("instruction,correct,wrong,colour", "x,y,z,c", "expected instruction, correct, wrong"),
-        ("instruction,correct,wrong", "Put the cube on the lime,,green.png", "line 2 has no correct"),
-        ("instruction,correct,wrong", "Put it on a lime, please,green.png,red.png", "line 2 has more fields"),
-        ("instruction,correct,wrong", "Banana!,yellow.png,green.png", "line 2: no target can be parsed"),
-        ("instruction,correct,wrong,category", "Put it on a lime,green.png,red.png,mean", "'mean' cannot name"),
-        ("instruction,correct,wrong,category", "Put it on a lime,green.png,red.png,A/B", "'A/B' cannot name"),
-        ("instruction,correct,wrong", "", "no line below"),
+        ("instruction,correct", "x,y", "line 1, lacks wrong; expected instruction, correct, wrong"),
+        (f"{NEEDED},colour", "x,y,z,c", "line 1, has 'colour', which no table has; expected"),
+        (NEEDED, "Put the cube on the lime,,green.png", "line 2, column correct: it is empty"),
+        (NEEDED, "Put it on a lime, please,green.png,red.png", "line 2 has more fields"),
+        (NEEDED, "Banana!,yellow.png,green.png", "line 2, column instruction: no target can be parsed"),
+        (f"{NEEDED},category", "Put it on a lime,green.png,red.png,mean", "line 2, column category: 'mean'"),
+        (f"{NEEDED},category", "Put it on a lime,green.png,red.png,A/B", "line 2, column category: 'A/B' cannot"),
+        (NEEDED, "", "no line below"),
     ],
 )  # fmt: skip
 def test_a_table_that_cannot_be_used_is_refused_by_its_line(
     header: str, line: str, message: str, pictures: Path
 ) -> None:
-    with pytest.raises(UsageError, match=message):
+    with pytest.raises(UsageError, match=rf"fruit\.csv,? .*{message}|fruit\.csv, {message}"):
         made(pictures, line, header=header)
     assert not (pictures / "suite").exists()
 
@@ -127,6 +128,44 @@ def test_a_question_that_breaks_a_rule_writes_nothing(line: str, message: str, p
     with pytest.raises(SuiteError, match=message):
         made(pictures, line)
     assert not (pictures / "suite").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "column", "message"),
+    [
+        (
+            "Put the cube on the lime,nowhere.png,red.png",
+            "correct",
+            "no picture nowhere.png in FOLDER. Paths",
+        ),
+        (
+            "Put the cube on the lime,red.png,more/no.png",
+            "wrong",
+            "no picture more/no.png in FOLDER/more. Paths",
+        ),
+        ("Put the cube on the lime,/no/x.png,red.png", "correct", "no picture /no/x.png in /no. Paths"),
+        ("Put the cube on the lime,red.png,text.png", "wrong", "FOLDER/text.png: not a picture that Pillow can"),
+    ],
+)
+def test_a_picture_that_cannot_be_read_is_named_by_line_column_and_searched_folder(
+    line: str, column: str, message: str, pictures: Path
+) -> None:
+    (pictures / "text.png").write_text("no picture", encoding="utf-8")
+    with pytest.raises(SuiteError) as caught:
+        made(pictures, "Put the cube on the plum,purple.png,brown.png", line, header=NEEDED)
+    said = str(caught.value)
+    assert said.startswith(f"{pictures / 'fruit.csv'}, line 3, column {column}: ")
+    assert message.replace("FOLDER", str(pictures)) in said
+    assert "build it again" not in said, "there is no suite yet"
+
+
+def test_a_question_that_breaks_a_rule_is_named_by_its_line(pictures: Path) -> None:
+    with pytest.raises(SuiteError, match=r"fruit\.csv, line 3.*names a side"):
+        made(
+            pictures,
+            "Put the cube on the plum,purple.png,brown.png,,",
+            "Put the cube on the left lime,green.png,red.png,,",
+        )
 
 
 def test_the_command_makes_the_suite_and_says_what_to_do_next(pictures: Path) -> None:

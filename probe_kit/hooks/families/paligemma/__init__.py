@@ -18,6 +18,7 @@ FAMILIES = (
         acts=False,
         reads=True,
         home=RELEASED,
+        vocabulary="probe_kit.models.embedded.words",
     ),
     Family(
         "paligemma",

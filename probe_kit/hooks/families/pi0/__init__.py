@@ -30,6 +30,7 @@ def _embedded(name: str, summary: str, notes: str) -> Family:
         source_weights=_VLM_TINY,
         interventions=FLOW,
         home=RELEASED,
+        vocabulary="probe_kit.models.embedded.words",
     )
 
 

@@ -36,7 +36,8 @@ def describe_swap(swap: Swapped, use: UseVerdict) -> str:
     if use.behaviour == "used" and not use.reversed:
         return f"the action follows a swap of the pictures {followed} ({net})"
     if use.behaviour == "used":
-        return f"the action goes against the pictures, swapped or not, in {_percent(swap.reversal_rate)} % of episodes"
+        against = f"in {_percent(swap.reversal_rate)} % of episodes"
+        return f"the action goes against the pictures, swapped or not, {against}"
     if use.is_bounded:
         return f"the action does not follow a swap of the pictures ({followed}, {net}{moved})"
     if use.behaviour == "inconclusive":
@@ -66,8 +67,8 @@ def instruction_swap_sentences(rows: Sequence[ImageSwapEffect], _: TableContext)
 def _rates(row: ImageSwapEffect, what: str) -> str:
     low, high = map(_percent, row.net_follow_rate_ci)
     return (
-        f"the action follows a swap of the {what} in {_percent(row.follow_rate)} % of episodes and does the reverse "
-        f"in {_percent(row.reversal_rate)} % (net {low} to {high} %)"
+        f"the action follows a swap of the {what} in {_percent(row.follow_rate)} % of episodes and does the "
+        f"reverse in {_percent(row.reversal_rate)} % (net {low} to {high} %)"
     )
 
 
