@@ -161,8 +161,8 @@ for command in (
 ):
     app.command()(command)
 app.command(cls=KindHelp)(intervene)
-for group in (app, suite_app, run_app):
-    for registered in group.registered_commands:
+for group in (app, *(named.typer_instance for named in app.registered_groups)):
+    for registered in group.registered_commands if group else ():
         if registered.cls is not KindHelp:
             registered.cls = PanelledHelp
 

@@ -45,7 +45,6 @@ OTHER_PROGRAMS = {
     "cd": "enters this very checkout",
     "pytest": "is what runs this",
     ".": "activates the environment that this runs in",
-    "pip": "installs an extra; which ones there are is checked",
     "export": "names the keys of an object store",
     "python": "runs a file or a module of this checkout; that it is there is checked",
 }
@@ -54,6 +53,7 @@ OTHER_PROGRAMS = {
 OF_OTHERS = {
     "--help": "every program's",
     "--help-all": "every command's",
+    "--extra": "uv's",
     "--gpus": "docker's",
     "--length": "b2sum's",
 }
@@ -106,9 +106,8 @@ def test_what_other_programs_are_given_is_there() -> None:
     known = set(re.findall(r"(?m)^([\w-]+) = \[", extras[1]))
     for command in TYPED:
         program, *rest = command.words
-        if program == "pip":
-            assert set(re.findall(r"probe-kit\[([\w-]+)\]", command.text)) <= known, command
-        elif program == "python":
+        assert set(re.findall(r"--extra ([\w-]+)", command.text)) <= known, command
+        if program == "python":
             place = ROOT / (rest[1].replace(".", "/") + ".py" if rest[0] == "-m" else rest[0])
             assert place.is_file(), command
             options = [word for word in rest[1:] if word.startswith("--")]
@@ -229,8 +228,7 @@ RUNS = {
 
 STAND_INS = {
     "README.md": {
-        r"--model pi0 --checkpoint FOLDER": "--model pi0-tiny --items 12 --max-steps 12",
-        r"intervene runs/mine --checkpoint FOLDER": "intervene runs/mine",
+        r"--items 24": "--items 12 --max-steps 12",
         r"train runs/mine": "train runs/mine --permutations 20",
     },
     "docs/asking.md": {

@@ -35,3 +35,16 @@ def test_every_page_and_picture_it_points_to_is_there() -> None:
     links = [link for link in re.findall(r"\]\(([^)#]+)\)", README) if "://" not in link]
     assert links
     assert [link for link in links if not (root / link).is_file()] == []
+
+
+def test_the_first_screen_up_to_the_picture_and_its_caption_is_short() -> None:
+    picture = re.search(r"!\[[^]]*\]\([^)]*\)\s+\*.*?\*\n\n", README, re.DOTALL)
+    assert picture is not None
+    assert len(README[: picture.end()].split()) <= 400
+
+
+def test_the_lines_of_a_study_name_nothing_that_a_fresh_checkout_lacks() -> None:
+    """They are typed by tests/test_documented_commands.py."""
+    (lines,) = re.findall(r"## Your own study\n\n```\n(.*?)```", README, re.DOTALL)
+    assert not re.search(r"\b[A-Z]{3,}\b", lines), "a word in capitals is to be replaced by the reader"
+    assert "--model pi0-tiny" in lines

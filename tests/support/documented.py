@@ -45,7 +45,9 @@ class Command:
     def words(self) -> list[str]:
         """The line as a shell splits it, from the program on."""
         words = shlex.split(self.text)
-        return words[1:] if words[0] == "./with-uv" else words
+        if words[0] != "./with-uv":
+            return words
+        return words[3:] if words[1] == "--extra" else words[1:]
 
     @property
     def ours(self) -> bool:
