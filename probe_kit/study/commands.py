@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from probe_kit._terminal.console import counter, marked, out, print_json, progress, say
-from probe_kit._terminal.options import AsJson
+from probe_kit._terminal.options import AsJson, EnvWorkers
 
 if TYPE_CHECKING:
     from probe_kit.study import StudyPlan
@@ -31,6 +31,7 @@ def run(
         bool, typer.Option("--dry-run", help="Print the plan. Loads no model and writes nothing.")
     ] = False,
     as_json: AsJson = False,
+    env_workers: EnvWorkers = None,
 ) -> None:
     """Play and ask what a study needs and is not stored yet.
 
@@ -52,7 +53,7 @@ def run(
                 counters[one.cell.name] = counter(bar, one.cell.name)
             counters[one.cell.name](done, planned, outcome)
 
-        failures = conduct_study(plan, tell, lambda failure: say(marked("[red]{}[/]", failure)))
+        failures = conduct_study(plan, tell, lambda one: say(marked("[red]{}[/]", one)), env_workers)
     after = plan_study(study, only)
     _print_plan(after)
     for failure in failures:

@@ -1,7 +1,7 @@
 """Playing of a study in this process: one model after the other, each loaded once for all of its runs."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import DiskSpaceError, ProbeKitError, StoreError
@@ -36,12 +36,14 @@ def conduct_study(
     plan: StudyPlan,
     progress: Progress | None = None,
     failed: Callable[[ModelFailure], None] | None = None,
+    env_workers: int | None = None,
 ) -> list[ModelFailure]:
     """Play and ask all that a plan finds missing; returns the models that failed.
 
     Every run is checked before the first one is played. A model that fails stops itself alone: episodes that are
     committed stay, and the next call resumes after them. progress: called per episode with the run, episodes done
-    and planned, and the outcome. failed: called when a model fails.
+    and planned, and the outcome. failed: called when a model fails. env_workers: processes that simulate, as in
+    `ExtractSettings`.
     Raises DiskSpaceError, StoreError, and whatever stops a single extraction that is no error of probe_kit.
     """
     failures: dict[str, ModelFailure] = {}
@@ -57,7 +59,7 @@ def conduct_study(
             give_up(one, error)
     for model, cells in cells_by_model(missing).items():
         if model not in failures:
-            _play_model(cells, progress, give_up)
+            _play_model(cells, progress, give_up, env_workers)
     return list(failures.values())
 
 
@@ -78,11 +80,12 @@ def _play_model(
     cells: list[PlannedCell],
     progress: Progress | None,
     give_up: Callable[[PlannedCell, ProbeKitError], None],
+    env_workers: int | None,
 ) -> None:
     loaded: dict[str, Any] = {}
     for one in cells:
         try:
-            _play(one, loaded, progress)
+            _play(one, loaded, progress, env_workers)
         except _STOP:
             raise
         except ProbeKitError as error:
@@ -90,9 +93,9 @@ def _play_model(
             return
 
 
-def _play(one: PlannedCell, loaded: dict[str, Any], progress: Progress | None) -> "Run":
+def _play(one: PlannedCell, loaded: dict[str, Any], progress: Progress | None, env_workers: int | None) -> "Run":
     """Make or finish one run. loaded: the model as policy and as VLM, filled on first use."""
-    settings = one.cell.settings_to_play
+    settings = replace(one.cell.settings_to_play, env_workers=env_workers)
     if isinstance(settings, AskSettings) and "answer_model" not in loaded:
         loaded["answer_model"] = load_answer_model(settings)
     if isinstance(settings, ExtractSettings) and settings.model not in SCRIPTED and "policy" not in loaded:

@@ -65,7 +65,9 @@ def states(file: Path) -> dict[str, tuple[str, int]]:
 def test_a_model_that_fails_stops_itself_alone_and_the_rest_is_played_once(file: Path) -> None:
     assert set(states(file).values()) == {("new", 0)}
     told: list[str] = []
-    (failure,) = conduct_study(plan_study(load_study(file)), failed=lambda one: told.append(one.model))
+    (failure,) = conduct_study(
+        plan_study(load_study(file)), failed=lambda one: told.append(one.model), env_workers=0
+    )
     assert (failure.model, failure.run, told) == ("broken", "broken/short", ["broken"])
     assert "nowhere" in failure.reason
     after = {
@@ -76,14 +78,14 @@ def test_a_model_that_fails_stops_itself_alone_and_the_rest_is_played_once(file:
     }
     assert states(file) == after
     files = {path: path.stat().st_mtime_ns for path in file.parent.rglob("*") if path.is_file()}
-    conduct_study(plan_study(load_study(file)))
+    conduct_study(plan_study(load_study(file)), env_workers=0)
     assert {path: path.stat().st_mtime_ns for path in file.parent.rglob("*") if path.is_file()} == files
     place = next(one.location for one in plan_study(load_study(file)).cells if one.cell.name == "idle/dark")
     before = open_run(place).stamp
     sorted((Path(place) / "commits").iterdir())[2].unlink()
     assert open_run(place, allow_partial=True).planned == 4
     assert states(file)["idle/dark"] == ("partial", 3)
-    conduct_study(plan_study(load_study(file), only="light"))
+    conduct_study(plan_study(load_study(file), only="light"), env_workers=0)
     assert states(file) == after
     assert open_run(place).stamp == before
 
@@ -117,6 +119,6 @@ def test_a_policy_is_loaded_once_for_all_of_its_runs(
     text = text.replace('family = "idle"', 'family = "pi0-tiny"\nrandom_weights = true')
     file = tmp_path / "study.toml"
     file.write_text(text, encoding="utf-8")
-    assert [one.model for one in conduct_study(plan_study(load_study(file)))] == ["broken"]
+    assert [one.model for one in conduct_study(plan_study(load_study(file)), env_workers=0)] == ["broken"]
     assert loaded == ["pi0-tiny"]
     assert states(file)["idle/dark"] == states(file)["idle/short"] == ("whole", 4)

@@ -1,0 +1,201 @@
+"""The paper's tables through the code of ours: what agrees, what does not, and what cannot be derived.
+
+Runs are made whose rates are the printed ones; tables of them must give the paper's other numbers.
+"""
+
+from collections.abc import Mapping
+from statistics import fmean
+from typing import Any
+
+import pytest
+
+from probe_kit.retention import RetentionTable, retention_table
+from probe_kit.retention.behaviour.success_rate import Regime, regime
+from probe_kit.retention.rows.row import RetentionRow
+from tests.retention.asked_runs import SaidRun
+from tests.study.paper_runs import paper, run_of
+
+REGIMES = {
+    Regime.KNOWLEDGE: "knowledge",
+    Regime.NO_RELIABLE_KNOWLEDGE: "none",
+    Regime.FAILURE: "failure",
+}
+
+
+@pytest.fixture(scope="module")
+def tables() -> dict[str, Any]:
+    return paper("tables")["tables"]
+
+
+@pytest.fixture(scope="module")
+def derived() -> dict[str, Any]:
+    return paper("recomputed")["derived_unprinted"]
+
+
+@pytest.fixture(scope="module")
+def runs(tables: dict[str, Any]) -> dict[str, SaidRun]:
+    """The 17 systems of the main table, as policies: what is computed of rates is the same for answers."""
+    return {
+        name: run_of(name, rates, tables["items"]["values"]) for name, rates in tables["sr_main"]["values"].items()
+    }
+
+
+@pytest.fixture(scope="module")
+def rows(runs: dict[str, SaidRun]) -> dict[str, RetentionTable]:
+    return {name: retention_table([run]) for name, run in runs.items()}
+
+
+def by_category(table: RetentionTable) -> Mapping[str, RetentionRow]:
+    return {row.category: row for row in table.rows}
+
+
+def test_means_and_normalised_scores_of_17_systems(
+    rows: dict[str, RetentionTable], derived: dict[str, Any]
+) -> None:
+    assert len(rows) == 17
+    for name, table in rows.items():
+        (mean,) = table.means
+        assert mean.success.sr is not None
+        assert 100 * mean.success.sr == pytest.approx(derived["mean_accuracy"][name], abs=0.01)
+        assert mean.success.normalised_score == pytest.approx(derived["normalised_score"][name], abs=0.01)
+
+
+def test_the_margin_of_guessing_is_the_papers(rows: dict[str, RetentionTable], derived: dict[str, Any]) -> None:
+    for category, row in by_category(rows["OpenVLA"]).items():
+        assert row.success.chance_margin_episodes is not None
+        assert 100 * row.success.chance_margin_episodes == pytest.approx(
+            derived["delta_points"][category], abs=0.001
+        )
+        assert row.success.n_episodes == (140 if category == "celebrity" else 300)
+    half = by_category(rows["OpenVLA"])["color"].success.chance_margin_items
+    assert half is not None
+    assert 100 * half == pytest.approx(8.002, abs=0.001)
+
+
+@pytest.mark.parametrize("unit", ["episodes", "items"])
+def test_204_regimes_by_episodes_and_by_items(
+    rows: dict[str, RetentionTable], derived: dict[str, Any], unit: str
+) -> None:
+    found = {}
+    for name, table in rows.items():
+        for category, row in by_category(table).items():
+            own = row.success
+            margin = getattr(own, f"chance_margin_{unit}")
+            assert own.sr is not None
+            named, _ = regime(own.sr, margin, own.share_wrong or 0, own.share_outside or 0)
+            found[name, category] = REGIMES[named]
+    wanted = derived[f"regimes_by_{unit}"]
+    assert len(found) == 204
+    assert [place for place, said in found.items() if wanted[place[0]][place[1]] != said] == []
+
+
+def test_8_of_204_cells_change_their_regime_between_episodes_and_items(
+    rows: dict[str, RetentionTable], derived: dict[str, Any]
+) -> None:
+    """Our table decides by items, as one question has two layouts, and says so where the paper would not."""
+    different = []
+    for name, table in rows.items():
+        for category, row in by_category(table).items():
+            own = row.success
+            assert own.sr is not None
+            assert own.chance_margin_episodes is not None
+            paper_says, _ = regime(
+                own.sr, own.chance_margin_episodes, own.share_wrong or 0, own.share_outside or 0
+            )
+            if paper_says != own.regime:
+                different.append(f"{name} {category} {100 * own.sr:.0f}")
+    assert different == derived["regimes_that_differ"]
+
+
+def test_46_of_48_means_of_left_and_right_are_the_printed_rate(tables: dict[str, Any]) -> None:
+    other = {}
+    for name, sides in tables["left_right"]["values"].items():
+        rates = {category: (own["left"], own["right"]) for category, own in sides.items()}
+        table = retention_table([run_of(name, rates, tables["items"]["values"])])
+        for category, row in by_category(table).items():
+            own = row.success
+            assert own.sr is not None
+            assert (100 * (own.sr_left or 0), 100 * (own.sr_right or 0)) == pytest.approx(rates[category])
+            printed = tables["sr_main"]["values"][name][category]
+            if abs(100 * own.sr - printed) > 1:
+                other[name, category] = (printed, 100 * own.sr)
+    assert other == {
+        ("SpatialVLA", "time"): (46, pytest.approx(47.5)),
+        ("Magma", "shape"): (81, pytest.approx(83.5)),
+    }
+
+
+GROUPS = {
+    "co-trained": ["Magma", "Xiaomi-Robotics-R0", "InternVLA-M1"],
+    "robot-only": ["OpenVLA", "SpatialVLA", "pi0"],
+}
+
+
+def test_co_trained_minus_robot_only_is_10_points_and_p_over_models_a_fifth(
+    runs: dict[str, SaidRun], derived: dict[str, Any]
+) -> None:
+    table = retention_table({group: [runs[name] for name in names] for group, names in GROUPS.items()})
+    *each, mean = table.differences
+    assert mean.category == "mean"
+    assert mean.sr is not None
+    assert 100 * mean.sr == pytest.approx(10.06, abs=0.005)
+    found = {row.category: 100 * (row.sr or 0) for row in each}
+    assert found == pytest.approx(derived["rq5_difference_by_category"], abs=0.005)
+    assert sum(gain > 0 for gain in found.values()) == 11
+    assert mean.sr_models is not None
+    assert (mean.sr_models.p, mean.sr_models.smallest_p) == (pytest.approx(0.2), pytest.approx(0.1))
+
+
+def test_without_magma_the_difference_is_half(rows: dict[str, RetentionTable]) -> None:
+    means = {name: table.means[0].success.sr or 0 for name, table in rows.items()}
+    co_trained, robot_only = ([means[name] for name in GROUPS[group]] for group in ("co-trained", "robot-only"))
+    assert 100 * (fmean(co_trained[1:]) - fmean(robot_only)) == pytest.approx(5.51, abs=0.005)
+
+
+def test_what_fine_tuning_changes(runs: dict[str, SaidRun], derived: dict[str, Any]) -> None:
+    names = ["OpenVLA (SFT)", "OpenVLA (RL)", "OpenVLA"]
+    table = retention_table([runs[name] for name in names], against="OpenVLA")
+    for name, printed in zip(names[:2], (-6.17, -1.08), strict=True):
+        found = {row.category: 100 * (row.sr or 0) for row in table.differences if row.group == name}
+        assert found["mean"] == pytest.approx(printed, abs=0.005)
+        assert found == pytest.approx(derived[f"rq6 {name} - OpenVLA"], abs=0.005)
+
+
+def test_ablations_minus_the_default_are_paired_on_the_four_categories_in_common(
+    tables: dict[str, Any], runs: dict[str, SaidRun], derived: dict[str, Any]
+) -> None:
+    """The main run has twelve categories, an ablation four: differences are of these, and the rest is left out."""
+    checked = 0
+    for row in tables["environment_ablations"]["rows"]:
+        name = f"{row['ablation']} {row['setting']} {row['model']}"
+        if name not in derived["ablation_minus_default"] or row["model"] != "pi0":
+            continue
+        ablated = run_of(name, row["values"], tables["items"]["values"])
+        table = retention_table([ablated, runs[row["model"]]])
+        found = {one.category: 100 * (one.sr or 0) for one in table.differences if one.category != "mean"}
+        assert found == pytest.approx(derived["ablation_minus_default"][name], abs=0.005)
+        assert all(one.paired and one.n_items == one.of_items for one in table.differences)
+        checked += 1
+    assert checked == 5
+
+
+@pytest.mark.parametrize(("vlm", "policy"), [("Prismatic-VLM-7B", "OpenVLA"), ("Paligemma-3B", "pi0")])
+def test_vlm_minus_vla_of_the_two_policies_whose_source_is_there(
+    tables: dict[str, Any], runs: dict[str, SaidRun], derived: dict[str, Any], vlm: str, policy: str
+) -> None:
+    asked = run_of(vlm, tables["sr_main"]["values"][vlm], tables["items"]["values"], asked=True)
+    table = retention_table([asked, runs[policy]], vlm_vla=True)
+    found = {row.category: 100 * row.difference for row in table.vlm_vla if row.category != "mean"}
+    assert found == pytest.approx(derived["gap_pairs"][f"{vlm} - {policy}"], abs=0.005)
+    assert all(row.paired for row in table.vlm_vla)
+
+
+def test_the_six_retentions_cannot_be_derived_from_what_is_printed(tables: dict[str, Any]) -> None:
+    """They are means of ratios per category, which stand in a figure only; ratios of printed means are others."""
+    values = tables["probing_retention"]["values"]
+    assert len(values) == 6
+    for row in values.values():
+        least, most = (
+            (row["action"] + sign * 0.005 - 50) / (row["prefix"] - sign * 0.005 - 50) for sign in (-1, 1)
+        )
+        assert not least <= row["retention"] <= most
