@@ -1,7 +1,8 @@
 """Make the tables and figures of README and docs that come from the demo: `python scripts/make_docs.py FOLDER`.
 
-FOLDER: what `probe-kit demo --compare --out FOLDER` makes; what is not there is made first (3 to 15 minutes on two
+FOLDER: what `probe-kit demo --compare --out FOLDER` makes; what is not there is made first (5 to 20 minutes on two
 cores). The numbers go to `docs/demo.json`, and from there, by `docs_tables`, into the pages; a test compares them.
+The sample report is that of the demo alone: its probes are fitted again, without the control of `--compare`.
 `--trained-only` makes again what concerns the trained policy alone and keeps the other organisms' stored numbers.
 """
 
