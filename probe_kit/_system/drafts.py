@@ -35,12 +35,15 @@ def write_whole(path: Path, text: str) -> None:
 def _own_folder(path: Path) -> Iterator[Path]:
     while True:
         folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=_prefix(path), suffix=_SUFFIX))
-        handle = os.open(folder, os.O_RDONLY)
+        try:
+            handle = os.open(folder, os.O_RDONLY)
+        except FileNotFoundError:  # another process took it for an abandoned one before it was opened
+            continue
         with suppress(OSError):  # some network file systems lock no folder; there nothing is removed either
             fcntl.flock(handle, fcntl.LOCK_SH)
         if folder.exists():
             break
-        os.close(handle)  # another process took it for an abandoned one before it was locked
+        os.close(handle)  # likewise, before it was locked
     try:
         yield folder
     finally:

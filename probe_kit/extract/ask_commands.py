@@ -50,7 +50,8 @@ def ask(
     to compare with. Every question is asked in both orders of the options. Answers are read from the text and from
     the logits of the options. Compare with policies by `probe-kit retention ASKED… ACTED…` or `probe-kit stages`.
 
-    The same command resumes interrupted runs. Other settings in the same folder are an error.
+    The same command resumes interrupted runs. With more items or categories they grow and keep what they have.
+    Other settings in the same folder are an error.
     """
     chosen = own.settings_of(locals())
     from probe_kit.extract.extraction import prepare_asks

@@ -61,7 +61,8 @@ def extract(
 ) -> None:
     """Run a model in every episode and store its activations.
 
-    The same command resumes an interrupted run. Other settings in the same folder are an error.
+    The same command resumes an interrupted run. With more items, categories or wordings the run grows and keeps
+    what it has. Other settings in the same folder are an error.
 
     \b
     probe-kit extract --model pi0-tiny --items 12 --out runs/mine
@@ -88,10 +89,12 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     from rich.table import Table
 
     from probe_kit.extract.needs import space_needed
+    from probe_kit.extract.store.growth import growth_at
     from probe_kit.extract.store.locations.disk import in_units
 
     plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()
-    needed = in_units(sum(space_needed(plan, extraction.settings).values()))
+    growth = growth_at(location, plan.to_json()["episodes"])
+    needed = in_units(sum(space_needed(extraction.further_plan(location), extraction.settings).values()))
     weights = (identity["weights_sha256"] or "scripted")[:12]
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
@@ -100,6 +103,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         "categories": ", ".join(plan.suite.categories),
         "scene": _describe_scene(extraction.settings.scene),
         "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
+        **({"grows": growth.words} if growth and growth.words else {}),
         **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
         "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
         **(

@@ -2,15 +2,18 @@
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.installing import install_command
 from probe_kit.errors import DiskSpaceError, MissingExtraError, UsageError
+from probe_kit.extract.plan import plan_episodes, plan_rows
 from probe_kit.extract.run_layout import RUN_FILE
 from probe_kit.extract.settings import AskSettings, RunSettings, check_other_settings
+from probe_kit.extract.store.growth import further_rows
+from probe_kit.extract.vqa.phrases import phrases
 from probe_kit.hashing import canonical_json
 
 if TYPE_CHECKING:
@@ -57,9 +60,9 @@ def check_words(settings: RunSettings, texts: Iterable[str], scripted: tuple[str
 
 
 def check_place(settings: RunSettings, suite: "Suite", location: "Location") -> None:
-    """Refuse a place that cannot be written, or where a run with other settings lies.
+    """Refuse a place that cannot be written, or where a run lies that has other settings or cannot grow so.
 
-    Only settings that are known without the model are compared; the writer compares all of them.
+    Only what is known without the model is compared; the writer compares all of it.
     Raises UsageError, DiskSpaceError for a read-only disk, SettingsMismatchError, or RunDamagedError if what lies
     there was changed.
     """
@@ -71,22 +74,39 @@ def check_place(settings: RunSettings, suite: "Suite", location: "Location") -> 
             return
         root = read_root(location)
         root.check_continuable()
-        stored = root.settings
-    known = {name: value for name, value in _known_settings(settings, suite).items() if name in stored}
-    check_other_settings({name: stored[name] for name in known}, known, str(location))
+        stored = root.own_settings
+        known = {name: value for name, value in _known_settings(settings, suite).items() if name in stored}
+        check_other_settings({name: stored[name] for name in known}, known, str(location))
+        episodes = plan_episodes(suite, settings.seed, settings.asked_wordings, asked_objects(settings, suite))
+        if root.plan:
+            further_rows(root.plan, plan_rows(suite, episodes), str(location))
 
 
 def _known_settings(settings: RunSettings, suite: "Suite") -> dict[str, Any]:
     chosen = {name: value for name, value in settings.choices().items() if name not in _OF_THE_CHECKPOINT}
     known = {
         **chosen,
-        "suite": {"identity": suite.identity, "content_sha256": suite.content_sha256},
-        "categories": list(suite.categories),
-        "items": len(suite.items),
+        "suite": suite_name(suite),
         "scene": settings.scene.to_json(),
     }
     as_stored: dict[str, Any] = json.loads(canonical_json(known))
     return as_stored
+
+
+def suite_name(suite: "Suite") -> dict[str, str]:
+    """What a run's identity says of its suite; items are compared one by one, by their content."""
+    return {"name": suite.name, "version": suite.version}
+
+
+def asked_objects(settings: RunSettings, suite: "Suite") -> Mapping[str, str]:
+    """By item, what a question asks for where this is not the object of the instruction; empty otherwise.
+
+    Raises UsageError for items without such a phrase.
+    """
+    if not isinstance(settings, AskSettings):
+        return {}
+    named = phrases(suite, settings.query, settings.seed)
+    return {} if settings.query == "target" else {item: phrase.with_article for item, phrase in named.items()}
 
 
 def _check_writable(location: "Location") -> None:

@@ -1,5 +1,6 @@
 """Extraction: workers play every episode that is not committed; then the run is sealed."""
 
+import json
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -9,11 +10,20 @@ from typing import TYPE_CHECKING
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import EpisodesFailedError, StoreError
 from probe_kit.extract.needs import space_needed
+from probe_kit.extract.plan import Plan
 from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_answer_model
 from probe_kit.extract.rollout.events import Done, Event
 from probe_kit.extract.run_layout import RUN_FILE
-from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
+from probe_kit.extract.settings import (
+    AskSettings,
+    ExtractSettings,
+    RunSettings,
+    check_other_settings,
+    run_label,
+)
 from probe_kit.extract.store.format.commits import failure_key
+from probe_kit.extract.store.format.root import read_root
+from probe_kit.extract.store.growth import further_rows
 from probe_kit.extract.store.label import label_run
 from probe_kit.extract.store.locations.disk import check_if_full
 from probe_kit.extract.store.locations.locate import locate
@@ -25,6 +35,7 @@ from probe_kit.extract.workers.local import run_here
 from probe_kit.extract.workers.processes import run_in_processes
 from probe_kit.extract.workers.ray import run_on_ray
 from probe_kit.extract.workers.scheduler import Scheduler
+from probe_kit.hashing import canonical_json
 
 if TYPE_CHECKING:
     from probe_kit.hooks import AnswerModel, Policy
@@ -42,8 +53,9 @@ class Extraction(Prepared):
     """A prepared extraction, ready to run; so far nothing is written."""
 
     def run(self, out: Path | str | Location, force: bool = False, progress: Progress | None = None) -> Run:
-        """Play and commit every episode that is not committed yet, seal the run and open it.
+        """Play and commit every episode of the plan that is not committed yet, seal the run and open it.
 
+        A run that lacks episodes of the plan grows by them. One that has more than these stays as it is.
         progress: called with (episodes done, episodes planned, outcome of the last one); by default a bar in a
         notebook, nothing elsewhere.
         Raises SettingsMismatchError or DiskSpaceError before anything is written, StoreError if `out` lies in an
@@ -51,9 +63,9 @@ class Extraction(Prepared):
         is wrong with all episodes at once. Committed episodes stay; the same call resumes after them.
         """
         location = locate(out)
-        if not force and not location.exists(RUN_FILE):
-            check_if_full(space_needed(self.plan, self.settings), location)
         with location.in_words():
+            if not force and (further := self.further_plan(location)).episodes:
+                check_if_full(space_needed(further, self.settings), location)
             writer = self.writer(location)
             with writer.owned():
                 self._check_exclusive(writer)
@@ -65,6 +77,20 @@ class Extraction(Prepared):
                     self._play(writer, remaining, progress or notebook_progress("episodes"))
                 seal(location)
         return open_run(location)
+
+    def further_plan(self, location: Location) -> Plan:
+        """The plan of the episodes that the run at `location` does not plan yet: all of them where there is none.
+
+        Raises SettingsMismatchError if the run there cannot grow by this plan, and RunDamagedError.
+        """
+        if not location.exists(RUN_FILE):
+            return self.plan
+        root = read_root(location)
+        root.check_continuable()
+        check_other_settings(root.own_settings, json.loads(canonical_json(self.identity())), str(location))
+        rows = further_rows(root.plan, self.plan.to_json()["episodes"], str(location))
+        added = {row["episode_id"] for row in rows}
+        return self.plan.only(one for one in self.plan.episodes if one.episode.episode_id in added)
 
     def _check_exclusive(self, writer: RunWriter) -> None:
         if writer.several_may_write():
@@ -87,7 +113,7 @@ class Extraction(Prepared):
                 failed = scheduler.given_up[event.number]
                 writer.give_up(failed.number, failed.reason, failed.traceback)
             if len(scheduler.given_up) >= HOPELESS and not scheduler.done:
-                raise self._failure(scheduler, writer.location)
+                raise self._failure(scheduler, writer)
 
         if self.settings.ray:
             run_on_ray(self.settings, writer.location.address, scheduler, on_event)
@@ -97,16 +123,16 @@ class Extraction(Prepared):
             run_here(self, writer, scheduler, on_event)
         if scheduler.given_up:
             seal(writer.location)
-            raise self._failure(scheduler, writer.location)
+            raise self._failure(scheduler, writer)
 
-    def _failure(self, scheduler: Scheduler, location: Location) -> EpisodesFailedError:
+    def _failure(self, scheduler: Scheduler, writer: RunWriter) -> EpisodesFailedError:
         error = EpisodesFailedError(
             f"{len(scheduler.given_up)} episodes failed twice and were given up; {len(scheduler.done)} others "
             "were finished and are kept. The same command tries them again; --partial reads the run without them"
         )
         for number, failed in scheduler.given_up.items():
-            where = f" (traceback in {location}/{failure_key(number)})" if failed.traceback else ""
-            error.add_note(f"{self.plan.episodes[number].episode.episode_id}: {failed.reason}{where}")
+            where = f" (traceback in {writer.location}/{failure_key(number)})" if failed.traceback else ""
+            error.add_note(f"{writer.plan.episode(number).episode.episode_id}: {failed.reason}{where}")
         return error
 
 

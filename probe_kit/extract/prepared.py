@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.calibration import Calibration, calibrated
-from probe_kit.extract.early import check_model, check_place, check_words
+from probe_kit.extract.early import asked_objects, check_model, check_place, check_words, suite_name
 from probe_kit.extract.plan import Plan, instructions_of, make_plan, plan_episodes, skipped_items
 from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.rollout.answer_controller import AnswerController
@@ -41,16 +41,15 @@ class Prepared:
     calibration: Calibration | None = None
 
     def identity(self) -> dict[str, Any]:
-        """Everything that names the stored numbers; two runs with equal identity are interchangeable."""
-        suite = self.plan.suite
+        """Everything that decides the numbers of an episode: neither which are selected, nor the label.
+
+        Runs with equal identity have equal numbers in the episodes that both have.
+        """
         return {
             **self.settings.choices(),
             **self.card,
-            "suite": {"identity": suite.identity, "content_sha256": suite.content_sha256},
-            "categories": list(suite.categories),
-            "items": len(suite.items),
+            "suite": suite_name(self.plan.suite),
             "scene": self.settings.scene.to_json(),
-            **({} if self.plan.wordings is None else {"wordings": self.plan.wordings}),
             **(protocol_identity(self.settings) if isinstance(self.settings, ExtractSettings) else {}),
         }
 
@@ -67,8 +66,13 @@ class Prepared:
         return RunWriter(location, self.plan, self.identity(), self.provenance(), run_label(self.settings))
 
     def default_name(self) -> str:
-        """Folder name that repeats for the same settings, so that the same command finds its run again."""
-        name = [self.settings.model, sha256_json(self.identity())[:8]]
+        """Folder name that repeats for the same settings, so that the same command finds its run again.
+
+        A command with more items finds it too; one with other categories, wordings or another suite does not.
+        """
+        suite, wordings = self.plan.suite, self.settings.asked_wordings
+        named = [self.identity(), suite.whole.content_sha256, suite.categories, wordings]
+        name = [self.settings.model, sha256_json(named)[:8]]
         if isinstance(self.settings, AskSettings):
             name = ["ask", name[0], self.settings.short_name, name[1]]
         return "-".join(name)
@@ -93,8 +97,8 @@ def load(
     suite = check_run(settings, location, loaded=not (answer_model is None and policy is None))
     if not rehearsed:
         run_preflight(settings.scene, plan_episodes(suite, settings.seed))
-    wordings = settings.asked_wordings
-    asked = list(plan_episodes(suite, settings.seed, wordings))
+    wordings, objects = settings.asked_wordings, asked_objects(settings, suite)
+    asked = list(plan_episodes(suite, settings.seed, wordings, objects))
     if wordings is not None:
         skipped_items(suite, asked, wordings)
     if isinstance(settings, AskSettings):
@@ -102,7 +106,9 @@ def load(
     else:
         controller = _acting(settings, instructions_of(asked), policy)
     with_tokens = settings.tokens == "all"
-    plan = make_plan(suite, controller.streams, settings.seed, settings.stored_calls, with_tokens, wordings)
+    plan = make_plan(
+        suite, controller.streams, settings.seed, settings.stored_calls, with_tokens, wordings, objects
+    )
     if settings.calibrate and isinstance(controller, PolicyController):
         settings, calibration = calibrated(settings, controller, plan)
         return Prepared(settings, plan, controller.identity, controller, calibration)

@@ -4,7 +4,7 @@ RUN/
   run.json           the root: settings, streams, hashes of the plan and of all metadata, and its own
   label.json         what tables call the run; may be changed, see `label`
   left-out.json      only in a copy without activations: what it left out, see `left_out`
-  plan.json          the episodes in order, each with its item's content hash, and the suite's parent
+  plan/<n>.json      the episodes in order, each with its item's content hash; a further record when the run grows
   commits/<n>.json   one per finished episode, written last: hashes of its objects, and its own
   times/<n>.json     seconds that an episode took, which no other hash covers, see `seconds`
   failed/<n>.json    why an episode was given up; removed when it is tried again
@@ -28,12 +28,14 @@ import numpy as np
 
 from probe_kit.hooks.contract.sites import QUANTITIES, Part, Site, Stream
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 """The one that is written."""
-READABLE_SCHEMAS = (3, SCHEMA_VERSION)
+READABLE_SCHEMAS = (3, 4, SCHEMA_VERSION)
 """Those that are read. In runs of former ones no hash bound everything to the root."""
 TOKEN_BLOCK = 128
-RUN_FILE, PLAN_FILE, CERTIFICATE_FILE = "run.json", "plan.json", "certificate.json"
+RUN_FILE, PLANS, CERTIFICATE_FILE = "run.json", "plan", "certificate.json"
+FORMER_PLAN_FILE = "plan.json"
+"""Where runs of schemas 3 and 4 have their plan, which never grows."""
 LABEL_FILE, TIMES, LEFT_OUT_FILE = "label.json", "times", "left-out.json"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
 FRAMES, CERTIFICATES, SEALED, PROBES, PROVENANCE = "frames", "certificates", "sealed", "probes", "provenance"

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, get_args
 
@@ -411,23 +410,6 @@ def check_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: s
             f"{where} holds a run with other settings:\n" + "\n".join(lines) + "\n"
             "Choose another --out, or repeat the stored settings to continue it"
         )
-
-
-def check_other_plan(stored: Sequence[Mapping[str, Any]], asked: Sequence[Mapping[str, Any]], where: str) -> None:
-    """Raise SettingsMismatchError unless a stored plan has the same episodes, as far as both describe them.
-
-    The settings decide the plan, but only within one version of probe_kit.
-    """
-    nothing: Mapping[str, Any] = {}
-    for was, now in zip_longest(stored, asked, fillvalue=nothing):
-        for part in sorted(was.keys() & now.keys()) or ["episode_id"]:
-            if was.get(part) != now.get(part):
-                name = was.get("episode_id") or now.get("episode_id")
-                raise SettingsMismatchError(
-                    f"{where} plans {len(stored)} episodes, this command {len(asked)}, and the first that differs "
-                    f"is {name}: its {part} is stored as {was.get(part)!r}, here {now.get(part)!r}. Continue "
-                    "the run with the version of probe_kit that began it, or choose another --out"
-                )
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:

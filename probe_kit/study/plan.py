@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from probe_kit.errors import ProbeKitError, RunNotFoundError, UsageError
+from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, UsageError
 from probe_kit.extract import open_run
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.study.cells import Cell
@@ -140,7 +140,7 @@ def _planned(cell: Cell, out: str) -> PlannedCell:
         return PlannedCell(cell, location, "skipped", 0, f"skipped: {cell.unavailable}")
     try:
         run = open_run(locate(location), allow_partial=True)
-    except RunNotFoundError:
+    except (RunNotFoundError, RunIncompleteError):  # killed before it had a plan
         return PlannedCell(cell, location, "new", 0, "new")
     except ProbeKitError as error:
         return PlannedCell(cell, location, "damaged", 0, f"damaged: {error}")

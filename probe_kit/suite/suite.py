@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,13 +33,17 @@ def missing_categories(items: Iterable[Item]) -> list[str]:
 
 @dataclass(frozen=True)
 class Suite:
-    """Items with a name, a version and a content hash; `card` is what `suite.json` says about them."""
+    """Items with a name, a version and a content hash; `card` is what `suite.json` says about them.
+
+    selected_from: the suite that `select` chose these items from, None for a whole suite.
+    """
 
     name: str
     version: str
     items: tuple[Item, ...]
     folder: Path
     card: dict[str, Any]
+    selected_from: "Suite | None" = field(default=None, compare=False, repr=False)
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{category} {count}" for category, count in count_by_category(self.items).items())
@@ -59,6 +63,11 @@ class Suite:
     def parent(self) -> str | None:
         """Content hash of the suite this one was selected from, None for a whole suite."""
         return self.card.get("parent")
+
+    @property
+    def whole(self) -> "Suite":
+        """The suite that this one was selected from, itself for a whole suite."""
+        return self if self.selected_from is None else self.selected_from.whole
 
     @property
     def categories(self) -> tuple[str, ...]:
@@ -88,7 +97,7 @@ class Suite:
             "missing": missing_categories(items),
             "content_sha256": content_sha256(items),
         }
-        return Suite(self.name, self.version, items, self.folder, card)
+        return Suite(self.name, self.version, items, self.folder, card, selected_from=self)
 
     def _first_items(self, category: str, count: int | None) -> list[Item]:
         items = [item for item in self.items if item.category == category]

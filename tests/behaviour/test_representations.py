@@ -25,7 +25,8 @@ from tests.support.reading import readings
 from tests.support.representations import WAYS, carrying, rewritten
 
 Edit = Callable[[dict[str, Any]], object]
-COMMIT, CERTIFIED, TIMES = "commits/00000004.json", "certificates/*.json", "times/00000004.json"
+PLAN, COMMIT, TIMES = "plan/*.json", "commits/00000004.json", "times/00000004.json"
+CERTIFIED = "certificates/*.json"
 PROBES, INTERVENTION = "probes/*/settings.json", "interventions/*/settings.json"
 
 
@@ -57,10 +58,22 @@ CHANGES: list[tuple[str, str, Edit]] = [
     ("run.json", "another suite", lambda card: card["settings"]["suite"].update(identity="other@1#0")),
     ("run.json", "an older schema", part("schema_version", 2)),
     ("run.json", "the schema before", part("schema_version", 3)),
-    ("run.json", "no hash of the plan", lambda card: card["objects"].pop("plan.json")),
+    ("run.json", "no hash of metadata", lambda card: card["objects"].popitem()),
     ("run.json", "no hashes", lambda card: card["objects"].clear()),
     ("run.json", "another hash of the settings", part("settings_sha256", "0" * 64)),
+    (PLAN, "the same", same),
+    (PLAN, "another run", part("run", "0" * 64)),
+    (PLAN, "another place", part("record", 1)),
+    (PLAN, "another plan before", part("former", "0" * 64)),
+    (PLAN, "another label", lambda plan: plan["episodes"][0].update(side_correct="up")),
+    (PLAN, "another category", lambda plan: plan["episodes"][1].update(category="shape")),
+    (PLAN, "another order", lambda plan: plan["order"].reverse()),
+    (PLAN, "an episode less", lambda plan: (plan["episodes"].pop(), plan["order"].remove(max(plan["order"])))),
+    (PLAN, "an episode twice", lambda plan: plan["order"].append(0)),
+    (PLAN, "another suite", lambda plan: plan["selection"]["suite"].update(identity="other@1#0")),
+    (PLAN, "tokens of arrays", lambda plan: plan["tokens"].update(backbone=900)),
     (COMMIT, "the same", same),
+    (COMMIT, "another plan", part("plan", "0" * 64)),
     (COMMIT, "another outcome", lambda commit: commit["outcome"].update(outcome="correct", cube_x=9.0)),
     (COMMIT, "another place", lambda commit: commit["outcome"].update(side_placed="left", cube_y=0.5)),
     (COMMIT, "another episode", part("episode", 5)),
@@ -147,7 +160,7 @@ def changed(run: Path, pattern: str, edit: Edit) -> tuple[Path, dict[str, Any], 
 
 def test_there_are_changes_of_every_kind_of_record() -> None:
     assert len(CHANGES) > 50
-    assert len({pattern for pattern, _, _ in CHANGES}) == 13
+    assert len({pattern for pattern, _, _ in CHANGES}) == 14
     assert len(WAYS) > 12
 
 
@@ -203,8 +216,8 @@ def test_a_changed_record_with_its_own_hash_computed_anew_is_named(
     assert problems
 
 
-@pytest.mark.parametrize("pattern", ["run.json", COMMIT, "label.json", TIMES, "sealed/*.json", "certificate.json",
-                                     CERTIFIED, "provenance/*.json", "failed/*.json"])  # fmt: skip
+@pytest.mark.parametrize("pattern", ["run.json", PLAN, COMMIT, "label.json", TIMES, "sealed/*.json", CERTIFIED,
+                                     "certificate.json", "provenance/*.json", "failed/*.json"])  # fmt: skip
 @pytest.mark.parametrize("way", ["leading space", "indented by json.dump", "two hashes"])
 def test_a_run_with_a_record_in_other_bytes_does_not_open(run: Path, pattern: str, way: str) -> None:
     path, content, kept = changed(run, pattern, same)

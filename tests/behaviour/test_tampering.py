@@ -93,9 +93,9 @@ def assert_found(run: Path, *names: str, deep: bool = False) -> None:
          "dropped episodes", "exchanged numbers", "another instruction"],
 )  # fmt: skip
 def test_a_changed_plan_is_found(run: Path, change: Callable[[Any], object]) -> None:
-    edit(run / "plan.json", lambda plan: change(plan["episodes"]))
-    assert_found(run, "plan.json")
-    with pytest.raises(RunDamagedError, match=r"plan\.json"):
+    edit(run / "plan/00000000.json", lambda plan: change(plan["episodes"]))
+    assert_found(run, "plan/00000000.json")
+    with pytest.raises(RunDamagedError, match=r"plan/00000000\.json"):
         retention_table([open_run(run)])
 
 
@@ -166,7 +166,7 @@ def test_a_changed_root_is_found(run: Path, change: Edit) -> None:
 
 def test_the_root_of_another_run_is_found(run: Path, other: Path) -> None:
     shutil.copy(other / "run.json", run / "run.json")
-    assert_found(run, "plan.json")
+    assert_found(run, "plan/00000000.json")
 
 
 # -- commits -----------------------------------------------------------------------------------------------
@@ -589,7 +589,9 @@ def test_what_a_commit_names_outside_of_its_run_is_not_there(run: Path, tmp_path
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes in this file system")
-@pytest.mark.parametrize("key", ["plan.json", "commits/00000002.json", "data.zarr/zarr.json", "certificate.json"])
+@pytest.mark.parametrize(
+    "key", ["plan/00000000.json", "commits/00000002.json", "data.zarr/zarr.json", "certificate.json"]
+)
 def test_a_pipe_or_a_device_in_the_place_of_a_file_is_not_waited_for(run: Path, key: str) -> None:
     (run / key).unlink()
     os.mkfifo(run / key)
@@ -607,7 +609,7 @@ def test_copies_that_lie_about_change_nothing_and_are_named(run: Path, little_ru
     probes = stored_probes(run)[0]
     names = (
         "run.json",
-        "plan.json",
+        "plan/00000000.json",
         "commits/00000003.json",
         "certificate.json",
         "data.zarr/expert/pooled/zarr.json",

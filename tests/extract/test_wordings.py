@@ -47,11 +47,12 @@ def test_every_item_is_planned_in_every_wording_that_it_has_on_the_same_seeds(su
 
 def test_a_run_without_the_option_is_what_it_was(suite):
     plain = prepare(ExtractSettings("expert", suite=suite.folder, scene=SHORT))
-    assert "wordings" not in plain.identity()
+    assert plain.plan.wordings is None
     assert not [row for row in (e.to_json() for e in plain.plan.episodes) if "wording" in row]
     asked = prepare(ExtractSettings("expert", suite=suite.folder, scene=SHORT, wordings=("knowledge",)))
-    assert asked.identity()["wordings"]["names"] == ["knowledge"]
-    assert {**asked.identity(), "wordings": None} == {**plain.identity(), "wordings": None}
+    assert asked.plan.selection["wordings"]["names"] == ["knowledge"]
+    assert asked.identity() == plain.identity()
+    assert asked.default_name() != plain.default_name()
 
 
 def test_a_wording_that_no_item_has_is_refused_before_anything_is_played(suite):

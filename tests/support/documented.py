@@ -20,7 +20,7 @@ NOT_COMMANDS = {
     ("docs/causal.md", "RUN/interventions/<key>/"): "a tree of files",
     ("docs/concepts.md", "suite ──► env ──► extract"): "a diagram",
     ("docs/storage.md", "RUN/"): "a tree of files",
-    ("docs/storage.md", "run.json ── plan.json"): "a diagram",
+    ("docs/storage.md", "run.json ── zarr.json"): "a diagram",
     (
         "docs/suite.md",
         "instruction,correct,wrong",

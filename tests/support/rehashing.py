@@ -8,8 +8,8 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from probe_kit.extract.store.format.arrays import at_extent, inner_chunks
 from probe_kit.extract.store.format.hashes import BLOCK_BYTES, HASH, Sum, as_record, block_digest
-from probe_kit.extract.store.format.shards import inner_chunks
 from probe_kit.hashing import sha256_json
 
 
@@ -18,9 +18,16 @@ def rehash(run: Path) -> None:
     shutil.rmtree(run / "columns.zarr", ignore_errors=True)
     shutil.rmtree(run / "sealed", ignore_errors=True)
     root = _content(run / "run.json")
-    objects = [run / "plan.json", *sorted((run / "data.zarr").rglob("zarr.json"))]
-    root["objects"] = {path.relative_to(run).as_posix(): _sum(path, "").to_json() for path in objects}
+    metadata = sorted((run / "data.zarr").rglob("zarr.json"))
+    root["objects"] = {
+        path.relative_to(run).as_posix(): Sum.of(at_extent(path.read_bytes(), 0)).to_json() for path in metadata
+    }
     identity = _write(run / "run.json", root)
+    former, plans = None, {}
+    for path in sorted((run / "plan").glob("*.json")):
+        plan = {**_content(path), "run": identity, "former": former}
+        former = _write(path, plan)
+        plans |= {row["episode"]: former for row in plan["episodes"]}
     for path in [run / "label.json", *sorted((run / "times").glob("*.json"))]:
         _write(path, {**_content(path), "run": identity})
     for path in sorted((run / "commits").glob("*.json")):
@@ -30,7 +37,7 @@ def rehash(run: Path) -> None:
             for key, known in commit["objects"].items()
             if (run / "data.zarr" / key).is_file()
         }
-        _write(path, {**commit, "run": identity})
+        _write(path, {**commit, "run": identity, "plan": plans[commit["episode"]]})
     for path in [run / "certificate.json", *sorted((run / "certificates").glob("*.json"))]:
         certificate = {**_content(path), "run": identity}
         path.unlink()

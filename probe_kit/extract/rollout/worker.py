@@ -77,14 +77,14 @@ class Worker:
     def _make_buffers(self) -> EpisodeBuffers:
         settings, controller = self._settings, self._controller
         with_tokens = settings.tokens == "all"
-        return EpisodeBuffers(controller.streams, settings.stored_calls, with_tokens, controller.on_gpu)
+        return EpisodeBuffers(self._writer.streams, settings.stored_calls, with_tokens, controller.on_gpu)
 
     def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
         """EpisodeLoop what `next_number` gives until it gives None; an event per episode, when it is committed."""
 
         def next_episode() -> PlannedEpisode | None:
             number = next_number()
-            return None if number is None else self._writer.plan.episodes[number]
+            return None if number is None else self._writer.plan.episode(number)
 
         controller, stages, ring = self._controller, self._stages, self._ring
         playing: Iterable[Rollout | Failure]

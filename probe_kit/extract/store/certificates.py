@@ -13,7 +13,8 @@ from probe_kit.errors import RunDamagedError
 from probe_kit.extract.run_layout import CERTIFICATE_FILE, CERTIFICATES
 from probe_kit.extract.store.format.commits import create_once
 from probe_kit.extract.store.format.hashes import HASH, expect, read_record
-from probe_kit.extract.store.format.root import RESTORE, Root
+from probe_kit.extract.store.format.plans import RESTORE
+from probe_kit.extract.store.format.root import Root
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import Provenance, name_of
 from probe_kit.hashing import sha256_json

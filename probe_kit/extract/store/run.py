@@ -34,7 +34,8 @@ from probe_kit.extract.store.format.commits import (
     stamp_of,
 )
 from probe_kit.extract.store.format.hashes import Sum
-from probe_kit.extract.store.format.root import RESTORE, read_root
+from probe_kit.extract.store.format.plans import RESTORE, while_growing
+from probe_kit.extract.store.format.root import read_root
 from probe_kit.extract.store.format.rows import Rows, TokenBlock, role_mask, token_blocks
 from probe_kit.extract.store.format.trajectories import Trajectories, has_trajectories, names_trajectory
 from probe_kit.extract.store.label import read_label
@@ -70,7 +71,7 @@ def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
     Raises RunNotFoundError if it is none, RunIncompleteError if it is unfinished, RunDamagedError if its schema
     is another one, a committed object is missing, or plan, metadata or any record is not what was written.
     """
-    run = Run(locate(path))
+    run = read_run(locate(path))
     run.check_records()
     done = len(run.episodes)
     if done < run.planned and not allow_partial:
@@ -80,6 +81,17 @@ def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
             "or accept what is there (--partial, allow_partial=True)"
         )
     return run
+
+
+def read_run(location: Location) -> "Run":
+    """The run at `location`, its plan and its commits read together, finished or not. Raises as `open_run`."""
+
+    def read() -> Run:
+        run = Run(location)
+        _ = run.stamp
+        return run
+
+    return while_growing(location, read)
 
 
 class Run:
@@ -99,6 +111,10 @@ class Run:
         self.location, self.wording, self.item_ids = location, wording, item_ids
         self.root = read_root(location)
         self.root.check()
+        if not self.root.plan:
+            raise RunIncompleteError(
+                f"{location} was begun and has no plan yet. Run the same `probe-kit extract` again"
+            )
         self.settings: dict[str, Any] = self.root.settings
         self.settings_sha256: str = self.root.card["settings_sha256"]
         self._streams = self.root.streams
@@ -529,7 +545,9 @@ class Run:
     def data(self) -> Store:
         """The arrays of the committed episodes as Zarr reads them; every object is checked as it is read."""
         store = self.location.store(DATA, read_only=True)
-        return CheckedStore(store, self._sums, lambda key: f"{self.location}/{DATA}/{key}", self._advice)
+        return CheckedStore(
+            store, self._sums, lambda key: f"{self.location}/{DATA}/{key}", self._advice, self.root.metadata
+        )
 
     @cached_property
     def _sums(self) -> dict[str, Sum]:

@@ -15,7 +15,7 @@ from probe_kit.extract.store.format.columns import STAMP_DIGITS, seal_key, write
 from probe_kit.extract.store.format.recording import RecordingStore
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
-from probe_kit.extract.store.run import Run
+from probe_kit.extract.store.run import Run, read_run
 from probe_kit.hooks.contract.views import PADDING
 
 EPISODES_PER_CHUNK = 1024
@@ -32,7 +32,7 @@ def seal(path: Path | str | Location) -> bool:
     """
     location = Run(locate(path)).location
     with location.one_at_a_time():
-        return _seal(Run(location))
+        return _seal(read_run(location))
 
 
 def _seal(run: Run) -> bool:

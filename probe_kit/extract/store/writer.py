@@ -15,11 +15,12 @@ from zarr.core.array_spec import ArrayConfigLike
 from zarr.core.buffer import Buffer
 from zarr.storage import MemoryStore
 
+from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract.plan import Plan, PlannedEpisode
-from probe_kit.extract.run_layout import COMMITS, DATA, FAILED, LABEL_FILE, PLAN_FILE, RUN_FILE
-from probe_kit.extract.settings import check_other_plan, check_other_settings
+from probe_kit.extract.run_layout import COMMITS, DATA, FAILED, LABEL_FILE, PLANS, RUN_FILE, StoredStream
+from probe_kit.extract.settings import check_other_settings
 from probe_kit.extract.store.certificates import write_certificate
-from probe_kit.extract.store.format.arrays import create_arrays
+from probe_kit.extract.store.format.arrays import at_extent, create_arrays
 from probe_kit.extract.store.format.commits import (
     Commit,
     commit_key,
@@ -28,10 +29,12 @@ from probe_kit.extract.store.format.commits import (
     write_commit,
     write_failure,
 )
-from probe_kit.extract.store.format.hashes import Sum, as_json, as_record, record_hash
+from probe_kit.extract.store.format.hashes import Sum, as_record, record_hash
+from probe_kit.extract.store.format.plans import grown_record, plan_key, while_growing
 from probe_kit.extract.store.format.recording import RecordingStore
 from probe_kit.extract.store.format.root import Root, new_root, read_root
 from probe_kit.extract.store.format.trajectories import create_trajectories, has_trajectories, write_trajectory
+from probe_kit.extract.store.growth import further_rows
 from probe_kit.extract.store.label import label_record
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import (
@@ -73,12 +76,14 @@ class EpisodeRecord:
 
 
 class RunWriter:
-    """Creates a run or continues the one that is there; any number of processes may do so at once.
+    """Creates a run, continues the one that is there, or lets it grow; any number of processes may do so at once.
 
-    provenance: of this process, by default of one that computes on the CPU. label: what tables call a run that
-    begins here, by default the model's name; one that is there keeps its own, see `label_run`.
-    Raises SettingsMismatchError if the location holds a run with other settings or another plan, or anything
-    else, and RunDamagedError if what it holds was changed.
+    plan: episodes to play. Those that the run lacks are appended to its plan; `self.plan` has the run's numbers.
+    settings: without what a selection decides. provenance: of this process, by default of one that computes on
+    the CPU. label: what tables call a run that begins here, by default the model's name; one that is there keeps
+    its own, see `label_run`.
+    Raises SettingsMismatchError if the location holds a run with other settings, episodes that `plan` lacks while
+    it lacks others, or anything else, and RunDamagedError if what it holds was changed.
     """
 
     def __init__(
@@ -92,40 +97,87 @@ class RunWriter:
         self._label = label or str(self.settings["model"])
         if not location.exists(RUN_FILE):
             location.found(self._beginning(), last=RUN_FILE)
-        self.root = self._continued()
+        self.root = while_growing(location, self._continued)
+        self.plan = plan.numbered({row["episode_id"]: row["episode"] for row in self.root.plan})
+
+    @property
+    def streams(self) -> list[StoredStream]:
+        """How the streams lie in the run, which may have room for longer sequences than this plan needs."""
+        return [self.root.streams[stream.name] for stream in self.plan.streams]
+
+    @property
+    def _with_tokens(self) -> bool:
+        return bool(self.settings["tokens"] == "all")
 
     def _beginning(self) -> dict[str, bytes]:
-        """Every object a run has before its first episode."""
+        """Every object that a run of these settings has before its first plan, the same for every selection."""
         arrays: dict[str, Buffer] = {}
         store = MemoryStore(arrays)
         create_arrays(
-            store,
-            list(self.plan.streams),
-            len(self.plan.episodes),
-            self.settings["captured_calls"],
-            self.settings["tokens"] == "all",
+            store, list(self.plan.streams), 0, self.settings["captured_calls"], self._with_tokens,
             self.settings["codec"],
-        )
+        )  # fmt: skip
         still = "ask" in self.settings or bool(self.settings.get("capture_only"))
         if "scene" in self.settings and not still:  # who is asked or captured does not move
             frames = self.settings["scene"]["max_steps"] + 1
-            create_trajectories(store, len(self.plan.episodes), frames, self.settings["codec"])
-        objects = {
-            PLAN_FILE: as_json(self.plan.to_json()),
-            **{f"{DATA}/{key}": value.to_bytes() for key, value in arrays.items()},
-        }
-        streams = [stream.to_json() for stream in self.plan.streams]
-        root = new_root(self.settings, streams, objects)
+            create_trajectories(store, 0, frames, self.settings["codec"])
+        objects = {f"{DATA}/{key}": at_extent(value.to_bytes(), 0) for key, value in arrays.items()}
+        root = new_root(self.settings, [self._without_length(one) for one in self.plan.streams], objects)
         return {**objects, LABEL_FILE: label_record(record_hash(root), self._label), RUN_FILE: root}
 
+    def _without_length(self, stream: StoredStream) -> dict[str, Any]:
+        """A stream as `run.json` has it: without its number of tokens, unless arrays are as long as that."""
+        kept = stream.to_json()
+        return kept if self._with_tokens else {name: value for name, value in kept.items() if name != "tokens"}
+
     def _continued(self) -> Root:
-        """The root of the run that is there, which must be the one that would be begun here."""
+        """The root of the run that is there, whose plan now holds the one of this writer."""
         root = read_root(self.location)
         root.check_continuable()
-        check_other_settings(root.settings, self.settings, str(self.location))
+        check_other_settings(root.own_settings, self.settings, str(self.location))
+        self._check_lengths(root)
+        if self._lacks(root) or root.narrow:
+            with self.location.held(lambda: None), self.location.tended(PLANS):
+                root = self._grown()
         root.check()
-        check_other_plan(root.plan, self.plan.to_json()["episodes"], str(self.location))
         return root
+
+    def _lacks(self, root: Root) -> bool:
+        """Whether the run does not plan all of this writer's episodes yet. Raises SettingsMismatchError."""
+        rows = self.plan.to_json()["episodes"]
+        return not root.plan or bool(further_rows(root.plan, rows, str(self.location)))
+
+    def _grown(self) -> Root:
+        """The root, once the run plans all of this writer's episodes and has room for them. Room is only added."""
+        root = read_root(self.location)
+        while self._lacks(root):
+            self.location.create_record(plan_key(len(root.stored_plan.extents)), self._record(root))
+            root = read_root(self.location)  # ours, or that of a process that was first
+        while root.narrow:
+            for key, content in root.widened().items():
+                self.location.write_record(key, content)
+            root = read_root(self.location)  # another process may have let it grow further
+        return root
+
+    def _check_lengths(self, root: Root) -> None:
+        """Raise SettingsMismatchError for instructions that the arrays of all tokens are too short for."""
+        for stream in self.plan.streams if self._with_tokens else ():
+            room = root.own_streams[stream.name].tokens
+            if stream.tokens > room:
+                raise SettingsMismatchError(
+                    f"{self.location} stores {room} tokens of {stream.name} per episode; the longest instruction "
+                    f"of this command needs {stream.tokens}. A run with --tokens all takes no longer instructions "
+                    "than it began with. Choose another --out"
+                )
+
+    def _record(self, root: Root) -> bytes:
+        """The plan record that adds this writer's plan to the one of the run."""
+        plan = self.plan.to_json()
+        tokens = {} if self._with_tokens else {stream.name: stream.tokens for stream in self.plan.streams}
+        selection = json.loads(canonical_json(self.plan.selection))
+        return grown_record(
+            root.identity, root.stored_plan, plan["episodes"], selection, plan["suite_parent"], tokens
+        )
 
     @cached_property
     def _keeps_trajectories(self) -> bool:
@@ -169,7 +221,7 @@ class RunWriter:
 
     def remaining(self) -> list[int]:
         """Numbers of the episodes that are not committed; objects of the committed ones are checked."""
-        done = read_commits(self.root)
+        done = while_growing(self.location, lambda: read_commits(read_root(self.location)))
         return [episode.index for episode in self.plan.episodes if episode.index not in done]
 
     def write(self, episode: EpisodeRecord) -> None:
@@ -222,6 +274,7 @@ class RunWriter:
             "run": self.root.identity,
             "episode": planned.index,
             "episode_id": planned.episode.episode_id,
+            "plan": self.root.stored_plan.hash_of(planned.index),
             "outcome": episode.outcome,
             "roles": episode.roles,
             "provenance": name_of(self.provenance),

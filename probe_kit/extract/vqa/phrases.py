@@ -43,12 +43,13 @@ class Phrase:
 def phrases(suite: Suite, query: Query, seed: int = 0) -> dict[str, Phrase]:
     """By item, what is asked for; the same in both layouts, and the same for the same seed.
 
+    Other objects are those of the whole suite, so that a phrase does not depend on the number of items asked for.
     Raises UsageError naming the first items for which the suite has no such phrase.
     """
     if query == "target":
         return {item.item_id: Phrase.of(item) for item in suite.items}
     by_category: dict[str, list[Item]] = {}
-    for item in suite.items:
+    for item in suite.whole.items:
         by_category.setdefault(item.category, []).append(item)
     choose = _distractor if query == "distractor" else _absent
     found = {item.item_id: choose(item, by_category[item.category], seed) for item in suite.items}
@@ -58,7 +59,7 @@ def phrases(suite: Suite, query: Query, seed: int = 0) -> dict[str, Phrase]:
         some = ", ".join(item.item_id for item in missing[:_MOST_NAMED])
         raise UsageError(
             f"--query {query}: {len(missing)} of {len(suite.items)} items, in {categories}, have no phrase for it "
-            f"({some} …): {_WHY[query]}. Choose other --categories, or more --items of these"
+            f"({some} …): {_WHY[query]}. Choose other --categories"
         )
     return {name: phrase for name, phrase in found.items() if phrase is not None}
 

@@ -1,8 +1,9 @@
-"""The arrays of a run: shapes, chunks, codec.
+"""The arrays of a run: shapes, chunks, codec, and where the inner chunks of a shard lie.
 
 Token arrays hold the bits of bfloat16 as uint16, because Zarr v3 has no bfloat16.
 """
 
+import json
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,16 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from probe_kit.extract.run_layout import StoredStream
 
+ENTRY, CHECKSUM = 16, 4
+"""Bytes: offset and length of a chunk as two uint64, and the crc32c after all entries, in the
+index that Zarr writes at the end of every shard."""
+_ABSENT = (1 << 64) - 1
+
 
 def create_arrays(
     store: Store, streams: list[StoredStream], episodes: int, calls: int, with_tokens: bool, codec: str
 ) -> None:
-    """Create every array at its final size; afterwards only chunks are written.
+    """Create every array; afterwards chunks are written, and `at_extent` gives them room for more episodes.
 
     Pooled rows: float32 (episode, call, [iteration,] layer, view, feature), one chunk per episode, NaN where
     nothing was captured. Tokens: uint16, one shard per episode, inner chunks of one layer x 128 tokens.
@@ -54,6 +60,27 @@ def create_arrays(
             )
 
 
+def at_extent(metadata: bytes, episodes: int) -> bytes:
+    """The `zarr.json` of an array with room for so many episodes; that of a group stays as it is.
+
+    One chunk holds one episode, so nothing else of an array depends on their number. Raises ValueError for what
+    describes no array or group.
+    """
+    content = json.loads(metadata)
+    if content.get("node_type") == "array":
+        content["shape"][0] = episodes
+    return json.dumps(content, indent=2).encode()
+
+
+def extent_of(metadata: bytes) -> int | None:
+    """Episodes that an array has room for by its `zarr.json`; None for that of a group.
+
+    Raises ValueError as `at_extent`.
+    """
+    content = json.loads(metadata)
+    return int(content["shape"][0]) if content.get("node_type") == "array" else None
+
+
 def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
     """blosc with its block size set (its own choice at level 1 loses most of the gain), then a checksum."""
     if name == "none":
@@ -77,3 +104,22 @@ def open_array(store: Store, name: str) -> zarr.Array[Any]:
 def decode_bfloat16(bits: NDArray[np.uint16]) -> NDArray[np.float32]:
     """uint16 bit patterns of bfloat16 to float32, exactly."""
     return (bits.astype(np.uint32) << 16).view(np.float32)
+
+
+def index_bytes(count: int) -> int:
+    """Length of the index of a shard of so many inner chunks."""
+    return count * ENTRY + CHECKSUM
+
+
+def chunk_slices(index: bytes) -> list[slice]:
+    """Where every inner chunk lies in its shard, in the order of the index; an absent one is empty."""
+    entries = np.frombuffer(index[:-CHECKSUM], "<u8").reshape(-1, 2)
+    return [
+        slice(0, 0) if start == _ABSENT else slice(start, start + length) for start, length in entries.tolist()
+    ]
+
+
+def inner_chunks(shard: bytes, count: int) -> list[slice]:
+    """Where the `count` inner chunks of a whole shard lie, then where its index does."""
+    index = slice(len(shard) - index_bytes(count), len(shard))
+    return [*chunk_slices(shard[index]), index]

@@ -9,8 +9,8 @@ from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import WrapperStore
 
 from probe_kit.errors import RunDamagedError
+from probe_kit.extract.store.format.arrays import chunk_slices, index_bytes
 from probe_kit.extract.store.format.hashes import BLOCK_BYTES, Sum, block_digest
-from probe_kit.extract.store.format.shards import chunk_slices, index_bytes
 
 _BLOCK = 2 * BLOCK_BYTES
 
@@ -18,15 +18,18 @@ _BLOCK = 2 * BLOCK_BYTES
 class CheckedStore(WrapperStore[Store]):
     """Reads objects that are known by their sums; whatever else lies in the store does not exist for it.
 
-    where: full name of an object, for messages. advice: what to do if one is wrong.
+    where: full name of an object, for messages. advice: what to do if one is wrong. held: objects that were read
+    before, by key; they are not read again, because metadata changes while a run grows.
     A wrong or missing object raises RunDamagedError. Of a shard, only the parts that are read are checked. Of
     several wrong objects that are read at once, the one that was asked for first is named, whichever comes first.
     """
 
     def __init__(
-        self, store: Store, sums: Mapping[str, Sum], where: Callable[[str], str], advice: Callable[[str], str]
-    ) -> None:
+        self, store: Store, sums: Mapping[str, Sum], where: Callable[[str], str], advice: Callable[[str], str],
+        held: Mapping[str, bytes] = {},
+    ) -> None:  # fmt: skip
         super().__init__(store)
+        self._held = held
         self._sums, self._where, self._advice = sums, where, advice
         self._indexes: dict[str, dict[tuple[int, int], str]] = {}
         self._numbers = count()
@@ -38,7 +41,7 @@ class CheckedStore(WrapperStore[Store]):
         return False
 
     def _with_store(self, store: Store) -> "CheckedStore":
-        return CheckedStore(store, self._sums, self._where, self._advice)
+        return CheckedStore(store, self._sums, self._where, self._advice, self._held)
 
     async def exists(self, key: str) -> bool:
         """Whether there is such an object, wrong or not."""
@@ -50,6 +53,8 @@ class CheckedStore(WrapperStore[Store]):
         """One object or a part of it."""
         if key not in self._sums:
             return None
+        if key in self._held and byte_range is None:
+            return prototype.buffer.from_bytes(self._held[key])
         number = next(self._numbers)
         self._underway[number] = key
         try:
@@ -82,6 +87,8 @@ class CheckedStore(WrapperStore[Store]):
         if key not in self._sums:
             return None
         prototype = prototype or default_buffer_prototype()
+        if key in self._held and byte_range is None:
+            return prototype.buffer.from_bytes(self._held[key])
         value = super().get_sync(key, prototype=prototype, byte_range=byte_range)
         return self._checked(key, value, byte_range)
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Any
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.run_layout import COMMITS, DATA, FAILED, ILLUSTRATIONS, TRAJECTORY, TRAJECTORY_AXES
+from probe_kit.extract.run_layout import COMMITS, DATA, FAILED, ILLUSTRATIONS, PLANS, TRAJECTORY, TRAJECTORY_AXES
 from probe_kit.extract.store.format.hashes import (
     HASH,
     Sum,
@@ -34,6 +34,8 @@ _PARTS = {
 }
 _WITH_CONTROL_STEPS = 4
 """The first schema whose commits hold the control step of every inference."""
+_WITH_PLANS = 5
+"""The first schema whose commits name the plan record that added their episode."""
 _NUMBERED = re.compile(r"([0-9]{8})\.json")
 _PROVENANCE = re.compile(r"[0-9a-f]{16}")
 
@@ -79,6 +81,7 @@ def read_commits(root: Root) -> dict[int, Commit]:
                 raise RunDamagedError(
                     f"{location}/{DATA}/{key} of episode {commit['episode_id']} {problem}. {redo(number)}"
                 )
+    root.check_room(commits)
     return commits
 
 
@@ -93,9 +96,13 @@ def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
     planned = root.planned.get(number)
     if planned is None:
         raise RunDamagedError(
-            f"{name} commits an episode that the run does not plan; it has {len(root.plan)}. Remove it"
+            f"{name} commits an episode that the run does not plan; it has {len(root.plan)}. Restore the file in "
+            f"{PLANS} that plans it, or repeat the `probe-kit extract` that let the run grow; a commit of another "
+            "run is to be removed"
         )
     expected = {"run": root.identity, "episode": number, "episode_id": planned["episode_id"]}
+    if root.schema >= _WITH_PLANS:
+        expected["plan"] = root.stored_plan.hash_of(number)
     if wrong := [f"{part} {commit.get(part)}" for part, value in expected.items() if commit.get(part) != value]:
         raise RunDamagedError(
             f"{name} is the commit of {', '.join(wrong)}; in this place belongs that of episode {number}, "
@@ -239,7 +246,7 @@ def committed_sizes(location: Location, commits: Mapping[int, Commit]) -> dict[s
 
 def committed_sums(root: Root, commits: Mapping[int, Commit]) -> dict[str, Sum]:
     """Sums of all that may be read in `data.zarr`, by key: metadata, and what commits name."""
-    sums = dict(root.metadata)
+    sums = {key: Sum.of(content) for key, content in root.metadata.items()}
     for commit in commits.values():
         sums |= read_sums(commit["objects"])
     return sums

@@ -1,11 +1,13 @@
 """Hashes that bind every object of a run to its place.
 
-    run.json ── plan.json, zarr.json of every array
-       └── commits ── the objects of their episode, their provenance
-              └── stamp ── columns, probes
+    run.json ── zarr.json of every array, at no episodes
+       └── plan ── the plan record before it
+              └── commits ── the objects of their episode, their provenance
+                     └── stamp ── columns, probes
 
-`run.json` hashes the plan and the metadata; a commit hashes its objects and says whose it is; what is derived says
-from which commits. A record is JSON that carries the hash of all its other bytes, so that any change is seen.
+`run.json` hashes the metadata; a plan record says whose it is; a commit hashes its objects, and says whose it is
+and which record planned it; what is derived says from which commits. A record is JSON that carries the hash of all
+its other bytes, so that any change is seen.
 Every content has one spelling: a record in other bytes than `as_record` writes is damaged, whatever its hash says.
 Hashes detect accidents. They are no protection against an attacker who recomputes them: see `docs/storage.md`.
 """

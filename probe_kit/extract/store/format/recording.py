@@ -6,8 +6,8 @@ from zarr.abc.store import Store
 from zarr.core.buffer import Buffer
 from zarr.storage import WrapperStore
 
+from probe_kit.extract.store.format.arrays import inner_chunks
 from probe_kit.extract.store.format.hashes import Sum, block_digest, digest
-from probe_kit.extract.store.format.shards import inner_chunks
 
 
 class RecordingStore(WrapperStore[Store]):

@@ -1,11 +1,12 @@
-"""The root of a run: `run.json`, and the objects whose hashes it holds.
+"""The root of a run: `run.json`, and what belongs to every run.
 
-It carries settings and streams, the hashes of the plan and of every array's metadata, and its own hash, which is
-the run's identity: commits name it, so that none counts in another run.
+It carries settings and streams, the hash of every array's metadata at no episodes, and its own hash, which is the
+run's identity: plans and commits name it, so that none counts in another run. The selection of episodes may grow
+and is in `plans`. In schemas 3 and 4 the root had the selection and the hash of one fixed plan.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NoReturn
 
@@ -17,12 +18,14 @@ from probe_kit.errors import (
 )
 from probe_kit.extract.run_layout import (
     DATA,
-    PLAN_FILE,
+    FORMER_PLAN_FILE,
+    PLANS,
     READABLE_SCHEMAS,
     RUN_FILE,
     SCHEMA_VERSION,
     StoredStream,
 )
+from probe_kit.extract.store.format.arrays import at_extent, extent_of
 from probe_kit.extract.store.format.hashes import (
     HASH,
     Sum,
@@ -35,6 +38,7 @@ from probe_kit.extract.store.format.hashes import (
     read_sums,
 )
 from probe_kit.extract.store.format.left_out import read_left_out
+from probe_kit.extract.store.format.plans import RESTORE, Row, StoredPlan, plan_key, read_plans
 from probe_kit.extract.store.format.stored_words import in_current_words
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.locations.summary import what_to_open
@@ -50,22 +54,24 @@ _EPISODE = {
 }
 _WITH_ITEM_HASHES = 4
 """The first schema whose plan holds item hashes and the suite's parent."""
-RESTORE = "Restore it from a copy, or extract the run again"
+_WITH_PLANS = 5
+"""The first schema whose plan is a list of records, outside the run's identity."""
 
 
 @dataclass(frozen=True)
 class Root:
-    """What `run.json` says, checked.
+    """What `run.json` says, checked, and the plan that goes with it.
 
-    card: as it is stored. settings: those of the card, in the words of now. identity: the hash that was computed
-    of it. streams: as it stores them, by name. sums: of the plan and the arrays' metadata, by key.
+    card: as it is stored. own_settings: those of the card, in the words of now, without what a selection decides.
+    identity: the hash that was computed of it. own_streams: as it stores them, by name. sums: of the arrays'
+    metadata, at no episodes; in former schemas at all of them, and of the plan.
     """
 
     location: Location
     card: Mapping[str, Any]
-    settings: dict[str, Any]
+    own_settings: dict[str, Any]
     identity: str
-    streams: Mapping[str, StoredStream]
+    own_streams: Mapping[str, StoredStream]
     sums: Mapping[str, Sum]
 
     @property
@@ -99,47 +105,99 @@ class Root:
             "the run that it was copied from"
         )
 
+    # -- what belongs to every run ---------------------------------------------------------------------
+
     def read(self, key: str) -> bytes:
-        """An object that belongs to every run. Raises RunDamagedError if it is missing or was changed."""
+        """An object that belongs to every run, as stored.
+
+        Raises RunDamagedError if it is missing or was changed.
+        """
         name = f"{self.location}/{key}"
         try:
             content = self.location.read(key)
         except FileNotFoundError:
             raise RunDamagedError(f"{name} is missing. {RESTORE}") from None
-        if problem := self.sums[key].problem(content):
+        if problem := self._problem(key, content):
             raise RunDamagedError(f"{name} {problem}. {RESTORE}")
         return content
 
+    def _problem(self, key: str, content: bytes) -> str | None:
+        """What is wrong with an object. An array may still have the room of a former plan record."""
+        if self.schema < _WITH_PLANS:
+            return self.sums[key].problem(content)
+        try:
+            extent, begun = extent_of(content), at_extent(content, 0)
+            spelt = at_extent(content, extent or 0) == content
+        except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError):
+            return "has other bytes than were written"
+        if problem := self.sums[key].problem(begun):
+            return problem
+        if spelt and extent is not None and extent > len(self.plan):
+            return (
+                f"has room for {extent} episodes, and {len(self.plan)} are planned; either it was changed, or a "
+                f"file of {PLANS} is missing, which the `probe-kit extract` that let the run grow writes again"
+            )
+        known = spelt and extent in (None, 0, *self.stored_plan.extents)
+        return None if known else "has other bytes than were written"
+
     def check(self) -> None:
         """Raise RunDamagedError unless the plan and all metadata are what was written."""
-        for key in self.sums:
-            self.read(key)
+        _ = self.plan, self._stored
 
     @cached_property
-    def plan(self) -> list[dict[str, Any]]:
-        """The planned episodes in order."""
-        name, parts = f"{self.location}/{PLAN_FILE}", self._episode_parts
-        plan: list[dict[str, Any]] = []
-        for episode in self._plan_file["episodes"]:
-            row = in_current_words(episode, "plan") if isinstance(episode, dict) else {}
-            expect(row, parts, name, RESTORE)
-            plan.append(row)
-        if len({episode["episode"] for episode in plan}) < len(plan):
-            raise RunDamagedError(f"{name} plans two episodes of one number. {RESTORE}")
-        return plan
+    def _stored(self) -> Mapping[str, bytes]:
+        """What `read` gives, by key."""
+        return {key: self.read(key) for key in self.sums}
+
+    @cached_property
+    def metadata(self) -> dict[str, bytes]:
+        """The arrays' metadata with room for every planned episode, by key in `data.zarr`.
+
+        Raises RunDamagedError if stored metadata is missing or was changed.
+        """
+        inside, planned = f"{DATA}/", len(self.plan)
+        stored = {key.removeprefix(inside): one for key, one in self._stored.items() if key.startswith(inside)}
+        if self.schema < _WITH_PLANS:
+            return stored
+        return {key: at_extent(content, planned) for key, content in stored.items()}
+
+    def widened(self) -> Mapping[str, bytes]:
+        """By key in the run, what to write over metadata that has room for fewer episodes than are planned."""
+        return {key: at_extent(self._stored[key], len(self.plan)) for key in self.narrow}
+
+    @cached_property
+    def narrow(self) -> Mapping[str, int]:
+        """Metadata on the disk that has room for fewer episodes than are planned, by key in the run, and how many.
+
+        So it is between a plan record and the rewriting of the metadata. `metadata` is not concerned.
+        """
+        inside, planned = f"{DATA}/", len(self.plan)
+        extents = {key: extent_of(one) for key, one in self._stored.items() if key.startswith(inside)}
+        return {key: room for key, room in extents.items() if room is not None and room < planned}
+
+    def check_room(self, numbers: Iterable[int]) -> None:
+        """Raise RunDamagedError if an episode of these numbers has no room in an array, as the disk has it."""
+        highest = max(numbers, default=-1)
+        for key, room in self.narrow.items():
+            if room <= highest:
+                raise RunDamagedError(
+                    f"{self.location}/{key} has room for {room} episodes, and episode {highest} is committed. The "
+                    "same `probe-kit extract` writes it again"
+                )
+
+    # -- the plan --------------------------------------------------------------------------------------
+
+    @cached_property
+    def stored_plan(self) -> StoredPlan:
+        """What the plan records say together; of former schemas what the one plan says."""
+        if self.schema >= _WITH_PLANS:
+            return read_plans(self.location, self.identity, self._check_row)
+        return StoredPlan(self._former_plan(), suite_parent=self._former_plan_file.get("suite_parent"))
 
     @property
-    def _episode_parts(self) -> dict[str, type]:
-        return _EPISODE if self.schema < _WITH_ITEM_HASHES else {**_EPISODE, "item_content_sha256": str}
-
-    @cached_property
-    def _plan_file(self) -> dict[str, Any]:
-        name = f"{self.location}/{PLAN_FILE}"
-        content = read_plain(self.read(PLAN_FILE), name, RESTORE)
-        expect(content, {"episodes": list}, name, RESTORE)
-        if self.schema >= _WITH_ITEM_HASHES and not isinstance(content.get("suite_parent", ...), str | None):
-            raise RunDamagedError(f"{name} does not say what its suite was selected from. {RESTORE}")
-        return content
+    def plan(self) -> Sequence[Row]:
+        """The planned episodes in order; none in a run that has no plan yet."""
+        return self.stored_plan.rows
 
     @property
     def suite_parent(self) -> str | None:
@@ -147,8 +205,59 @@ class Root:
 
         None for a whole suite, and in runs of schema 3, which do not say it.
         """
-        parent: str | None = self._plan_file.get("suite_parent")
-        return parent
+        return self.stored_plan.suite_parent
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """Those of the run and of the selection that it has now: suite, categories, items and wordings."""
+        selection = self.stored_plan.selection
+        suite = {**self.own_settings.get("suite", {}), **selection.get("suite", {})}
+        return {**self.own_settings, **selection, **({"suite": suite} if suite else {})}
+
+    @cached_property
+    def streams(self) -> Mapping[str, StoredStream]:
+        """How the streams lie in the store, by name.
+
+        Raises RunDamagedError if the plan lacks the number of tokens of one.
+        """
+        tokens = self.stored_plan.tokens
+        lacking = [
+            one["name"] for one in self.card["streams"] if "tokens" not in one and one["name"] not in tokens
+        ]
+        if lacking and self.plan:
+            name = f"{self.location}/{plan_key(len(self.stored_plan.extents) - 1)}"
+            raise RunDamagedError(f"{name} says no number of tokens of {lacking[0]}. {RESTORE}")
+        return {
+            name: replace(one, tokens=tokens[name]) if name in tokens else one
+            for name, one in self.own_streams.items()
+        }
+
+    def _check_row(self, row: Any, name: str) -> None:
+        expect(row if isinstance(row, dict) else {}, self._episode_parts, name, RESTORE)
+
+    def _former_plan(self) -> list[Row]:
+        name = f"{self.location}/{FORMER_PLAN_FILE}"
+        plan: list[Row] = []
+        for episode in self._former_plan_file["episodes"]:
+            row = in_current_words(episode, "plan") if isinstance(episode, dict) else {}
+            self._check_row(row, name)
+            plan.append(row)
+        if len({episode["episode"] for episode in plan}) < len(plan):
+            raise RunDamagedError(f"{name} plans two episodes of one number. {RESTORE}")
+        return plan
+
+    @cached_property
+    def _former_plan_file(self) -> dict[str, Any]:
+        name = f"{self.location}/{FORMER_PLAN_FILE}"
+        content = read_plain(self.read(FORMER_PLAN_FILE), name, RESTORE)
+        expect(content, {"episodes": list}, name, RESTORE)
+        if self.schema >= _WITH_ITEM_HASHES and not isinstance(content.get("suite_parent", ...), str | None):
+            raise RunDamagedError(f"{name} does not say what its suite was selected from. {RESTORE}")
+        return content
+
+    @property
+    def _episode_parts(self) -> dict[str, type]:
+        return _EPISODE if self.schema < _WITH_ITEM_HASHES else {**_EPISODE, "item_content_sha256": str}
 
     @cached_property
     def planned(self) -> dict[int, dict[str, Any]]:
@@ -156,20 +265,17 @@ class Root:
         return {episode["episode"]: episode for episode in self.plan}
 
     @cached_property
-    def metadata(self) -> dict[str, Sum]:
-        """Sums of the arrays' metadata, by key in `data.zarr`."""
-        inside = f"{DATA}/"
-        return {key.removeprefix(inside): one for key, one in self.sums.items() if key.startswith(inside)}
-
-    @cached_property
     def arrays(self) -> dict[str, int]:
         """Arrays of `data.zarr` in which every episode has one object, and how many axes each has."""
-        with_tokens = self.settings["tokens"] == "all"
-        return {name: axes for one in self.streams.values() for name, axes in one.arrays(with_tokens).items()}
+        with_tokens = self.own_settings["tokens"] == "all"
+        return {name: axes for one in self.own_streams.values() for name, axes in one.arrays(with_tokens).items()}
 
 
 def new_root(settings: Mapping[str, Any], streams: list[dict[str, Any]], objects: Mapping[str, bytes]) -> bytes:
-    """The `run.json` of a run that begins with these other objects."""
+    """The `run.json` of a run that begins with these arrays' metadata, at no episodes.
+
+    streams: without the number of tokens, which a selection decides, unless every token is stored.
+    """
     return as_record(
         {
             "schema_version": SCHEMA_VERSION,
@@ -209,7 +315,8 @@ def find_root(location: Location) -> Root | None:
     check_sums(card["objects"], name, RESTORE)
     streams = _read_streams(card["streams"], name)
     root = Root(location, card, settings, card[HASH], streams, read_sums(card["objects"]))
-    if lost := {PLAN_FILE, *(f"{DATA}/{array}/zarr.json" for array in root.arrays)} - {*root.sums}:
+    former = {FORMER_PLAN_FILE} if root.schema < _WITH_PLANS else set()
+    if lost := (former | {f"{DATA}/{array}/zarr.json" for array in root.arrays}) - {*root.sums}:
         raise RunDamagedError(f"{name} names no hash of {min(lost)}. {RESTORE}")
     return root
 
@@ -221,7 +328,7 @@ def _read_card(raw: bytes, name: str) -> dict[str, Any]:
         newer = type(schema) is int and schema > SCHEMA_VERSION
         raise RunDamagedError(
             f"{name} has schema {schema}; this version of probe_kit reads schemas "
-            f"{' and '.join(map(str, READABLE_SCHEMAS))}. "
+            f"{', '.join(map(str, READABLE_SCHEMAS))}. "
             + ("Update probe_kit" if newer else "Extract the run again, or read it with the version that made it")
         )
     return read_record(raw, name, RESTORE)
@@ -229,7 +336,9 @@ def _read_card(raw: bytes, name: str) -> dict[str, Any]:
 
 def _read_streams(stored: list[Any], name: str) -> dict[str, StoredStream]:
     try:
-        streams = [StoredStream.from_json(in_current_words(dict(one), "stream")) for one in stored]
+        streams = [
+            StoredStream.from_json({"tokens": 1, **in_current_words(dict(one), "stream")}) for one in stored
+        ]
     except (TypeError, ValueError, KeyError) as error:
         raise RunDamagedError(f"{name} describes its streams wrongly: {error!r}. {RESTORE}") from error
     if len({stream.name for stream in streams}) < len(streams):

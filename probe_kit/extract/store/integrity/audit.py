@@ -22,7 +22,8 @@ from probe_kit.extract.store.format.commits import (
     wrong_size,
 )
 from probe_kit.extract.store.format.left_out import is_left_out
-from probe_kit.extract.store.format.root import RESTORE, Root, read_root
+from probe_kit.extract.store.format.plans import RESTORE, count_plans
+from probe_kit.extract.store.format.root import Root, read_root
 from probe_kit.extract.store.integrity.deep import content_problems
 from probe_kit.extract.store.integrity.orphans import stray_keys
 from probe_kit.extract.store.label import read_label
@@ -59,7 +60,7 @@ class Audit:
     @property
     def finished(self) -> bool:
         """Whether every planned episode is committed; an older state of a run is whole, but not finished."""
-        return self.ok and self.committed == self.planned
+        return self.ok and 0 < self.planned == self.committed
 
 
 def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
@@ -69,9 +70,17 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
     rows. Problems are collected, not raised. Raises RunNotFoundError if there is no run at `path`.
     """
     location = locate(path)
+    while True:
+        before = count_plans(location)
+        found = _audit(location, deep)
+        if found.ok or count_plans(location) == before:  # else it grew while it was compared
+            return found
+
+
+def _audit(location: Location, deep: bool) -> Audit:
     try:
         root = read_root(location)
-        planned = len(root.plan)
+        planned, _ = len(root.plan), root.streams
     except RunDamagedError as error:  # nothing can be said of the rest
         return Audit(str(location), 0, 0, 0, False, deep, (str(error),))
     problems = list(_root_problems(root))
@@ -81,12 +90,15 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
             commits[number] = read_commit(root, number, key, raw)
         except RunDamagedError as error:
             problems.append(str(error))
+    problems += [] if problems else _caught(partial(root.check_room, commits))
     problems += _commit_problems(root, commits)
     problems += picture_problems(location, commits)
     problems += seconds_problems(root, commits)
     problems += _caught(partial(read_label, root))
     problems += _caught(lambda: root.left_out)
     problems += _provenance_problems(root, commits)
+    if not planned:
+        return Audit(str(location), 0, 0, 0, False, deep, tuple(problems))
     if commits:
         problems += _caught(partial(read_certificate, root))
     failures: dict[str, str] = {}

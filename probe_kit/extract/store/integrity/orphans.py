@@ -16,6 +16,7 @@ from probe_kit.extract.store.certificates import certificate_keys
 from probe_kit.extract.store.format.bundles import BUNDLES, HEAD, PARTIAL, TIMES, bundle_keys, read_bundle
 from probe_kit.extract.store.format.columns import Columns, seal_key
 from probe_kit.extract.store.format.commits import Commit, commit_key, numbered, pictures_of
+from probe_kit.extract.store.format.plans import plan_key
 from probe_kit.extract.store.format.root import Root
 from probe_kit.extract.store.seconds import seconds_key
 
@@ -32,6 +33,7 @@ def known_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | Non
     yield LABEL_FILE
     yield LEFT_OUT_FILE
     yield from root.sums
+    yield from (plan_key(record) for record in range(len(root.stored_plan.extents)))
     for number, commit in commits.items():
         yield commit_key(number)
         yield seconds_key(number)

@@ -22,7 +22,7 @@ from probe_kit.extract.run_layout import (
     DATA,
     FAILED,
     FRAMES,
-    PLAN_FILE,
+    PLANS,
     PROVENANCE,
     RUN_FILE,
     SEALED,
@@ -32,7 +32,7 @@ from probe_kit.extract.run_layout import (
 from probe_kit.extract.store.locations.location import TRIES, Location
 
 # What a killed process leaves: objects and columns that never got their final name.
-_WRITTEN_ASIDE = (COMMITS, TIMES, FAILED, CERTIFICATES, PROVENANCE, SEALED, FRAMES, VIDEOS)
+_WRITTEN_ASIDE = (PLANS, COMMITS, TIMES, FAILED, CERTIFICATES, PROVENANCE, SEALED, FRAMES, VIDEOS)
 _ORPHANS = ("*.tmp", *(f"{folder}/*.tmp" for folder in _WRITTEN_ASIDE), f"{DATA}/**/*.partial")
 _PIECE = 1 << 20
 
@@ -226,12 +226,16 @@ class Folder(Location):
     @contextmanager
     def one_at_a_time(self) -> Iterator[None]:
         """By locks; also that of the run, so that no process removes the work as a leftover."""
-        with (self._path / RUN_FILE).open("rb") as run, (self._path / PLAN_FILE).open("rb") as turn:
-            fcntl.flock(run, fcntl.LOCK_SH)
-            fcntl.flock(turn, fcntl.LOCK_EX)
-            for leftover in self._path.glob(f"{COLUMNS}*.tmp"):  # of a killed seal: a live one holds this lock
-                shutil.rmtree(leftover, ignore_errors=True)
-            yield
+        turn = os.open(self._path / DATA, os.O_RDONLY)  # a folder that is never exchanged
+        try:
+            with (self._path / RUN_FILE).open("rb") as run:
+                fcntl.flock(run, fcntl.LOCK_SH)
+                fcntl.flock(turn, fcntl.LOCK_EX)
+                for leftover in self._path.glob(f"{COLUMNS}*.tmp"):  # of a killed seal: a live one holds this lock
+                    shutil.rmtree(leftover, ignore_errors=True)
+                yield
+        finally:
+            os.close(turn)
 
     @contextmanager
     def tended(self, folder: str) -> Iterator[None]:
@@ -243,7 +247,7 @@ class Folder(Location):
             fcntl.flock(handle, fcntl.LOCK_EX)
             with suppress(PermissionError):  # a run that may only be read is listed too
                 for leftover in path.glob("*.tmp"):
-                    leftover.unlink()
+                    leftover.unlink(missing_ok=True)  # or its writer has just removed it
             yield
         finally:
             os.close(handle)

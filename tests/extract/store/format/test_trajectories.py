@@ -98,7 +98,7 @@ def test_a_run_begun_without_room_for_them_is_finished_without(
         run.trajectory(0)
     streams = [recorded_run.stored(name) for name in recorded_run.streams]
     planned = make_plan(small_suite, streams, 0, 1, True)
-    writer = RunWriter(locate(copy), planned, run.settings)
+    writer = RunWriter(locate(copy), planned, run.root.own_settings)
     frames = recorded_run.trajectory(0).frames
     kinds: tuple[Literal["pooled", "tokens"], ...] = ("pooled", "tokens")
     arrays = {kind: {name: recorded_run.rows(name, kind)[0] for name in recorded_run.streams} for kind in kinds}

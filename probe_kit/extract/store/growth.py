@@ -1,0 +1,98 @@
+"""Growth of a run: what a plan adds to the one that is stored. A run never gets smaller."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from probe_kit.errors import SettingsMismatchError
+from probe_kit.extract.run_layout import RUN_FILE
+from probe_kit.extract.store.format.bundles import BUNDLES, bundle_keys
+from probe_kit.extract.store.format.root import read_root
+from probe_kit.extract.store.locations.location import Location
+
+Row = Mapping[str, Any]
+_NUMBER = "episode"
+"""The part of a row that depends on when its episode was added."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """A plan beside the one that is stored.
+
+    stored, asked: episodes of either. added: episodes that only the plan has. results: probes and interventions
+    that are stored with the run, such as `probes 1a2b3c4d5e6f`; after a growth they are of former episodes.
+    """
+
+    stored: int
+    asked: int
+    added: int
+    results: tuple[str, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """In a line; empty where both plans are the same."""
+        if self.added:
+            stale = f"; of the former episodes only: {', '.join(self.results)}" if self.results else ""
+            return f"from {self.stored} to {self.asked} episodes; stored ones stay as they are{stale}"
+        if self.asked < self.stored:
+            return (
+                f"not needed: the run has {self.stored} episodes, these {self.asked} among them; it never shrinks"
+            )
+        return ""
+
+
+def further_rows(stored: Sequence[Row], asked: Sequence[Row], where: str) -> list[Row]:
+    """The rows of a plan that the stored one lacks; none if the stored one holds them all.
+
+    Raises SettingsMismatchError if both plan one episode differently, or if each has some that the other lacks.
+    """
+    was, now = ({row["episode_id"]: row for row in rows} for rows in (stored, asked))
+    for name in was.keys() & now.keys():
+        _check_equal(was[name], now[name], where)
+    further = [row for name, row in now.items() if name not in was]
+    lost = [row for name, row in was.items() if name not in now]
+    if further and lost:
+        raise SettingsMismatchError(
+            f"{where} has {_counted(stored)}; this command asks for {_counted(asked)}. A run grows and never gets "
+            f"smaller, and {len(lost)} of its episodes are not asked for (the first is {lost[0]['episode_id']}). "
+            "Ask for at least what it has, or choose another --out"
+        )
+    return further
+
+
+def _check_equal(was: Row, now: Row, where: str) -> None:
+    """Raise SettingsMismatchError unless an episode is planned as it is stored, but for its number."""
+    for part in sorted((was.keys() | now.keys()) - {_NUMBER}):
+        if was.get(part) != now.get(part):
+            raise SettingsMismatchError(
+                f"{where} plans {was['episode_id']} otherwise: its {part} is stored as {was.get(part)!r}, here "
+                f"{now.get(part)!r}. Use the suite, the kind of --wordings and the version of probe_kit that the "
+                "run began with, or choose another --out"
+            )
+
+
+def _counted(rows: Sequence[Row]) -> str:
+    """Items by category, and the wordings they are asked in."""
+    items = {row["item_id"]: row["category"] for row in rows}
+    counts = ", ".join(f"{name} {count}" for name, count in sorted(Counter(items.values()).items()))
+    wordings = ", ".join(dict.fromkeys(row["wording"] for row in rows if "wording" in row))
+    return f"items of {counts}" + (f" in the wordings {wordings}" if wordings else "")
+
+
+def growth_at(location: Location, asked: Sequence[Row]) -> Growth | None:
+    """How the run at `location` would grow by a plan with these rows; None if none is there or has a plan.
+
+    Raises as `further_rows`, SettingsMismatchError for a run of a former schema, and RunDamagedError if what is
+    there was changed.
+    """
+    if not location.exists(RUN_FILE):
+        return None
+    root = read_root(location)
+    root.check_continuable()
+    stored = root.plan
+    if not stored:
+        return None
+    added = len(further_rows(stored, asked, str(location)))
+    results = [f"{home} {key}" for home in BUNDLES for key in bundle_keys(location, home)] if added else []
+    return Growth(len(stored), len(asked), added, tuple(results))
