@@ -27,14 +27,13 @@ from numpy.typing import NDArray
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
+from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.crossval import site_probe as probe
 from probe_kit.train.crossval.joint import can_be_joint, cross_validate_jointly, labels_at_once
 from probe_kit.train.crossval.joint_design import JointSite
 from probe_kit.train.crossval.joint_objective import JointProblems
 from probe_kit.train.crossval.nested_folds import (
-    INNER_FOLDS,
-    OUTER_FOLDS,
     STRENGTHS,
     FittedFold,
     NestedFold,

@@ -26,11 +26,11 @@ from rich.table import Table
 from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
-from probe_kit.statistics.folds import Fold, grouped_folds
+from probe_kit.statistics.folds import OUTER_FOLDS, Fold, grouped_folds
 from probe_kit.statistics.label_permutations import flip_groups, flip_items, max_statistic_p, pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
 from probe_kit.train.crossval.metrics import correctness
-from probe_kit.train.crossval.site_probe import OUTER_FOLDS, nested_folds, probe_site
+from probe_kit.train.crossval.site_probe import nested_folds, probe_site
 from probe_kit.train.data.samples import Samples
 
 SITES, WIDTH, PERMUTATIONS = 2, 6, 39

@@ -24,9 +24,10 @@ from probes import features, labels_of
 from rich.console import Console
 from threadpoolctl import threadpool_limits
 
+from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.crossval import site_probe as probe
-from probe_kit.train.crossval.nested_folds import INNER_FOLDS, OUTER_FOLDS, nested_folds
+from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.design_matrix import DenseDesign
 from probe_kit.train.solver.principal_axes import WORTH_NARROWING

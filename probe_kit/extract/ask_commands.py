@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, out, progress, say
 from probe_kit.extract import command_options as own
-from probe_kit.extract.commands import print_plan
+from probe_kit.extract.commands import print_plan, print_sufficiency
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
@@ -62,11 +62,13 @@ def ask(
     places = [None if out_folder is None else f"{out_folder.rstrip('/')}/{one.short_name}" for one in wanted]
     runs: list[Run] = []
     prepared = prepare_asks(wanted, places)
-    for place in places:
+    for number, place in enumerate(places):
         with err.status("loading suite and model"):
             extraction = next(prepared)
         location = locate(place or Path("runs") / extraction.default_name())
         print_plan(extraction, location)
+        if number == 0:  # of all of them, because they ask about the same items
+            print_sufficiency(extraction)
         if not dry_run:
             with progress() as bar:
                 runs.append(extraction.run(location, force=force, progress=counter(bar, "questions")))

@@ -77,6 +77,7 @@ def extract(
         extraction = prepare(settings, out_folder)
     location = locate(out_folder or Path("runs") / extraction.default_name())
     print_plan(extraction, location)
+    print_sufficiency(extraction)
     if dry_run:
         return
     with progress() as bar:
@@ -122,6 +123,21 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     table.add_column(overflow="fold")  # a path that is cut off is no path
     for name, value in rows.items():
         table.add_row(marked("[dim]{}[/]", name), value)
+    err.print(table)
+
+
+def print_sufficiency(extraction: "Extraction") -> None:
+    """What the plan is enough for, said before any work; too few items in yellow."""
+    from rich.table import Table
+
+    from probe_kit.suite.validation.sufficiency import Smallest, sufficiencies
+
+    plan, scored = extraction.plan, not getattr(extraction.settings, "capture_only", False)
+    table = Table(show_header=False, title=f"enough for ({Smallest.of(plan.suite).words})", box=None)
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    for one in sufficiencies(plan.suite, scored, bool(plan.streams)):
+        table.add_row(one.name, marked("[yellow]{}[/]" if one.enough is False else "{}", one.words))
     err.print(table)
 
 

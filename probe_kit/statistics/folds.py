@@ -11,6 +11,9 @@ from probe_kit.errors import TooFewGroupsError, UsageError
 if TYPE_CHECKING:
     import pandas as pd
 
+OUTER_FOLDS, INNER_FOLDS = 5, 4
+"""Folds that score probes, and folds of a training side that choose C. A fold needs a group of its own."""
+
 FoldUnit = Literal["groups", "concepts"]
 FOLD_UNITS: dict[str, str] = {
     "groups": "items that share a picture stay together",

@@ -112,6 +112,14 @@ def _shapes(groups: ArrayLike, items: ArrayLike, layouts: ArrayLike) -> list[tup
     return found
 
 
+def possible_flips(groups: int) -> int:
+    """How many permutations `flip_groups` makes of so many groups, each with as many episodes of either class.
+
+    Below ENUMERATED_BELOW groups; of more it draws as many as it is asked for.
+    """
+    return 2 ** (groups - 1) - 1 if groups else 0
+
+
 def smallest_p(permutations: int) -> float:
     """The smallest p-value that so many label permutations can give; 1 without any."""
     return 1 / (1 + permutations)

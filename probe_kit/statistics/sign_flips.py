@@ -39,6 +39,11 @@ def max_t(
     return observed, np.asarray(p), np.asarray(p_fwe)
 
 
+def smallest_flip_p(groups: int) -> float:
+    """The smallest p-value of `max_t` with so many groups: one pattern of all that are tried."""
+    return 0.5**groups if groups <= EXACT else 1 / DRAWS
+
+
 def _signs(groups: int, seed: int) -> NDArray[np.float64]:
     """(draws, groups) of ±1, the first row all +1."""
     if groups <= EXACT:

@@ -1,6 +1,6 @@
 """The significance level, and the margin around one half that guessing can reach."""
 
-from math import sqrt
+from math import ceil, sqrt
 from statistics import NormalDist
 
 from probe_kit.errors import UsageError
@@ -25,3 +25,13 @@ def chance_margin(n: float, alpha: float = SIGNIFICANCE) -> float:
     if n < 1:
         raise UsageError(f"the margin around chance needs at least one trial, got n={n}")
     return NormalDist().inv_cdf(1 - alpha / 2) * sqrt(0.25 / n)
+
+
+def items_for_width(width: float) -> int:
+    """Items per category for which a 95 % interval of a rate near one half is at most `width` wide.
+
+    Items that share a picture and are answered alike count as fewer. Raises UsageError for no width.
+    """
+    if not 0 < width < 1:
+        raise UsageError(f"an interval {width} wide; expected a share between 0 and 1")
+    return ceil((NormalDist().inv_cdf(0.975) / width) ** 2)

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.statistics.estimates.balanced import GroupSums
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most
+from probe_kit.statistics.folds import OUTER_FOLDS
 from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 NEIGHBOURS, ALIKE = 0.9, 0.3
 """Assumed correlation of neighbouring sites, and of the episodes of one group."""
 ITEMS_PER_GROUP, LAYOUTS = 2, 2
-FEWEST_ITEMS, MOST_ITEMS = 5 * ITEMS_PER_GROUP, 1000
+FEWEST_ITEMS, MOST_ITEMS = OUTER_FOLDS * ITEMS_PER_GROUP, 1000
 """Between these the number of items is searched."""
 SEEDS = 5
 """Parts of a simulation, each with a limit of chance of its own; their spread is the error of the whole."""
@@ -70,7 +71,10 @@ def simulate(items: int, above: float, sites: int = 19, draws: int = 400, seed: 
     than `SEEDS` draws, or an impossible signal.
     """
     if items < FEWEST_ITEMS:
-        raise UsageError(f"{items} items make fewer than 5 groups; no probe is fitted. Expected 10 or more.")
+        raise UsageError(
+            f"{items} items make fewer than {OUTER_FOLDS} groups; no probe is fitted. Expected {FEWEST_ITEMS} or "
+            "more."
+        )
     if not 0 <= above <= 0.5:
         raise UsageError(f"a signal of {above} above chance; expected a share from 0 to 0.5")
     if sites < 1 or draws < SEEDS:
@@ -215,16 +219,6 @@ def _pool(sites: int, seed: int) -> NDArray[np.int8]:
         drawn.append(right.reshape(sites, -1, size).sum(axis=2, dtype=np.int8).T)
     own = np.concatenate(drawn)
     return np.concatenate([own, np.int8(size) - own])
-
-
-def items_for_width(width: float) -> int:
-    """Items per category for which a 95 % interval of a rate near one half is at most `width` wide.
-
-    Items that share a picture and are answered alike count as fewer. Raises UsageError for no width.
-    """
-    if not 0 < width < 1:
-        raise UsageError(f"an interval {width} wide; expected a share between 0 and 1")
-    return ceil((NormalDist().inv_cdf(0.975) / width) ** 2)
 
 
 def _right(

@@ -61,7 +61,8 @@ def power(
     Assumes two items and four episodes per group, a correlation of 0.9 between neighbouring sites, and controls at
     chance.
     """
-    from probe_kit.train.power import items_for_width, items_needed, simulate
+    from probe_kit.statistics.significance import items_for_width
+    from probe_kit.train.power import items_needed, simulate
 
     for name, value in (("--power", wanted), ("--width", width)):
         if value is not None and not isfinite(value):

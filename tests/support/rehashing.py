@@ -23,7 +23,8 @@ def rehash(run: Path) -> None:
         path.relative_to(run).as_posix(): Sum.of(at_extent(path.read_bytes(), 0)).to_json() for path in metadata
     }
     identity = _write(run / "run.json", root)
-    former, plans = None, {}
+    former: str | None = None
+    plans: dict[int, str] = {}
     for path in sorted((run / "plan").glob("*.json")):
         plan = {**_content(path), "run": identity, "former": former}
         former = _write(path, plan)

@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
-from probe_kit.statistics.significance import detectable
-from probe_kit.train.power import _carriers, _limit, fewest, items_for_width, items_needed, simulate
+from probe_kit.statistics.significance import detectable, items_for_width
+from probe_kit.train.power import _carriers, _limit, fewest, items_needed, simulate
 
 
 def test_power_grows_with_items_and_with_the_signal() -> None:

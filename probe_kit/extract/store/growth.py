@@ -36,9 +36,7 @@ class Growth:
             stale = f"; of the former episodes only: {', '.join(self.results)}" if self.results else ""
             return f"from {self.stored} to {self.asked} episodes; stored ones stay as they are{stale}"
         if self.asked < self.stored:
-            return (
-                f"not needed: the run has {self.stored} episodes, these {self.asked} among them; it never shrinks"
-            )
+            return f"no: the run has {self.stored} episodes, these {self.asked} among them, and never shrinks"
         return ""
 
 

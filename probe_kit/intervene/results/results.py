@@ -19,6 +19,7 @@ from probe_kit.intervene.kinds.registry import kind_of
 from probe_kit.intervene.results.site_maps import stored_carrying_directions, stored_localised_sites
 from probe_kit.intervene.store.answers import ConditionOutcomes, StoredIntervention, find_stored
 from probe_kit.intervene.store.settings import PER_STEP
+from probe_kit.statistics.sign_flips import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.store import load_results
@@ -109,10 +110,10 @@ class InterventionResult:
     def _few_groups(self) -> list[str]:
         counts = {category: np.unique(own.groups).size for category, own in self.outcomes.by_category()}
         return [
-            f"{category}: with {count} group{'s' * (count != 1)} of items no p can be below {0.5**count:.2g}, so "
-            "that nothing is beyond chance. Play more (--items)."
+            f"{category}: with {count} group{'s' * (count != 1)} of items no p can be below "
+            f"{smallest_flip_p(count):.2g}, so that nothing is beyond chance. Play more (--items)."
             for category, count in counts.items()
-            if 0.5**count >= SIGNIFICANCE
+            if smallest_flip_p(count) >= SIGNIFICANCE
         ]
 
     def _one_step(self) -> list[str]:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from probe_kit.statistics.folds import OUTER_FOLDS
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, category_of
 from probe_kit.suite.items import Item
 from probe_kit.suite.pictures import load_picture
@@ -20,7 +21,6 @@ from probe_kit.suite.validation.rules import SIDES
 
 LEAST_ROLE_BALANCE = 0.4
 FEWEST_ITEMS = 30
-FEWEST_GROUPS = 5
 SCREEN_PIXELS = 40  # a tile's side on a 224 px frame, see docs/suite.md
 
 _FEWEST_USES = 5  # with fewer, balance cannot be judged
@@ -104,8 +104,8 @@ def enough_groups(suite: Suite) -> Iterator[Finding]:
     for item in suite.items:
         groups[item.category].add(item.group_id)
     for category, members in groups.items():
-        if len(members) < FEWEST_GROUPS:
-            message = f"{len(members)} independent groups; probes need at least {FEWEST_GROUPS}"
+        if len(members) < OUTER_FOLDS:
+            message = f"{len(members)} independent groups; probes need at least {OUTER_FOLDS}"
             yield warning("W09", category_of(category).title, message)
 
 

@@ -5,15 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from probe_kit.statistics.folds import Fold, grouped_folds
+from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS, Fold, grouped_folds
 from probe_kit.train.solver.backend import Array, to_numpy
 from probe_kit.train.solver.projection import Projection
 
 Matrix = NDArray[np.float64]
 
 STRENGTHS: Matrix = np.array([1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0])
-OUTER_FOLDS = 5
-INNER_FOLDS = 4
 
 
 @dataclass(frozen=True)

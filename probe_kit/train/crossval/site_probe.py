@@ -12,8 +12,6 @@ from probe_kit.train.crossval.joint import can_be_joint, cross_validate_jointly
 from probe_kit.train.crossval.joint_design import JointSite
 from probe_kit.train.crossval.metrics import correctness, log_loss
 from probe_kit.train.crossval.nested_folds import (
-    INNER_FOLDS,
-    OUTER_FOLDS,
     STRENGTHS,
     FittedFold,
     Matrix,
@@ -27,8 +25,6 @@ from probe_kit.train.solver.logistic import LogisticSolver
 from probe_kit.train.solver.projection import Projection
 
 __all__ = [
-    "INNER_FOLDS",
-    "OUTER_FOLDS",
     "STRENGTHS",
     "FittedFold",
     "NestedFold",

@@ -1,0 +1,59 @@
+"""What a number of groups is enough for: one definition for the plan of a run and for later refusals."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from itertools import count
+
+import numpy as np
+
+from probe_kit.statistics.estimates.balanced import CHANCE, GroupSums
+from probe_kit.statistics.estimates.crossfit import FEWEST_GROUPS
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most
+from probe_kit.statistics.folds import OUTER_FOLDS
+from probe_kit.statistics.label_permutations import possible_flips, smallest_p
+from probe_kit.statistics.sign_flips import smallest_flip_p
+from probe_kit.statistics.significance import SIGNIFICANCE
+
+GROUPS_FOR_PROBES = OUTER_FOLDS
+"""With fewer, `train` refuses the category."""
+GROUPS_FOR_RETENTION = max(OUTER_FOLDS, FEWEST_GROUPS)
+"""With fewer there are no probes, or no cross-fitted scores."""
+
+
+def least_probe_p(groups: int) -> float:
+    """The smallest p that label permutations of so many groups can give, if there are enough permutations."""
+    return smallest_p(possible_flips(groups))
+
+
+def groups_for_signal() -> int:
+    """Fewest groups of which a probe can be significant."""
+    return _fewest(lambda groups: least_probe_p(groups) < SIGNIFICANCE, GROUPS_FOR_PROBES)
+
+
+def groups_for_interventions() -> int:
+    """Fewest groups of which an effect can be beyond chance."""
+    return _fewest(lambda groups: smallest_flip_p(groups) < SIGNIFICANCE, 1)
+
+
+@lru_cache
+def groups_for_absence(episodes: int) -> int:
+    """Fewest groups of so many episodes with which a stream that knows nothing can be called absent.
+
+    That is at best: for a single site, right in half of the episodes, which differ as much within groups as
+    between them. `probe-kit power` simulates how often it happens.
+    """
+    return _fewest(lambda groups: _limit_at_chance(groups, episodes) < ABSENT_BELOW, GROUPS_FOR_RETENTION)
+
+
+def _limit_at_chance(groups: int, episodes: int) -> float:
+    """What `at_most` gives of one site that is right in half of the episodes, groups varying as episodes do.
+
+    Half of the groups lie a standard deviation above one half, and half of them as far below.
+    """
+    sizes = np.full(groups, float(episodes))
+    around = np.resize([1.0, -1.0], groups) * np.sqrt(episodes * CHANCE * (1 - CHANCE))
+    return at_most(GroupSums((sizes * CHANCE + around - around.mean())[None, :], sizes))
+
+
+def _fewest(enough: Callable[[int], bool], start: int) -> int:
+    return next(groups for groups in count(start) if enough(groups))

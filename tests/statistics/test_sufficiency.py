@@ -1,0 +1,110 @@
+"""What the plan calls enough is what the methods do with so many groups."""
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats  # type: ignore[import-untyped]
+
+from probe_kit.errors import TooFewGroupsError
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
+from probe_kit.statistics.label_permutations import ENUMERATED_BELOW, flip_groups, possible_flips, smallest_p
+from probe_kit.statistics.sign_flips import EXACT, max_t, smallest_flip_p
+from probe_kit.statistics.significance import SIGNIFICANCE, chance_margin, items_for_width
+from probe_kit.statistics.sufficiency import (
+    GROUPS_FOR_PROBES,
+    GROUPS_FOR_RETENTION,
+    groups_for_absence,
+    groups_for_interventions,
+    groups_for_signal,
+    least_probe_p,
+)
+from probe_kit.train.crossval.category_problem import category_problem
+from probe_kit.train.settings import ProbeSettings
+
+
+def episodes(groups: int) -> pd.DataFrame:
+    """Two items of two layouts per group."""
+    rows = [
+        {
+            "episode_id": f"{group}-{item}:{layout[0]}", "item_id": f"{group}-{item}", "group_id": f"g{group}",
+            "category": "color", "layout": layout, "side_correct": side, "side_placed": side, "outcome": "correct",
+            "target_concept": f"a{group}", "distractor_concept": f"b{group}",
+        }
+        for group in range(groups)
+        for item in range(2)
+        for layout, side in (("original", "left"), ("swapped", "right"))
+    ]  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+@pytest.mark.parametrize("groups", range(2, ENUMERATED_BELOW))
+def test_possible_flips_are_those_that_are_made(groups: int) -> None:
+    table = episodes(groups)
+    labels = (table["side_correct"] == "left").to_numpy()
+    assert flip_groups(labels, table["group_id"], 5000, 0).shape[1] == possible_flips(groups)
+    assert least_probe_p(groups) == smallest_p(possible_flips(groups))
+
+
+@pytest.mark.parametrize("groups", range(3, 9))
+def test_train_refuses_and_warns_where_the_plan_says_so(groups: int) -> None:
+    settings = ProbeSettings(
+        model="little", random_weights=True, weights=None, suite="", run_settings="", episodes="",
+        categories=("color",), views=("mean",), target="correct", permutations=1000, seed=0,
+    )  # fmt: skip
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        if groups < GROUPS_FOR_PROBES:
+            with pytest.raises(
+                TooFewGroupsError, match=f"{groups} independent groups .* {GROUPS_FOR_PROBES} folds"
+            ):
+                category_problem(episodes(groups), "color", settings)
+            return
+        category_problem(episodes(groups), "color", settings)
+    assert any("the smallest possible p" in str(one.message) for one in said) == (groups < groups_for_signal())
+
+
+@pytest.mark.parametrize("groups", range(2, EXACT + 2))
+def test_no_sign_flip_gives_a_smaller_p(groups: int) -> None:
+    effects = np.repeat(np.linspace(1, 2, groups), 2)[None, :]
+    names = np.repeat(np.arange(groups), 2)
+    _, p, _ = max_t(effects, np.arange(2 * groups), names, 0)
+    assert p[0] >= smallest_flip_p(groups)
+    if groups <= EXACT:
+        assert p[0] == smallest_flip_p(groups)
+    assert (smallest_flip_p(groups) < SIGNIFICANCE) == (groups >= groups_for_interventions())
+
+
+@pytest.mark.parametrize("size", [2, 4, 8])
+def test_absence_can_be_said_where_the_limit_at_one_half_is_below_the_bound(size: int) -> None:
+    def limit(groups: int) -> float:
+        """Korn and Graubard's, of groups that vary as single episodes do, with a variance of G − 1 degrees."""
+        count = groups * size
+        lost = stats.t.ppf(1 - SIGNIFICANCE, count - 1) / stats.t.ppf(1 - SIGNIFICANCE, groups - 1)
+        trials = count * (groups - 1) / groups * lost**2  # the variance is that of a sample, over G − 1
+        return float(stats.beta.ppf(1 - SIGNIFICANCE, trials / 2 + 1, trials / 2))
+
+    found = groups_for_absence(size)
+    even = [groups for groups in range(4, 60, 2) if limit(groups) < ABSENT_BELOW]
+    assert even[0] - 1 <= found <= even[0]
+    assert found >= GROUPS_FOR_RETENTION
+
+
+def test_the_fewest_groups_are_those_of_the_page() -> None:
+    page = (Path(__file__).parents[2] / "docs/statistics.md").read_text(encoding="utf-8")
+    lines = dict(re.findall(r"^\| ([a-z ]+) \| .* \| (\d+)[^|]*\|$", page, re.MULTILINE))
+    found = {
+        "probes": GROUPS_FOR_PROBES, "retention": GROUPS_FOR_RETENTION, "verdict shown": groups_for_signal(),
+        "verdict absent": groups_for_absence(4), "interventions": groups_for_interventions(),
+    }  # fmt: skip
+    assert {name: int(lines[name]) for name in found} == found
+    assert f"± 10 points take {items_for_width(0.2)} items" in page
+
+
+def test_the_margin_of_so_many_items_is_the_one_that_was_asked_for() -> None:
+    for margin in (0.05, 0.1, 0.2):
+        items = items_for_width(2 * margin)
+        assert chance_margin(items) <= margin < chance_margin(items - 1)
