@@ -16,10 +16,18 @@ if TYPE_CHECKING:
     from probe_kit.intervene.kinds.erase.intervention import ConceptErasure
     from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, stored_image_swaps
     from probe_kit.intervene.kinds.image_swap.intervention import ImageSwap
-    from probe_kit.intervene.kinds.image_swap.verdict import Behaviour, UseVerdict, classify_all, classify_use
+    from probe_kit.intervene.kinds.image_swap.verdict import (
+        Behaviour,
+        Places,
+        UseVerdict,
+        classify_all,
+        classify_use,
+    )
     from probe_kit.intervene.kinds.instruction_swap.effects import InputSensitivity, InstructionSwapEffect
     from probe_kit.intervene.kinds.instruction_swap.intervention import InstructionSwap
     from probe_kit.intervene.kinds.interchange.intervention import Interchange
+    from probe_kit.intervene.kinds.joint.effects import JointEffect, stored_joint_places
+    from probe_kit.intervene.kinds.joint.intervention import JointPlaces
     from probe_kit.intervene.kinds.site_effects import PatchEffect
     from probe_kit.intervene.kinds.steer.intervention import Steering
     from probe_kit.intervene.replay.session import ReplaySession, ReplaySource
@@ -46,7 +54,10 @@ __all__ = [
     "InstructionSwapEffect",
     "Interchange",
     "InterventionResult",
+    "JointEffect",
+    "JointPlaces",
     "PatchEffect",
+    "Places",
     "ReplaySession",
     "ReplaySource",
     "Steering",
@@ -59,6 +70,7 @@ __all__ = [
     "stored_attention",
     "stored_image_swaps",
     "stored_interventions",
+    "stored_joint_places",
     "stored_site_effects",
 ]
 
@@ -90,6 +102,10 @@ __getattr__, __dir__ = lazy_names(
         "UseVerdict": "kinds.image_swap.verdict",
         "ReplaySource": "replay.session",
         "Behaviour": "kinds.image_swap.verdict",
+        "JointEffect": "kinds.joint.effects",
+        "JointPlaces": "kinds.joint.intervention",
+        "Places": "kinds.image_swap.verdict",
+        "stored_joint_places": "kinds.joint.effects",
         "run_intervention": "runner",
         "classify_use": "kinds.image_swap.verdict",
         "classify_all": "kinds.image_swap.verdict",

@@ -75,7 +75,7 @@ def _execute(
     wanted = items_of(run, intervention)
     with open_session(run, source, load) as session, session.ready():
         session.on_fit_progress = on_fit_progress or notebook_progress("items learnt from")
-        _check_roles(session, settings)
+        _check_roles(session, settings, getattr(type(intervention), "roles", ROLES))
         items = intervention.eligible_items(session, wanted)
         conditions = intervention.conditions(session)
         parts = _replay_items(
@@ -100,14 +100,17 @@ def _execute(
     pieces.discard()
 
 
-def _check_roles(session: ReplaySession, settings: Mapping[str, Any]) -> None:
-    """Raise UsageError for a role that nothing at the asked sites plays: the table would be silent about it."""
+def _check_roles(session: ReplaySession, settings: Mapping[str, Any], usual: Sequence[str]) -> None:
+    """Raise UsageError for a role that nothing at the asked sites plays: the table would be silent about it.
+
+    usual: the roles of the kind if none are named, of which one that is there will do.
+    """
     roles, sites = settings.get("roles"), settings.get("sites")
     intervention = [(sites, roles)] if roles and sites else []
     intervention += [([name.place], [name.role]) for name in map(ConditionName.parse, settings.get("targets", ()))]
     for patterns, wanted in intervention:
         found = [place.stream for pattern in patterns for place in resolve_sites(pattern, session.policy)]
-        check_roles_have_tokens(session.policy, tuple(dict.fromkeys(found)), wanted, ROLES)
+        check_roles_have_tokens(session.policy, tuple(dict.fromkeys(found)), wanted, usual)
 
 
 def check_supported(run: Run, intervention: Intervention) -> None:

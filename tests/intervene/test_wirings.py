@@ -4,10 +4,14 @@ from collections.abc import Mapping
 
 import pytest
 
+from probe_kit.errors import UsageError
 from probe_kit.intervene import ConditionOutcomes, ImageSwapEffect, UseVerdict, classify_all
 from probe_kit.intervene.edits.sites import resolve_sites
+from probe_kit.intervene.kinds.base import Measurement
 from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
 from probe_kit.intervene.kinds.interchange.intervention import PatchedFromSource
+from probe_kit.intervene.kinds.joint.effects import JointEffect, describe_joint_places, measured_joint_places
+from probe_kit.intervene.kinds.joint.intervention import JointPlaces
 from probe_kit.intervene.kinds.site_effects import patch_effects
 from probe_kit.intervene.replay.conditions import Condition
 from probe_kit.intervene.results.site_maps import localised_sites
@@ -120,3 +124,65 @@ def test_a_place_is_named_where_the_answer_is_read(
     rows = patch_effects(outcomes, SUITE)
     assert next(row for row in rows if row.place == "expert.01").is_localised
     assert localised_sites(rows) == located
+
+
+# -- joint places ------------------------------------------------------------------------------------------------
+
+
+def joint(
+    session: WiredSession, name: str, sites: str = "kv.*", roles: tuple[str, ...] = ("language",)
+) -> dict[str, JointEffect]:
+    """By part and cells, what `--kind joint` finds."""
+    asked = JointPlaces(categories=(name,), sites=(sites,), roles=roles)
+    conditions = asked.conditions(session)
+    outcomes = outcomes_of(session, [name], conditions[2:])
+    entries = asked.certificate_entries(conditions, None)  # type: ignore[arg-type]
+    measurement = Measurement(outcomes, SUITE, {}, entries, lambda _: b"")
+    rows = measured_joint_places(measurement)
+    return {row.cells if row.part == "cell" else row.part: row for row in rows}
+
+
+def test_a_single_place_is_read_and_is_the_smallest_set(wired: WiredSession) -> None:
+    rows = joint(wired, "copied")
+    assert (rows["kv.01 language"].finding, rows["kv.02 language"].finding) == ("read here", "nothing alone")
+    assert (rows["minimal"].cells, rows["minimal"].finding) == ("kv.01 language", "read here")
+    assert describe_joint_places(list(rows.values())) == "read at kv.01 language"
+
+
+def test_a_majority_of_blocks_is_read_jointly_and_at_no_single_place(wired: WiredSession) -> None:
+    rows = joint(wired, "blocks")
+    words = [rows[f"kv.{block:02d} language"] for block in range(3)]
+    assert {row.finding for row in words} == {"nothing alone"}
+    assert all(abs(row.alone or 0) <= 0.02 and abs(row.needed or 0) <= 0.02 for row in words)
+    found = rows["minimal"]
+    assert (found.cells, found.finding, found.n_groups) == ("kv.01 language + kv.02 language", "read jointly", 6)
+    assert (found.alone or 0) >= 0.95
+    assert describe_joint_places(list(rows.values())).startswith("no single place: read jointly at kv.01")
+
+
+def test_a_majority_of_roles_is_found_within_one_block(wired: WiredSession) -> None:
+    rows = joint(wired, "roles", "kv.01", ("image", "language", "state"))
+    assert rows["minimal"].cells == "kv.01 language + kv.01 state"
+    assert rows["minimal"].finding == "read jointly"
+
+
+def test_what_bypasses_the_backbone_is_past_all_cells(wired: WiredSession) -> None:
+    rows = joint(wired, "bypass")
+    assert rows["every-cell"].finding == "past it"
+    assert "minimal" not in rows
+    assert describe_joint_places(list(rows.values())) == "past kv"
+
+
+def test_an_exchange_finds_the_place_that_a_backup_hides_from_erasing(wired: WiredSession) -> None:
+    rows = joint(wired, "backup")
+    assert rows["kv.01 language"].finding == "read here"
+    assert (rows["kv.01 language"].alone or 0) == pytest.approx(1.0, abs=0.02)
+
+
+def test_layers_that_follow_each_other_are_no_parallel_cells(wired: WiredSession) -> None:
+    with pytest.raises(UsageError, match="one after the other"):
+        JointPlaces(categories=("copied",), sites=("backbone.*",)).conditions(wired)
+    with pytest.raises(UsageError, match="two cells or more"):
+        JointPlaces(categories=("copied",), sites=("kv.01",), roles=("image",)).conditions(wired)
+    with pytest.raises(UsageError, match="share no token"):
+        JointPlaces(roles=("all", "image"))

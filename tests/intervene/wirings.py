@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+import pandas as pd
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -266,8 +267,15 @@ class WiredSession(ReplaySession):
     """A replay session without a simulator: the tiles lie left and right of zero."""
 
     def __init__(self) -> None:
-        self.policy, self.run = WiredPolicy(), SimpleNamespace(model="wired")  # type: ignore[assignment]
+        self.policy, self.on_fit_progress = WiredPolicy(), None
+        inputs = [one for name in WIRINGS for one in replay_inputs(name)]
+        columns = {"category": [one.category for one in inputs], "item_id": [one.item_id for one in inputs]}
+        self.run = SimpleNamespace(model="wired", episodes=pd.DataFrame(columns))  # type: ignore[assignment]
         self._middle, self._across = np.zeros(2), np.array([0.0, 1.0])
+
+    def replay_inputs(self, item_id: str) -> list[ReplayInput]:
+        """Both layouts of one item."""
+        return [one for one in replay_inputs(item_id.rpartition("-")[0]) if one.item_id == item_id]
 
 
 def replay_inputs(name: str, x: float = 0.0) -> list[ReplayInput]:

@@ -83,8 +83,21 @@ def apply_patch(
     Raises CaptureError for another number of tokens, and what `hooks.edit` raises, such as for a site that fires
     another number of times than its tap promises.
     """
-    with _edited(policy, {site: [(tokens, change)] for site in sites}) as log:
+    with apply_patches(policy, {site: [(tokens, change)] for site in sites}) as log:
         yield log
+
+
+@contextmanager
+def apply_patches(
+    model: "Model", changes: Mapping[Site, Sequence[tuple[TokenSelection, TokenEdit]]]
+) -> Iterator[EditLog]:
+    """The same at several sites, each with tokens and changes of its own, in their order."""
+    from probe_kit.hooks.capturing.capture_context import edit
+
+    log, active = EditLog(), _ActiveEdits()
+    with edit(model, {site: partial(active.apply, site, own) for site, own in changes.items()}):
+        yield log
+    log.entries += active.measured()
 
 
 @contextmanager
@@ -108,20 +121,8 @@ def apply_edits(
             if mask.any():
                 tokens = TokenSelection.of(mask.ravel(), model.card.device)
                 changes[site].append((tokens, DeclaredEdit(own, vector, mask.shape[1])))
-    with _edited(model, changes) as log:
+    with apply_patches(model, changes) as log:
         yield log
-
-
-@contextmanager
-def _edited(
-    model: "Model", changes: Mapping[Site, Sequence[tuple[TokenSelection, TokenEdit]]]
-) -> Iterator[EditLog]:
-    from probe_kit.hooks.capturing.capture_context import edit
-
-    log, active = EditLog(), _ActiveEdits()
-    with edit(model, {site: partial(active.apply, site, own) for site, own in changes.items()}):
-        yield log
-    log.entries += active.measured()
 
 
 def _vector(own: Edit, given: Vectors) -> NDArray[np.float32] | None:

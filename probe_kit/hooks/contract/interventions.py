@@ -14,7 +14,7 @@ per-step: its sum over every inference of the unedited episode; only the clean a
 ASKED_AS: Mapping[InterventionKind, tuple[str, tuple[str, ...]]] = MappingProxyType(
     {
         "swap": ("--kind", ("image-swap", "instruction-swap")),
-        "edit": ("--kind", ("interchange", "steer", "closed-loop", "erase")),
+        "edit": ("--kind", ("interchange", "joint", "steer", "closed-loop", "erase")),
         "attention": ("--kind", ("attention",)),
         "kv": ("--sites", ("kv.*",)),
         "tiles": ("--roles", ("image.left", "image.right")),

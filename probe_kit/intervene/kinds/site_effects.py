@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.base import (
     ConditionName,
     EffectRow,
@@ -56,6 +57,15 @@ class PatchEffect(EffectRow):
         """Whether it carries half of the effect, beyond chance among all that was tried."""
         enough = self.effect is not None and self.effect >= LOCALISATION_SHARE
         return enough and self.p_fwe is not None and self.p_fwe < SIGNIFICANCE
+
+    @property
+    def is_by_construction(self) -> bool:
+        """Whether its place carries the effect in every policy that acts on the images, and so locates nothing.
+
+        The first layer of the backbone holds the swapped images themselves, and the acting stream the action.
+        """
+        stream, _, layer = self.place.partition("@")[0].partition(".")
+        return stream not in ("backbone", KV_STREAM) or (stream == "backbone" and int(layer) == 0)
 
     @property
     def name(self) -> str:

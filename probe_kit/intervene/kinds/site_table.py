@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 _LEGEND = (
     "effect: share of what the whole image swap does, n/a where that is not beyond chance; net flip rate: share "
     "of episodes that flip to the target side, minus those that flip away from it; p: family-wise over all edits "
-    "of the category, one-sided; relative change: how far tokens were moved, in their own norms"
+    "of the category, one-sided; relative change: how far tokens were moved, in their own norms; *: carries the "
+    "effect by construction and locates nothing"
 )
 
 
@@ -27,7 +28,7 @@ def site_table(rows: Sequence[PatchEffect], context: TableContext) -> "Responsiv
         caption=_LEGEND,
         name="category · edit",
         names=tuple(f"{row.category} · {row.name}" for row in shown),
-        styles=tuple("bold" if row.is_localised else "" for row in shown),
+        styles=tuple("bold" if row.is_localised and not row.is_by_construction else "" for row in shown),
         parts=(
             Part(
                 "What the action does",
@@ -69,7 +70,7 @@ def _cells(row: PatchEffect) -> "tuple[Cell, ...]":
 
     low, high = row.net_ci
     texts = (
-        "n/a" if row.effect is None else f"{row.effect:.2f}",
+        "n/a" if row.effect is None else f"{row.effect:.2f}{'*' * row.is_by_construction}",
         f"{row.net:+.2f} [{low:+.2f}, {high:+.2f}]",
         f"{row.net_left:+.2f} / {row.net_right:+.2f}",
         f"{100 * row.mean_displacement:+.2f}",

@@ -16,7 +16,7 @@ from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict, classify_al
 from probe_kit.intervene.kinds.kind import Kind
 from probe_kit.intervene.kinds.reach import tiles_apart
 from probe_kit.intervene.kinds.registry import kind_of
-from probe_kit.intervene.results.site_maps import stored_carrying_directions, stored_localised_sites
+from probe_kit.intervene.results.places import stored_places
 from probe_kit.intervene.store.answers import ConditionOutcomes, StoredIntervention, find_stored
 from probe_kit.intervene.store.settings import PER_STEP
 from probe_kit.statistics.sign_flips import smallest_flip_p
@@ -206,7 +206,7 @@ def verdicts_of(run: RunReader, shown: Sequence[ImageSwapEffect] = ()) -> dict[s
     except NoProbesError:
         results = None
     found = {**stored_image_swaps(run), **{row.category: row for row in shown}}
-    return classify_all(found, encoded_in(results), stored_localised_sites(run), stored_carrying_directions(run))
+    return classify_all(found, encoded_in(results), stored_places(run))
 
 
 def effects_csv(measurement: Measurement) -> str:

@@ -55,19 +55,10 @@ def keys_in_use(run: RunReader) -> set[str]:
 def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
     """The places, each once, that carry half of the effect or more when their tokens are patched in full.
 
-    Without those that carry it by construction, see `carries_by_construction`.
+    Without those that carry it by construction.
     """
     found = [row for row in rows if row.is_localised and not row.direction]
-    return tuple(dict.fromkeys(row.place for row in found if not carries_by_construction(row.place)))
-
-
-def carries_by_construction(place: str) -> bool:
-    """Whether a place carries the effect in every policy that acts on the images.
-
-    The first layer of the backbone holds the swapped images themselves, and the acting stream holds the action.
-    """
-    stream, _, layer = place.partition("@")[0].partition(".")
-    return stream not in (BACKBONE, KV_STREAM) or (stream == BACKBONE and int(layer) == 0)
+    return tuple(dict.fromkeys(row.place for row in found if not row.is_by_construction))
 
 
 def stored_localised_sites(run: RunReader) -> dict[str, tuple[str, ...]]:

@@ -77,7 +77,10 @@ class ConditionOutcomes:
 
     def only(self, category: str) -> "ConditionOutcomes":
         """The episodes of one category."""
-        chosen = self.categories == category
+        return self.of_episodes(self.categories == category)
+
+    def of_episodes(self, chosen: NDArray[np.bool_]) -> "ConditionOutcomes":
+        """Some of the episodes. chosen: (E,)."""
         axes = {"displacement": 1, "max_action_change": 1, "edit_log": 1, "episode_outcomes": 1}
         cut: dict[str, Any] = {
             name: np.compress(chosen, value, axes.get(name, 0))

@@ -9,7 +9,7 @@ from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.kinds.image_swap.effects import stored_image_swaps
-from probe_kit.intervene.results.site_maps import stored_carrying_directions, stored_localised_sites
+from probe_kit.intervene.results.places import stored_places
 from probe_kit.retention.behaviour.success_rate import (
     SuccessRate,
     capture_only,
@@ -85,13 +85,13 @@ def run_rows(
         probed = ", ".join(results.settings.views)
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
     judged, found = RunUnderRule.of(run, settings.rule, settings.last_steps), stored_image_swaps(run)
-    located, carried = (stored_localised_sites(run), stored_carrying_directions(run)) if found else ({}, {})
+    places = stored_places(run) if found else {}
     drawn = [
         _row(judged, results, settings, group, str(category), episodes, view)
         for category, episodes in judged.run.episodes.groupby("category", sort=False)
         for view in shown
     ]
-    return [replace(one, row=add_image_swap(one.row, found, located, carried)) for one in drawn]
+    return [replace(one, row=add_image_swap(one.row, found, places)) for one in drawn]
 
 
 def _row(

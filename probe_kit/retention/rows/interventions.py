@@ -3,33 +3,29 @@
 Reads what `probe-kit intervene` left in the run; no model is loaded.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from math import isfinite
 
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
-from probe_kit.intervene.kinds.image_swap.verdict import classify_use, control_for
+from probe_kit.intervene.kinds.image_swap.verdict import Places, classify_use, control_for
 from probe_kit.retention.rows.parts import SwapEffect
 from probe_kit.retention.rows.row import RetentionRow
 
 
 def add_image_swap(
-    row: RetentionRow,
-    found: Mapping[str, ImageSwapEffect],
-    located: Mapping[str, Sequence[str]],
-    carried: Mapping[str, Sequence[str]],
+    row: RetentionRow, found: Mapping[str, ImageSwapEffect], places: Mapping[str, Places]
 ) -> RetentionRow:
     """The row with the effect of the image swap on its category, judged by its own probes.
 
-    found: by category; may be empty. located: places that carry it, by category, of those that were searched.
-    carried: directions that do.
+    found: by category; may be empty. places: by category, where it passes and is read.
     """
     own = found.get(row.category)
     if own is None:
         return row
     encoded = row.backbone.has_signal if row.backbone.exceeds else None
     category, control = row.category, control_for(row.category, found)
-    use = classify_use(encoded, own, control, located.get(category), carried.get(category, ()))
+    use = classify_use(encoded, own, control, places.get(category))
     effect = SwapEffect(
         follow_rate=own.follow_rate,
         reversal_rate=own.reversal_rate,

@@ -107,6 +107,6 @@ def test_what_a_family_supports_is_listed_in_the_words_of_the_command() -> None:
     assert option["--roles"] == list(TILE_ROLES)
     assert [Site.parse(f"{site.removesuffix('*')}02.keys").stream for site in option["--sites"]] == ["kv"]
     page = CliRunner().invoke(app, ["models", "internvla-m1"]).stdout
-    assert "intervene  --kind image-swap, instruction-swap, interchange, steer, closed-loop, erase" in page
+    assert "intervene  --kind image-swap, instruction-swap, interchange, joint, steer, closed-loop, erase" in page
     assert "kv.*" not in page
     assert "; --sites kv.*" in CliRunner().invoke(app, ["models", "pi0-tiny"]).stdout

@@ -8,6 +8,7 @@ import pytest
 from probe_kit.intervene import ConditionOutcomes, PatchEffect, classify_use
 from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
+from probe_kit.intervene.kinds.image_swap.verdict import Places
 from probe_kit.intervene.kinds.site_effects import patch_effects
 from probe_kit.intervene.results.site_maps import localised_sites
 from tests.intervene.answers import follower, habit, outcomes_of
@@ -110,5 +111,9 @@ def test_the_place_is_said_beside_the_behaviour_and_does_not_change_it() -> None
         ("backbone.01", "kv.02", "backbone.02"): "passes at backbone.01, backbone.02; read at kv.02",
     }
     for located, expected in places.items():
-        use = classify_use(True, found, None, located)
+        use = classify_use(True, found, None, Places(located))
         assert (use.behaviour, use.place) == ("used", expected)
+    jointly = "no single place: read jointly at kv.01 language + kv.02 language"
+    assert str(Places((), jointly=jointly)) == jointly
+    assert str(Places(("backbone.01",), jointly=jointly)) == f"passes at backbone.01; {jointly}"
+    assert str(Places(("kv.01",), jointly=jointly)) == "read at kv.01"

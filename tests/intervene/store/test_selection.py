@@ -22,9 +22,9 @@ from probe_kit.intervene import (
     stored_image_swaps,
 )
 from probe_kit.intervene.results.inventory import listed_interventions
+from probe_kit.intervene.results.places import stored_places
 from probe_kit.intervene.results.results import effects_of
 from probe_kit.intervene.results.site_maps import (
-    stored_carrying_directions,
     stored_localised_sites,
     stored_site_effects,
     stored_steering,
@@ -190,7 +190,7 @@ def read(run: ArrayRun) -> dict[str, Any]:
         "along": stored_subspace_effects(run),
         "steering": stored_steering(run),
         "attention": {name: own.to_bytes() for name, own in stored_attention(run).items()},
-        "verdicts": classify_all(found, encoded, stored_localised_sites(run), stored_carrying_directions(run)),
+        "verdicts": classify_all(found, encoded, stored_places(run)),
         "targets": best_patch_targets(run, ["color"]),
     }
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import pytest
 
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
+from probe_kit.intervene.kinds.image_swap.verdict import Places
 from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
 from probe_kit.retention.columns.sentences import conclusion, describe_category, verdict
 from probe_kit.retention.rows.interventions import add_image_swap
@@ -106,7 +107,7 @@ def combination(
     )  # fmt: skip
     own = SWAPS[swapped]
     found = {} if own is None else {"color": own, **(CONTROL if control else {})}
-    return add_image_swap(row, found, {} if located is None else {"color": located}, {})
+    return add_image_swap(row, found, {} if located is None else {"color": Places(located)})
 
 
 def every_combination() -> Iterator[tuple[str, str, str, str, RetentionRow]]:

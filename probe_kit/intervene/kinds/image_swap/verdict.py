@@ -244,25 +244,38 @@ def _ends(limits: tuple[float, float]) -> str:
 # -- with what else is stored ----------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Places:
+    """What was found inside the network, in one category.
+
+    located: places that carry half of the effect; None if an interchange did not search for them. carried: places
+    and the directions along which half of it passes there. jointly: what joint places found, in words.
+    """
+
+    located: tuple[str, ...] | None = None
+    carried: tuple[str, ...] = ()
+    jointly: str = ""
+
+    def __str__(self) -> str:
+        located = self.located or ()
+        is_read = any(place.partition(".")[0] == KV_STREAM for place in located)
+        found = "; ".join(filter(None, (describe_sites(located, self.carried), "" if is_read else self.jointly)))
+        return found or NOT_LOCATED * (self.located is not None)
+
+
 def classify_use(
-    encoded: bool | None,
-    found: ImageSwapEffect,
-    control: str | None,
-    located: Sequence[str] | None = None,
-    carried: Sequence[str] = (),
+    encoded: bool | None, found: ImageSwapEffect, control: str | None, places: Places | None = None
 ) -> UseVerdict:
-    """The verdict of the image swap, with what interchanges and probes say of it.
+    """The verdict of the image swap, with what probes and interventions inside the network say of it.
 
     encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
-    without probes. control: see `classify_behaviour`. located: places that carry half of the effect, if an
-    interchange searched for them. carried: places and the directions along which half of it passes there.
+    without probes. control: see `classify_behaviour`. places: None if nothing was tried inside.
     """
     own = classify_behaviour(found, control)
     if own.behaviour in ("not used", "inconclusive"):
         return own
-    place = "" if located is None else describe_sites(located, carried) or NOT_LOCATED
     tie = "" if encoded is None else NOT_TESTED if encoded else NO_COPY
-    return replace(own, place=place, tie=tie)
+    return replace(own, place=str(places or ""), tie=tie)
 
 
 def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
@@ -287,17 +300,14 @@ def control_for(category: str, found: Mapping[str, ImageSwapEffect]) -> str | No
 def classify_all(
     found: Mapping[str, ImageSwapEffect],
     encoded: Mapping[str, bool | None],
-    located: Mapping[str, Sequence[str]] = MappingProxyType({}),
-    carried: Mapping[str, Sequence[str]] = MappingProxyType({}),
+    places: Mapping[str, Places] = MappingProxyType({}),
 ) -> dict[str, UseVerdict]:
     """Of every category that was intervened on.
 
-    encoded, located, carried: by category; one that is not there was not probed, or not looked for inside.
+    encoded, places: by category; one that is not there was not probed, or not looked for inside.
     """
     return {
-        name: classify_use(
-            encoded.get(name), one, control_for(name, found), located.get(name), carried.get(name, ())
-        )
+        name: classify_use(encoded.get(name), one, control_for(name, found), places.get(name))
         for name, one in found.items()
     }
 

@@ -1,0 +1,1 @@
+"""Joint places: which cells carry the effect together, which alone, and which are needed."""

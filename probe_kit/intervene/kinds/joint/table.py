@@ -1,0 +1,56 @@
+"""What sets of cells carry, as a table for a terminal."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from probe_kit.intervene.kinds.base import TableContext
+from probe_kit.intervene.kinds.joint.effects import EVERY, MINIMAL, SECOND, JointEffect
+
+if TYPE_CHECKING:
+    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
+
+_LEGEND = (
+    "alone: share of the image swap with only these cells patched; needed: what all cells lose without them; "
+    "read here: both at least 0.5; enough alone: another copy is read as well; needed, not enough: one part of "
+    "several; nothing alone: neither, which leaves a part of a set; smallest set: searched in one half of the "
+    "groups, scored in the other; p: that the action moves toward the target side, of cells max-T over all"
+)
+_PARTS = {EVERY: "all cells of", MINIMAL: "smallest set:", SECOND: "without it:"}
+
+
+def joint_table(rows: Sequence[JointEffect], context: TableContext) -> "ResponsiveTable":
+    """One line per category and set."""
+    from probe_kit._terminal.responsive_table import Part, ResponsiveTable
+
+    return ResponsiveTable(
+        title=f"Where is it read, alone and jointly? {context.subject}, joint places",
+        caption=_LEGEND,
+        name="category · cells",
+        names=tuple(
+            " ".join(filter(None, (f"{row.category} ·", _PARTS.get(row.part, ""), row.cells))) for row in rows
+        ),
+        styles=tuple("bold" if row.finding.startswith("read") else "" for row in rows),
+        parts=(
+            Part(
+                "Share of the image swap",
+                ("alone [95 %]", "needed [95 %]", "p", "groups", "finding"),
+                tuple(_cells(row) for row in rows),
+            ),
+        ),
+    )
+
+
+def _cells(row: JointEffect) -> "tuple[Cell, ...]":
+    from probe_kit._terminal.responsive_table import Cell
+
+    texts = (
+        _share(row.alone, row.alone_ci), _share(row.needed, row.needed_ci),
+        f"{row.p if row.p_fwe is None else row.p_fwe:.2g}", str(row.n_groups), row.finding,
+    )  # fmt: skip
+    return tuple(map(Cell, texts))
+
+
+def _share(value: float | None, limits: tuple[float, float] | None) -> str:
+    if value is None or limits is None:
+        return "–"
+    return f"{value:.2f} [{limits[0]:.2f}, {limits[1]:.2f}]"

@@ -1,0 +1,68 @@
+"""Joint places on a real run: a set of one cell is the interchange, and what is stored has its tables."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from probe_kit._terminal.console import out
+from probe_kit.errors import UnsupportedInterventionError
+from probe_kit.extract import Run
+from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.intervene import Interchange, InterventionResult, ReplaySource, run_intervention
+from probe_kit.intervene.kinds.joint.effects import joint_keys_in_use, stored_joint_places
+from probe_kit.intervene.kinds.joint.intervention import JointPlaces
+from probe_kit.intervene.results.inventory import listed_interventions
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+SITES, ROLES = ("kv.00", "kv.01"), ("image", "language")
+
+
+@pytest.fixture(scope="module")
+def result(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult:
+    asked = JointPlaces(categories=("color",), items=2, sites=SITES, roles=ROLES)
+    return run_intervention(copy, asked, source, load=lambda *_: twin)
+
+
+def test_one_cell_alone_is_the_interchange_at_its_place_bit_for_bit(
+    copy: Run, source: ReplaySource, twin: "Policy", result: InterventionResult
+) -> None:
+    asked = Interchange(categories=("color",), items=2, sites=SITES, roles=ROLES)
+    singly = run_intervention(copy, asked, source, load=lambda *_: twin).outcomes
+    for place in SITES:
+        for role in ROLES:
+            np.testing.assert_array_equal(
+                result.outcomes.of(f"alone|{place}|{role}"), singly.of(f"{place}|{role}")
+            )
+
+
+def test_all_cells_but_one_are_the_other_cells_together(result: InterventionResult) -> None:
+    """Block 2 was not named: everything that is patched and left out is known."""
+    changed = dict(zip(result.outcomes.conditions, result.outcomes.max_action_change, strict=True))
+    assert (changed["every-cell"] > 0).all()
+    assert (changed["without|kv.00|image"] != changed["every-cell"]).any()
+    fires = {name: row["fires"] for name, row in result.certificate["edits"].items()}
+    assert fires["every-cell"] == 4 * fires["alone|kv.00|image"] == 4 / 3 * fires["without|kv.00|image"]
+
+
+def test_it_is_stored_listed_and_shown(copy: Run, result: InterventionResult) -> None:
+    rows = stored_joint_places(copy)["color"]
+    assert [row.cells for row in rows if row.part == "cell"] == [
+        f"{place} {role}" for place in SITES for role in ROLES
+    ]
+    assert {row.finding for row in rows} == {"n/a"}, "two items are no evidence"
+    assert joint_keys_in_use(copy) == {result.key}
+    assert result.key in {one.key for one in listed_interventions(copy) if one.state == "used"}
+    assert set(result.certificate["joint"]) == {"color"}
+    with out.capture() as printed:
+        out.print(result.to_rich(), width=160)
+    assert "all cells of kv" in printed.get()
+    assert len(result.table) == len(rows)
+
+
+def test_a_family_without_keys_and_values_is_refused_by_name() -> None:
+    (_, kv) = JointPlaces().required_capabilities
+    with pytest.raises(UnsupportedInterventionError, match="kv"):
+        Interventions().check(kv, "other")
