@@ -81,12 +81,6 @@ class TableContext:
     verdicts: Mapping[str, CategoryVerdict]
 
 
-def category_name(category: str) -> str:
-    """A category at the beginning of a sentence."""
-    spelt = category.replace("_", " ")
-    return f"{spelt[:1].upper()}{spelt[1:]}"
-
-
 # -- names of conditions -------------------------------------------------------------------------------------
 
 

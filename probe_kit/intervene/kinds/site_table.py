@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit.intervene.kinds.base import TableContext, by_category, category_name, count_edits
+from probe_kit.intervene.kinds.base import TableContext, by_category, count_edits
 from probe_kit.intervene.kinds.site_effects import PatchEffect
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.suite.categories import category_of
 
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
@@ -49,7 +50,7 @@ def site_table(rows: Sequence[PatchEffect], context: TableContext) -> "Responsiv
 
 def site_sentences(rows: Sequence[PatchEffect], _: TableContext) -> list[str]:
     """One per category: which edits carry half of what the image swap does, or move the action at all."""
-    return [f"{category_name(name)}: {_finding(own)}." for name, own in by_category(rows).items()]
+    return [f"{category_of(name).title}: {_finding(own)}." for name, own in by_category(rows).items()]
 
 
 def _finding(rows: Sequence[PatchEffect]) -> str:

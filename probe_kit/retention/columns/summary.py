@@ -20,7 +20,7 @@ from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.estimators.stream_scores import Limits
 from probe_kit.retention.rows.row import MEAN, RetentionRow
-from probe_kit.retention.text import spell
+from probe_kit.suite.categories import category_of
 
 MARK = "✓"
 """After a share: the stream's signal is shown, or the regime of the behaviour is knowledge."""
@@ -161,8 +161,7 @@ def _difference_p(row: Difference) -> str:
 
 
 def _name(category: str) -> str:
-    spelt = spell(category)
-    return spelt[:1].upper() + spelt[1:]
+    return category_of(category).title
 
 
 def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.hooks.contract.sites import label_of
+from probe_kit.suite.categories import category_of
 from probe_kit.train.choices import Target
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 from probe_kit.train.results.probe_results import ProbeResults
@@ -55,11 +56,9 @@ def best_sites_sentences(results: ProbeResults) -> list[str]:
     found = []
     for category in dict.fromkeys(str(row["category"]) for row in rows):
         own = [row for row in rows if row["category"] == category]
-        name, count = category.replace("_", " "), own[0]["n"]
+        name, count = category_of(category).title, own[0]["n"]
         parts = "; ".join(map(_in_stream, own))
-        found.append(
-            f"{name[:1].upper()}{name[1:]} ({count} episodes): {_TARGETS[results.settings.target]} is {parts}."
-        )
+        found.append(f"{name} ({count} episodes): {_TARGETS[results.settings.target]} is {parts}.")
     return found
 
 

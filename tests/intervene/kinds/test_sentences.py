@@ -41,7 +41,7 @@ SAID = {
 def swap(response: str) -> ImageSwapEffect:
     follow, reversal, ci, p, reversal_p, share, share_ci = SWAPS[response]
     return ImageSwapEffect(
-        category="public_info", n_episodes=48, n_items=24, n_groups=12, follow_rate=follow, reversal_rate=reversal,
+        category="public-info", n_episodes=48, n_items=24, n_groups=12, follow_rate=follow, reversal_rate=reversal,
         net_follow_rate=follow - reversal, net_follow_rate_ci=ci, follow_p=p, reversal_p=reversal_p,
         median_displacement=0.1, reach=0.3, reach_source="actions", reach_share=share, reach_share_ci=share_ci,
         moved_share=abs(share), left_reached=follow - reversal, right_reached=follow - reversal,
@@ -49,7 +49,7 @@ def swap(response: str) -> ImageSwapEffect:
 
 
 def context(verdict: UseVerdict | None) -> TableContext:
-    verdicts = {} if verdict is None else {"public_info": verdict}
+    verdicts = {} if verdict is None else {"public-info": verdict}
     return TableContext(cast("Measurement", None), "", verdicts)
 
 
@@ -61,13 +61,13 @@ def test_an_image_swap_is_described_by_what_the_action_does_and_then_its_verdict
 ) -> None:
     found = classify_use(encoded, swap(response), control)
     (sentence,) = image_swap_sentences([swap(response)], context(found))
-    assert sentence == f"Public info (24 items): {SAID[response]} {found.sentence}"
+    assert sentence == f"Public Info (24 items): {SAID[response]} {found.sentence}"
 
 
 def test_an_instruction_swap_is_described_without_a_verdict() -> None:
     (sentence,) = instruction_swap_sentences([swap("reverses")], context(None))
     assert sentence == (
-        "Public info (24 items): the action follows a swap of the instruction in 0 % of episodes and does the "
+        "Public Info (24 items): the action follows a swap of the instruction in 0 % of episodes and does the "
         "reverse in 90 % (net -100 to -60 %)."
     )
 

@@ -130,3 +130,8 @@ def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:
     assert color.endswith("the model did not act. Shown in the backbone.")
     assert shape.endswith("the model did not act. Not shown in the backbone: more items would tell.")
     assert "acted on" not in " ".join(cell for line in summary_table([found]).cells for cell in line)
+
+
+def test_a_category_goes_by_its_title() -> None:
+    (found,) = summarise_runs([answers("public-info"), answers("ripe-fruit"), answers(MEAN)])
+    assert [sentence.partition(" (")[0] for sentence in found.sentences] == ["Public Info", "Ripe fruit"]

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit.intervene.kinds.base import TableContext, by_category, category_name, count_edits
+from probe_kit.intervene.kinds.base import TableContext, by_category, count_edits
 from probe_kit.intervene.kinds.closed_loop.effects import MIN_IN_ZONE_RATIO, ClosedLoopEffect
 from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST
 from probe_kit.intervene.store.answers import CLEAN
+from probe_kit.suite.categories import category_of
 
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
@@ -47,7 +48,7 @@ def closed_loop_table(rows: Sequence[ClosedLoopEffect], context: TableContext) -
 
 def closed_loop_sentences(rows: Sequence[ClosedLoopEffect], _: TableContext) -> list[str]:
     """One per category: at which places the cube turns to the other picture."""
-    return [f"{category_name(name)}: {_finding(own)}." for name, own in by_category(rows).items()]
+    return [f"{category_of(name).title}: {_finding(own)}." for name, own in by_category(rows).items()]
 
 
 def _finding(rows: Sequence[ClosedLoopEffect]) -> str:

@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit.intervene.kinds.base import TableContext, by_category, category_name, count_edits
+from probe_kit.intervene.kinds.base import TableContext, by_category, count_edits
 from probe_kit.intervene.kinds.erase.effects import ErasureEffect
+from probe_kit.suite.categories import category_of
 
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
@@ -45,7 +46,7 @@ def erasure_table(rows: Sequence[ErasureEffect], context: TableContext) -> "Resp
 
 def erasure_sentences(rows: Sequence[ErasureEffect], _: TableContext) -> list[str]:
     """One per category: which erasures take the answer from the action."""
-    return [f"{category_name(name)}: {_finding(own)}." for name, own in by_category(rows).items()]
+    return [f"{category_of(name).title}: {_finding(own)}." for name, own in by_category(rows).items()]
 
 
 def _finding(rows: Sequence[ErasureEffect]) -> str:

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from typing import Protocol
 
-from probe_kit.intervene.kinds.base import TableContext, category_name
+from probe_kit.intervene.kinds.base import TableContext
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
 from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict
+from probe_kit.suite.categories import category_of
 
 
 class Swapped(Protocol):
@@ -73,7 +74,7 @@ def _rates(row: ImageSwapEffect, what: str) -> str:
 
 
 def _begin(row: ImageSwapEffect) -> str:
-    return f"{category_name(row.category)} ({row.n_items} item{'s' * (row.n_items != 1)})"
+    return f"{category_of(row.category).title} ({row.n_items} item{'s' * (row.n_items != 1)})"
 
 
 def _percent(value: float | None) -> str:
