@@ -74,11 +74,15 @@ class Measurement:
 
 @dataclass(frozen=True)
 class TableContext:
-    """What a table says besides its rows. subject: model and suite. verdicts: by category."""
+    """What a table says besides its rows. subject: model and suite. verdicts: by category.
+
+    explains: whether the caption says what each verdict rests on, which sentences say too.
+    """
 
     measurement: Measurement
     subject: str
     verdicts: Mapping[str, CategoryVerdict]
+    explains: bool = True
 
 
 # -- names of conditions -------------------------------------------------------------------------------------

@@ -167,7 +167,8 @@ class InterventionResult:
 
     def to_rich(self, details: bool = True) -> "ResponsiveTable":
         """The table for a terminal. details: split it where it is wide, else leave columns out by name."""
-        table: ResponsiveTable = self._kind.function("table")(self.effects, self._context)
+        context = replace(self._context, explains=details)
+        table: ResponsiveTable = self._kind.function("table")(self.effects, context)
         return replace(table, splits=details)
 
     @property

@@ -34,7 +34,7 @@ def image_swap_table(rows: Sequence[ImageSwapEffect], context: TableContext) -> 
     said = [verdicts[row.category].verdict if row.category in verdicts else "–" for row in rows]
     return ResponsiveTable(
         title=f"Is it used? {context.subject}, images swapped",
-        caption="; ".join([_LEGEND, *partial, *reaches, *reasons]),
+        caption="; ".join([_LEGEND, *partial, *reaches, *(reasons if context.explains else ())]),
         name="category",
         names=tuple(row.category for row in rows),
         styles=("",) * len(rows),

@@ -30,7 +30,7 @@ class Swapped(Protocol):
 
 
 def describe_swap(swap: Swapped, use: UseVerdict) -> str:
-    """What a swap of the pictures does to the action, with its uncertainty."""
+    """What a swap of the pictures does to the action, with the numbers that the verdict's sentence lacks."""
     low, high = (_percent(limit) for limit in swap.net_follow_rate_ci or (None, None))
     followed, net = f"in {_percent(swap.follow_rate)} % of episodes", f"net of reversals {low} to {high} %"
     moved = "" if swap.reach_share is None else f", moved by {swap.reach_share:.2f} of its reach"
@@ -40,10 +40,11 @@ def describe_swap(swap: Swapped, use: UseVerdict) -> str:
         against = f"in {_percent(swap.reversal_rate)} % of episodes"
         return f"the action goes against the pictures, swapped or not, {against}"
     if use.is_bounded:
-        return f"the action does not follow a swap of the pictures ({followed}, {net}{moved})"
+        return f"the action does not follow a swap of the pictures ({followed})"
     if use.behaviour == "inconclusive":
-        return f"whether the action follows a swap of the pictures is open ({followed}, {net}{moved})"
-    return f"the action follows a swap of the pictures in part ({followed}, {net}{moved})"
+        return f"whether the action follows a swap of the pictures is open ({followed})"
+    numbers = f"{followed}, {net}{moved}" if use.is_used else followed
+    return f"the action follows a swap of the pictures in part ({numbers})"
 
 
 def image_swap_sentences(rows: Sequence[ImageSwapEffect], context: TableContext) -> list[str]:
