@@ -203,9 +203,9 @@ def test_absence_is_said_of_a_bounded_backbone_only_and_more_items_are_asked_for
             ("guessing", "shown", "absent", "does not follow"),
             "(24 items): the backbone holds the answer (98 %, 88 to 100); the action expert does not hold it (50 "
             "%, at most 62 %); the action does not follow a swap of the pictures (in 4 % of episodes), and the "
-            "cube ends on the correct picture in 54 %, 34 to 74. The answer is not used in the first chunk: within "
-            "0.1 of its reach and 0.25 of the episodes (moved by 0.02 [-0.01, 0.05] of its reach, net follow rate 0.02 [-0.10, 0.12]); positive "
-            "control: shape.",
+            "cube ends on the correct picture in 54 %, 34 to 74. The answer is not used in the first chunk: "
+            "within 0.1 of its reach and 0.25 of the episodes (moved by 0.02 [-0.01, 0.05] of its reach, net "
+            "follow rate 0.02 [-0.10, 0.12]); positive control: shape.",
         ),
         (
             ("guessing", "at chance", "absent", "no swap"),
