@@ -82,5 +82,6 @@ def _print_end(model: str, checkpoint: str | None, outcomes: "list[Outcome]") ->
         first = next(one for one in outcomes if one.state == "failed")
         say(marked("next: {}. Then run the same command again.", first.change.rstrip(".")))
     else:
+        play = "extract" if any(one.name == "two_episodes_are_extracted" for one in outcomes) else "ask"
         place = f" --checkpoint {checkpoint}" if checkpoint else ""
-        say(marked("next: [bold]probe-kit extract --model {}[/] --items 24", f"{model}{place}"))
+        say(marked("next: [bold]probe-kit {} --model {}[/] --items 24", play, f"{model}{place}"))

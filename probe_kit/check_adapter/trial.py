@@ -35,19 +35,21 @@ class Trial:
         self, family: Family, checkpoint: str | None, given: Mapping[str, Any], instructions: Sequence[str]
     ) -> None:
         self._family, self._checkpoint, self._given, self.instructions = family, checkpoint, given, instructions
-        self._scratch = Path(tempfile.mkdtemp(prefix="probe-kit-check-"))
+        self._scratch: Path | None = None
         self.loaded: Model | None = None
 
     def close(self) -> None:
         """Remove what was written, and let the model go."""
         self.loaded = None
-        shutil.rmtree(self._scratch, ignore_errors=True)
+        if self._scratch is not None:
+            shutil.rmtree(self._scratch, ignore_errors=True)
 
     @property
     def settings(self) -> ContractSettings:
         """The family with its options; a size stands for a checkpoint, which is named instead."""
         settings = ContractSettings()
         settings.family = self._family.name
+        settings.other_words = f" {self.instructions[0].split()[-1]}"  # a word that the tokenizer knows
         settings.options = {name: value for name, value in self._given.items() if name != SIZE}
         settings.unloadable_options = (
             frozenset(own.name for own in self._family.options) - self.other_options.keys()
@@ -93,6 +95,8 @@ class Trial:
     @property
     def folder(self) -> Path:
         """A new empty folder."""
+        if self._scratch is None:
+            self._scratch = Path(tempfile.mkdtemp(prefix="probe-kit-check-"))
         return Path(tempfile.mkdtemp(dir=self._scratch))
 
 

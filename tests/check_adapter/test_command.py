@@ -50,6 +50,16 @@ def test_a_sound_adapter_passes_every_check_and_plays_two_episodes(tmp_path: Pat
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("model", "play"), [("pi0-tiny", "extract"), ("vlm-tiny", "ask")])
+def test_the_embedded_models_pass(model: str, play: str, tmp_path: Path) -> None:
+    """Also those that answer; what needs a checkpoint to copy is skipped with the reason."""
+    done = ran(tmp_path, model)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "skipped  Every option reaches the card. (the family brings its own weights" in done.stdout
+    assert f"next: probe-kit {play} --model {model} --items 24" in done.stderr
+
+
+@pytest.mark.slow
 def test_a_broken_adapter_is_told_what_to_change(tmp_path: Path) -> None:
     folder = install_encoder_vla(tmp_path / "theirs")
     write_checkpoint(tmp_path / "checkpoint")

@@ -58,6 +58,10 @@ def test_what_was_written_is_removed() -> None:
     assert not first.parent.exists()
 
 
+def test_questions_become_longer_by_a_word_of_the_instructions() -> None:
+    assert Trial(FAMILY, None, {}, ("grasp the cup", "stop")).settings.other_words == " cup"
+
+
 def test_the_instructions_differ_in_length_and_some_are_alike() -> None:
     model = SimpleNamespace(card=SimpleNamespace(needs=frozenset()))
     own = Trial(FAMILY, None, {}, INSTRUCTIONS)
