@@ -215,6 +215,7 @@ def retention_table(
     absent_below: float = ABSENT_BELOW,
     against: str | None = None,
     labels: Mapping[str, str] | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
 ) -> RetentionTable:
     """Success rates, probe peaks and retention of several runs, per category and view.
 
@@ -229,9 +230,11 @@ def retention_table(
     activations or probes shows success rates only. score: by which VLM runs are read, `text`, `logits` or
     `order-balanced`; they stand first. with_side_words: count their items in whose name a side stands. vlm_vla:
     compare every VLM run with every acting one, see `vlm_vla_differences`. labels: names of runs in tables and
-    figures by their location, instead of their own. Raises UnknownSiteError for a view
-    that was not probed, UsageError for an unknown key or a number of keys that is not that of the runs, for a
-    run that is given twice, or for `against` where it is none of them; SceneError for overlapping zones.
+    figures by their location, instead of their own. pairs: by location, the runs that are compared, each the first
+    minus the second, instead of the first run with every other; all of them are one family of tests.
+    Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
+    is not that of the runs, for a run that is given twice, or for `against` or `pairs` where they are none of the
+    runs; SceneError for overlapping zones.
     """
     check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
@@ -262,7 +265,7 @@ def retention_table(
         by_group = {name: [run for group, run in listed if group == name] for name in runs}
         compared = compare_groups(by_group, drawn, rescore, against)
     elif len(listed) > 1 or against is not None:
-        compared = compare_runs([run for _, run in listed], drawn, names, rescore, against, vlm_vla)
+        compared = compare_runs([run for _, run in listed], drawn, names, rescore, against, vlm_vla, pairs)
     notes += [
         f"{run.location} captured activations only and did not act: SR is n/a." for _, run in listed if _heard(run)
     ]
@@ -273,7 +276,7 @@ def retention_table(
         for part in ([d.row for d in drawn], means)
     )
     judged = [under_rule(run, rule, last_steps) for _, run in listed if can_be_judged(run, rule, last_steps)]
-    pairs = correct_wordings([pair for run in judged for pair in _wordings(run, names[str(run.location)])])
+    worded = correct_wordings([pair for run in judged for pair in _wordings(run, names[str(run.location)])])
     found_differences = vlm_vla_differences([run for _, run in listed], names) if vlm_vla else []
     if vlm_vla and not found_differences:
         raise UsageError(
@@ -287,7 +290,7 @@ def retention_table(
         results,
         iterations,
         tuple(notes),
-        pairs,
+        worded,
         found_differences,
         compared.unpaired,
     )

@@ -9,15 +9,19 @@ if TYPE_CHECKING:
     from probe_kit.study.mistakes import Mistake, StudyFileError
     from probe_kit.study.plan import StudyPlan, plan_study
     from probe_kit.study.reading import LoadedStudy, load_study
+    from probe_kit.study.tables.make import make_table
+    from probe_kit.study.tables.named_table import NamedTable
 
 __all__ = [
     "LoadedStudy",
     "Mistake",
     "ModelFailure",
+    "NamedTable",
     "StudyFileError",
     "StudyPlan",
     "conduct_study",
     "load_study",
+    "make_table",
     "plan_study",
 ]
 
@@ -32,5 +36,7 @@ __getattr__, __dir__ = lazy_names(
         "plan_study": "plan",
         "ModelFailure": "conduct",
         "conduct_study": "conduct",
+        "NamedTable": "tables.named_table",
+        "make_table": "tables.make",
     },
 )

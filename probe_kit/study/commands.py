@@ -1,19 +1,21 @@
 """`probe-kit study`: a whole study from one file."""
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from probe_kit._terminal.console import counter, marked, out, print_json, progress, say
-from probe_kit._terminal.options import AsJson, EnvWorkers
+from probe_kit._terminal.console import counter, marked, out, print_json, print_text, progress, say
+from probe_kit._terminal.options import AsJson, EnvWorkers, Partial
 
 if TYPE_CHECKING:
+    from probe_kit.retention.columns.text_table import TextTable
     from probe_kit.study import StudyPlan
     from probe_kit.study.plan import PlannedCell
 
 app = typer.Typer(help="Run a whole study from one file.", no_args_is_help=True)
 UNFINISHED = 1
+Style = Literal["table", "markdown", "latex", "json"]
 File = Annotated[
     str,
     typer.Argument(metavar="FILE", help="Study file, or the name of a study of the package: embedded or paper."),
@@ -71,6 +73,37 @@ def status(file: File, only: Only = None, as_json: AsJson = False) -> None:
     print_json(plan.to_json()) if as_json else _print_plan(plan)
     if plan.totals()["missing"]:
         raise typer.Exit(UNFINISHED)
+
+
+@app.command("table")
+def table(
+    file: File,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Table of the file.")],
+    style: Annotated[Style, typer.Option("--format", help="Output format.")] = "table",
+    partial: Partial = False,
+) -> None:
+    """Print a table of a study from its stored runs. Loads no model."""
+    from probe_kit.retention.formats.latex import latex_table
+    from probe_kit.retention.formats.markdown import markdown_table
+    from probe_kit.study import load_study, make_table
+
+    made = make_table(load_study(file), name, partial)
+    if style == "json":
+        print_json({"table": made.text.title, "note": made.text.note, "numbers": list(made.numbers)})
+    elif style == "table":
+        _print_table(made.text)
+    else:
+        text = latex_table(made.text) if style == "latex" else f"{markdown_table(made.text)}\n{made.text.note}."
+        print_text(text)
+
+
+def _print_table(text: "TextTable") -> None:
+    from rich.table import Table
+
+    shown = Table(*text.columns, title=text.title, caption=f"{text.note}.", box=None)
+    for cells in text.cells:
+        shown.add_row(*(marked("{}", cell) for cell in cells))
+    out.print(shown)
 
 
 def _print_plan(plan: "StudyPlan") -> None:

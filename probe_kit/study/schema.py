@@ -43,12 +43,6 @@ class SuiteTable(_Table):
     counts: dict[str, Even] = {}
 
 
-class ReuseTable(_Table):
-    """folders: where runs that were made by hand lie."""
-
-    folders: list[str] = []
-
-
 class ModelTable(_Table):
     """One model. family: a name of `probe-kit models`.
 
@@ -179,7 +173,6 @@ class Study(_Table):
     out: str | None = None
     scene: SceneName | None = None
     suite: SuiteTable = SuiteTable()
-    reuse: ReuseTable = ReuseTable()
     models: Annotated[dict[Name, ModelTable], Field(min_length=1)]
     conditions: dict[Name, ConditionTable] = {}
     asks: dict[Name, AskTable] = {}

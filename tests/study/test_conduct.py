@@ -7,8 +7,9 @@ import pytest
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
+from probe_kit.errors import RunIncompleteError, UsageError
 from probe_kit.extract import open_run
-from probe_kit.study import conduct_study, load_study, plan_study
+from probe_kit.study import conduct_study, load_study, make_table, plan_study
 from probe_kit.suite import Suite
 
 TEXT = """
@@ -47,6 +48,17 @@ conditions = ["short"]
 name = "light"
 models = ["idle"]
 conditions = ["dark"]
+
+[comparisons.light]
+pairs = {{ conditions = ["short", "dark"], models = ["idle"] }}
+
+[tables.main]
+kind = "success"
+runs = ["main"]
+
+[tables.light]
+kind = "ablation"
+comparison = "light"
 """
 
 
@@ -99,6 +111,32 @@ def test_the_commands_print_the_plan_and_say_by_their_exit_code_whether_it_is_wh
     assert [one["model"] for one in found["runs"]] == ["expert", "broken", "idle", "idle"]
     assert run.invoke(app, ["study", "status", str(file)]).exit_code == 1
     assert run.invoke(app, ["study", "status", str(file), "--only", "absent-block"]).exit_code == 2
+
+
+def test_tables_are_made_of_stored_runs_alone_and_name_what_is_missing(file: Path) -> None:
+    conduct_study(plan_study(load_study(file)), env_workers=0)
+    study = load_study(file)
+    with pytest.raises(RunIncompleteError, match=r"broken/short is not whole: .* \(--partial\)"):
+        make_table(study, "main")
+    made = make_table(study, "main", partial=True)
+    assert made.text.columns == ("system", "Color", "mean")
+    assert [cells[0] for cells in made.text.cells] == ["expert", "idle"]
+    assert made.text.note.endswith("broken · short is missing")
+    light = make_table(study, "light")
+    assert [cells[:3] for cells in light.text.cells] == [
+        ("idle · dark − idle · short", name, "+0.0 [-100.0, +100.0]") for name in ("Color", "mean")
+    ]
+    with pytest.raises(UsageError, match=r"unknown table 'man'; known: main, light\. Did you mean 'main'"):
+        make_table(study, "man")
+    run = CliRunner()
+    assert run.invoke(app, ["study", "table", str(file), "light"]).exit_code == 0
+    latex = run.invoke(app, ["study", "table", str(file), "light", "--format", "latex"]).stdout
+    assert r"\begin{tabular}" in latex
+    found = json.loads(run.invoke(app, ["study", "table", str(file), "light", "--format", "json"]).stdout)
+    assert [(one["category"], one["items"], one["of_items"]) for one in found["numbers"]] == [
+        ("color", 2, 2),
+        ("mean", 2, 2),
+    ]
 
 
 @pytest.mark.slow

@@ -50,22 +50,23 @@ def compare_runs(
     rescore: Rescore,
     against: str | None = None,
     vlm_vla: bool = False,
+    chosen: Sequence[tuple[str, str]] | None = None,
 ) -> PairedRuns:
     """The first run minus every other, or every other minus the run `against`; VLM runs and policy runs apart.
 
     runs: in the order in which they were named. drawn: their rows. labels: what runs are called, by location.
     against: a run's name in tables, its folder's name or its location. vlm_vla: whether VLM runs are compared with
-    policy runs elsewhere. Runs of one seed and wording are compared, on the items that both have: success rates on
-    these alone, probes where no run has other items.
+    policy runs elsewhere. chosen: by location, the pairs that are compared instead, each the first minus the
+    second. Runs of one seed and wording are compared, on the items that both have: success rates on these alone,
+    probes where no run has other items.
     Raises UsageError for a name that is none of the runs, or several.
     """
     if against is not None and len(runs) < 2:
         raise UsageError(f"--against {against} needs a second run to compare with it")
     names = dict(zip(map(_place, runs), full_names(runs, labels), strict=True))
-    chosen = None if against is None else _run_called(against, runs, names)
     pairs: list[ComparedSides] = []
     unpaired: list[str] = []
-    for here, there in _pairs(runs, chosen):
+    for here, there in _pairs(runs, names, against, chosen):
         both = f"{names[_place(here)]} and {names[_place(there)]}"
         items = common_items([here, there])
         if why := _why_not(here, there, items):
@@ -77,7 +78,7 @@ def compare_runs(
         ]
         unpaired += _left_out(both, items)
         pairs.append(_on_common_items((sides[0], sides[1]), items, here.suite, rescore))
-    if not vlm_vla and len({ask_of(run) is None for run in runs}) == 2:
+    if not vlm_vla and chosen is None and len({ask_of(run) is None for run in runs}) == 2:
         unpaired.append("VLM runs and policy runs are not compared with each other here; --vlm-vla does that.")
     return PairedRuns(pair_differences(pairs), tuple(unpaired))
 
@@ -149,7 +150,18 @@ def _place(run: RunReader) -> str:
     return str(run.location)
 
 
-def _pairs(runs: Sequence[RunReader], against: RunReader | None) -> list[tuple[RunReader, RunReader]]:
+def _pairs(
+    runs: Sequence[RunReader],
+    names: Mapping[str, str],
+    name: str | None,
+    chosen: Sequence[tuple[str, str]] | None,
+) -> list[tuple[RunReader, RunReader]]:
+    if chosen is not None:
+        there = {_place(run): run for run in runs}
+        if strange := [place for pair in chosen for place in pair if place not in there]:
+            raise UsageError(f"{strange[0]} is none of the runs {', '.join(there)}")
+        return [(there[one], there[other]) for one, other in chosen]
+    against = None if name is None else _run_called(name, runs, names)
     if against is not None:
         return [(run, against) for run in runs if run is not against and _asked(run) == _asked(against)]
     found = []

@@ -48,26 +48,33 @@ class VlmVlaDifference:
 
 
 def vlm_vla_differences(
-    runs: Sequence[RunReader], names: Mapping[str, str] | None = None
+    runs: Sequence[RunReader],
+    names: Mapping[str, str] | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
 ) -> list[VlmVlaDifference]:
     """Every VLM run minus every acting one that it can be compared with, per category and over all of them.
 
     A policy whose network grew from weights that were asked is not compared with VLMs of other weights.
-    names: what runs are called, by their location; by default their labels. Runs as `retention` reads them.
+    names: what runs are called, by their location; by default their labels. pairs: locations of the VLM runs and
+    policy runs that are compared instead. Runs as `retention` reads them.
     """
     called = names or {str(run.location): run.label for run in runs}
     asked = [run for run in runs if ask_of(run) is not None]
     acted = [run for run in runs if ask_of(run) is None]
     found: list[VlmVlaDifference] = []
-    for vlm, policy, source in _chosen(asked, acted):
+    for vlm, policy, source in _chosen(asked, acted, pairs):
         found += [replace(row, source=source) for row in _pair(vlm, policy, called)]
     p_holm = corrected(found, lambda row: row.p, lambda row: row.category == MEAN)
     return [replace(row, p_holm=p) for row, p in zip(found, p_holm, strict=True)]
 
 
-def _chosen(asked: Sequence[RunReader], acted: Sequence[RunReader]) -> list[tuple[RunReader, RunReader, Relation]]:
+def _chosen(
+    asked: Sequence[RunReader], acted: Sequence[RunReader], pairs: Sequence[tuple[str, str]] | None
+) -> list[tuple[RunReader, RunReader, Relation]]:
     """The pairs that are compared, VLM by VLM."""
     related = [(vlm, policy, grew_from(policy, vlm)) for vlm, policy in product(asked, acted)]
+    if pairs is not None:
+        return [one for one in related if (str(one[0].location), str(one[1].location)) in pairs]
     grown = {id(policy) for _, policy, source in related if source == "yes"}
     return [pair for pair in related if pair[2] != "no" or id(pair[1]) not in grown]
 

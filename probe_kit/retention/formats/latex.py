@@ -48,10 +48,7 @@ def latex(
     whole = summary_table(found, differences)
     further = [whole, *further]
     parts += [_table(table.without_details()) for table in tables_of(rows, differences, unpaired)]
-    parts += [
-        _environment(f"{own.title} ({own.note})", own.columns, [_line(map(_marked, cells)) for cells in own.cells])
-        for own in further
-    ]
+    parts += map(latex_table, further)
     return "\n".join([*parts, *(f"% {note}" for note in notes)])
 
 
@@ -65,6 +62,12 @@ def _table(table: Table) -> str:
         names = map(escape, named_cells(table, row))
         lines.append(_line([*names, *(_cell(column, row) for column in table.columns)]))
     return _environment(" ".join([f"{titled(table)}.", *table.captions]), columns, lines)
+
+
+def latex_table(table: TextTable) -> str:
+    """A table of text as a `table` environment; needs the package booktabs."""
+    lines = [_line(map(_marked, cells)) for cells in table.cells]
+    return _environment(f"{table.title} ({table.note})", table.columns, lines)
 
 
 def _environment(caption: str, columns: Sequence[str], lines: Sequence[str]) -> str:

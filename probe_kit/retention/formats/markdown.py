@@ -31,7 +31,7 @@ def markdown(
     parts += [f"* {sentence}" for run in found for sentence in run.sentences]
     parts += ["", *(_table(table) for table in tables_of(rows, differences, unpaired))]
     plain = [*wording_tables(wordings), *further]
-    parts += [f"{_markdown_table(own.title, own.columns, own.cells)}\n{own.note}\n" for own in plain]
+    parts += [f"{markdown_table(own)}\n{own.note}\n" for own in plain]
     return "\n".join([*parts, *(f"> {note}\n" for note in notes)])
 
 
@@ -42,6 +42,11 @@ def _table(table: Table) -> str:
     ]
     captions = (f"> {caption}\n" for caption in table.captions)
     return "\n".join([_markdown_table(titled(table), columns, cells), *captions])
+
+
+def markdown_table(table: TextTable) -> str:
+    """A table of text in Markdown, without its note."""
+    return _markdown_table(table.title, table.columns, table.cells)
 
 
 def _markdown_table(heading: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

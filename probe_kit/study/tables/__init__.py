@@ -1,0 +1,1 @@
+"""Named tables of a study, from stored runs alone."""

@@ -1,0 +1,125 @@
+"""Tables of differences: conditions, steps of a chain, groups of models, and VLMs against policies."""
+
+from collections.abc import Sequence
+
+from probe_kit.retention.columns.text import (
+    difference_interval,
+    difference_items,
+    difference_test,
+    models_test,
+    number,
+    percent,
+    with_limits,
+)
+from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.vlm_vla import VlmVlaDifference
+from probe_kit.retention.rows.row import MEAN
+from probe_kit.retention.table import RetentionTable
+from probe_kit.study.tables.named_table import NamedTable, Number
+from probe_kit.suite.categories import category_of
+
+_TEST = "p: exact, signs of whole groups of items flipped; (Holm) over all categories and pairs of this comparison"
+
+
+def difference_table(table: RetentionTable, title: str) -> NamedTable:
+    """Differences of success rates, a row per pair and category; the whole comparison is one family of tests."""
+    found = _once(table.differences)
+    cells = tuple(
+        (
+            f"{row.group} − {row.minus}",
+            _category(row.category),
+            difference_interval(row.sr, row.sr_ci),
+            difference_test(row),
+            difference_items(row) or "all",
+        )
+        for row in found
+    )
+    columns = ("systems", "category", "difference, points [95 %]", "p (Holm)", "items in common")
+    made = NamedTable(TextTable(title, _TEST, columns, cells), tuple(map(_number, found)))
+    return made.with_note([sentence.removesuffix(".") for sentence in table.unpaired])
+
+
+def group_table(table: RetentionTable, title: str) -> NamedTable:
+    """Groups of models: the exact p over models first, the interval of these models apart."""
+    found = _once(table.differences)
+    cells = tuple(
+        (
+            f"{row.group} − {row.minus}",
+            _category(row.category),
+            models_test(row.sr_models, 100, 1),
+            difference_interval(row.sr, row.sr_ci),
+        )
+        for row in found
+    )
+    note = (
+        "p over models: exact, labels of models exchanged, in brackets the least that so few models allow and "
+        "Welch's interval; the last column is of these models on other items"
+    )
+    columns = ("groups", "category", "p over models (least)", "these models, points [95 %]")
+    return NamedTable(TextTable(title, note, columns, cells), tuple(map(_number, found)))
+
+
+def vlm_vla_table(found: Sequence[VlmVlaDifference]) -> NamedTable:
+    """Share right of VLMs minus success rate of policies, where the file names the VLM of a policy."""
+    cells = tuple(
+        (
+            f"{row.asked} − {row.acted}",
+            _category(row.category),
+            percent(row.accuracy),
+            percent(row.sr),
+            with_limits(percent(row.difference), row.difference_ci, percent),
+            number(row.p_holm, 4),
+            str(row.n_items),
+        )
+        for row in found
+    )
+    numbers = [
+        {
+            "vlm": row.asked,
+            "policy": row.acted,
+            "category": row.category,
+            "accuracy": row.accuracy,
+            "sr": row.sr,
+            "difference": row.difference,
+            "ci": row.difference_ci,
+            "p": row.p,
+            "p_holm": row.p_holm,
+            "items": row.n_items,
+            "same_frames": row.same_frames,
+            "source": row.source,
+        }
+        for row in found
+    ]
+    other = "; some pairs began with OTHER first frames" if any(row.same_frames is False for row in found) else ""
+    note = f"{_TEST.replace('this comparison', 'the table')}{other}"
+    columns = ("systems", "category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p (Holm)", "items")
+    return NamedTable(TextTable("VLM − VLA", note, columns, cells), tuple(numbers))
+
+
+def _once(differences: Sequence[Difference]) -> list[Difference]:
+    """Each difference of success rates once, whatever number of views there are."""
+    known = {(row.group, row.minus, row.category): row for row in reversed(differences) if row.sr is not None}
+    return list(known.values())[::-1]
+
+
+def _category(name: str) -> str:
+    return name if name == MEAN else category_of(name).title
+
+
+def _number(row: Difference) -> Number:
+    models = row.sr_models
+    return {
+        "system": row.group,
+        "minus": row.minus,
+        "category": row.category,
+        "difference": row.sr,
+        "ci": row.sr_ci,
+        "p": row.p,
+        "p_holm": row.p_holm,
+        "items": row.n_items,
+        "of_items": row.of_items,
+        "p_over_models": None if models is None else models.p,
+        "least_p_over_models": None if models is None else models.smallest_p,
+        "models_ci": None if models is None else models.ci,
+    }

@@ -1,0 +1,102 @@
+"""The stored runs that a table is made of, restricted to what its blocks select, and why others are missing."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from probe_kit.errors import ProbeKitError, RunIncompleteError
+from probe_kit.extract import open_run
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.study.cells import Cell, Selection
+from probe_kit.study.reading import LoadedStudy
+
+if TYPE_CHECKING:
+    from probe_kit.extract import Run
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A run of the study, and the cell it is of."""
+
+    cell: Cell
+    run: "Run"
+
+    @property
+    def place(self) -> str:
+        """Its location, as tables name runs."""
+        return str(self.run.location)
+
+
+@dataclass(frozen=True)
+class StoredRuns:
+    """found: in the order of the file. missing: of the others, why they are not in the table."""
+
+    found: tuple[StoredRun, ...]
+    missing: tuple[str, ...]
+
+    def labels(self, study: LoadedStudy) -> dict[str, str]:
+        """By location, the model's label; with condition or ask, and seed, where a model has several runs."""
+        names = [one.cell.model for one in self.found]
+        return {one.place: _label(study, one.cell, names.count(one.cell.model) > 1) for one in self.found}
+
+
+def stored_runs(
+    study: LoadedStudy,
+    wanted: Callable[[Cell], Selection | None],
+    partial: bool = False,
+    categories: Sequence[str] | None = None,
+) -> StoredRuns:
+    """Open what is stored of a study. wanted: of a cell, what of it a table shows; None leaves it out.
+
+    partial: accept runs that are missing or unfinished; they are named. categories: slugs, all by default.
+    Raises RunIncompleteError for a run that is missing, unfinished or damaged, unless `partial`.
+    """
+    found, missing = [], []
+    for cell in study.cells:
+        selection = wanted(cell)
+        if selection is None:
+            continue
+        label = _label(study, cell, True)
+        if cell.unavailable:
+            missing.append(f"{label} is missing: {cell.unavailable}")
+            continue
+        try:
+            run = open_run(locate(cell.location(study.study.folder)), allow_partial=partial)
+            found.append(StoredRun(cell, _part(run, cell, selection, categories)))
+        except ProbeKitError as error:
+            if not partial:
+                raise RunIncompleteError(
+                    f"{cell.name} is not whole: {error}. Finish it with `probe-kit study run {study.file}`, or "
+                    "accept what is there (--partial)"
+                ) from error
+            missing.append(f"{label} is missing")
+    return StoredRuns(tuple(found), tuple(missing))
+
+
+def _part(run: "Run", cell: Cell, selection: Selection, categories: Sequence[str] | None) -> "Run":
+    """What the table shows of a run, which may hold more for other blocks."""
+    chosen = [name for name in selection.categories if categories is None or name in categories]
+    if tuple(chosen) == cell.selection.categories and selection.items == cell.selection.items:
+        return run
+    return run.only(chosen, selection.items)
+
+
+def _label(study: LoadedStudy, cell: Cell, several: bool) -> str:
+    label = study.study.models[cell.model].label or cell.model
+    seed = f", seed {cell.seed}" if cell.seed else ""
+    return f"{label} · {cell.way}{seed}" if several or seed else label
+
+
+def of_blocks(names: Sequence[str]) -> Callable[[Cell], Selection | None]:
+    """What cells hold for some blocks."""
+
+    def wanted(cell: Cell) -> Selection | None:
+        own = [selection for name, selection in cell.selections.items() if name in names]
+        if not own:
+            return None
+        first, *others = own
+        for other in others:
+            first = first.joined(other)
+        return first
+
+    return wanted
