@@ -22,7 +22,7 @@ from probe_kit.errors import (
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
 from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
 from probe_kit.hooks.contract.card import ModelCard, SourceWeights
-from probe_kit.hooks.contract.default_scene import BRIDGE, DefaultScene
+from probe_kit.hooks.contract.default_scene import RELEASED, DefaultScene
 from probe_kit.hooks.contract.interventions import ALL_EDITS, InterventionKind, Interventions
 from probe_kit.hooks.contract.options import Option, check_options
 from probe_kit.hooks.contract.protocol import ProtocolRow
@@ -88,7 +88,7 @@ class Family:
     source_weights: SourceWeights | None = None
     sizes: tuple[tuple[str, str], ...] = ()
     interventions: Interventions = ALL_EDITS
-    home: DefaultScene = BRIDGE
+    home: DefaultScene = RELEASED
     vocabulary: str = ""
 
     def __post_init__(self) -> None:

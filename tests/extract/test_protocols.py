@@ -112,7 +112,7 @@ def test_how_a_protocol_differs_from_the_default_is_in_the_run() -> None:
     said = protocol_identity(ExtractSettings("magma", protocol="act2answer").followed())["protocol"]
     assert said["name"] == "act2answer"
     assert said["differs_from_default"]["-M temperature"] == ["0.7", "0"]
-    assert said["differs_from_default"]["scene tile_side"] == ["0.1452", "0.11"]
+    assert not [name for name in said["differs_from_default"] if name.startswith("scene")]
     assert "-M unnorm_key" not in said["differs_from_default"]
     assert said["unmatched"]
     assert protocol_identity(ExtractSettings("magma")) == {}

@@ -10,7 +10,7 @@ from typing import Any
 class DefaultScene:
     """preset: of `SceneSpec.preset`. changes: its fields that differ, also when other fields are asked for."""
 
-    preset: str = "bridge"
+    preset: str
     changes: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
     def __str__(self) -> str:
@@ -18,7 +18,7 @@ class DefaultScene:
         return ", ".join([self.preset, *(f"{name} {value}" for name, value in self.changes.items())])
 
 
-BRIDGE = DefaultScene()
-"""The default scene."""
-RELEASED = DefaultScene("act2answer", MappingProxyType({"early_stop": True, "max_steps": 40}))
-"""Of the embedded models: the released protocol's scene. Their demonstrations took at most 40 actions."""
+RELEASED = DefaultScene("act2answer")
+"""Of every family that declares no other: policies and readers of one study get the same first frames."""
+EMBEDDED = DefaultScene("act2answer", MappingProxyType({"early_stop": True, "max_steps": 40}))
+"""Of the embedded models, whose demonstrations took at most 40 actions."""

@@ -71,9 +71,13 @@ def test_an_embedded_model_is_at_home_where_it_was_trained(name: str) -> None:
     assert scene_of(name, name="bridge", max_steps=3) == SceneSpec(max_steps=3)
 
 
-def test_all_others_are_at_home_in_the_default_scene() -> None:
-    embedded = {*NAMES, VLM}
-    assert {scene_of(name) for name in {*own_families(), "expert", "unknown"} - embedded} == {SceneSpec()}
+def test_all_other_families_play_the_released_scene_and_scripts_the_default_one() -> None:
+    """A VLM and a policy of one study get the same first frames without an option."""
+    released = SceneSpec.preset("act2answer")
+    assert (released.arm, released.max_steps, released.start_grasped) == ("widowx", 80, True)
+    for name in own_families().keys() - {*NAMES, VLM}:
+        assert (scene_of(name), ExtractSettings(name).scene, AskSettings(name).scene) == (released,) * 3
+    assert {scene_of(name) for name in ("expert", "idle", "unknown")} == {SceneSpec()}
 
 
 def test_the_hand_never_turns(pi0_tiny: Pi0) -> None:

@@ -1,6 +1,6 @@
 """PaliGemma, on transformers' own network, and the embedded VLM of 0.61 million parameters."""
 
-from probe_kit.hooks.contract.default_scene import RELEASED
+from probe_kit.hooks.contract.default_scene import EMBEDDED
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.family import Family
 
@@ -17,7 +17,7 @@ FAMILIES = (
         config_types=("paligemma",),
         acts=False,
         reads=True,
-        home=RELEASED,
+        home=EMBEDDED,
         vocabulary="probe_kit.models.embedded.words",
     ),
     Family(

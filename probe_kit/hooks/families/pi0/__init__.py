@@ -1,7 +1,7 @@
 """pi0 through lerobot, and the embedded policies, which are pi0 at 0.84 million parameters."""
 
 from probe_kit.hooks.contract.card import SourceWeights
-from probe_kit.hooks.contract.default_scene import RELEASED
+from probe_kit.hooks.contract.default_scene import EMBEDDED
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.contract.state_layout import OPENNESS
@@ -29,7 +29,7 @@ def _embedded(name: str, summary: str, notes: str) -> Family:
         source="vlm-tiny",
         source_weights=_VLM_TINY,
         interventions=FLOW,
-        home=RELEASED,
+        home=EMBEDDED,
         vocabulary="probe_kit.models.embedded.words",
     )
 
