@@ -25,7 +25,7 @@ from probe_kit.extract.settings import SCENE_OPTIONS, AskSettings, ExtractSettin
 from probe_kit.extract.store.export import WRITERS
 from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
 from probe_kit.hooks.contract.interventions import Readout
-from probe_kit.hooks.contract.protocol import ProtocolName
+from probe_kit.hooks.contract.protocol import ROTATIONS, ProtocolName
 from probe_kit.hooks.family import Dtype
 from probe_kit.intervene.kinds.registry import KINDS
 from probe_kit.retention.behaviour.vlm_answers import SCORES
@@ -43,6 +43,7 @@ MOST_LINES = 100
 CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("extract", "--wordings"): WORDINGS,
     ("extract", "--protocol"): get_args(ProtocolName),
+    ("extract", "--rotation"): ROTATIONS,
     ("extract", "--scene"): PRESETS,
     ("extract", "--dtype"): get_args(Dtype),
     ("extract", "--tokens"): get_args(Tokens),

@@ -13,7 +13,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, Tokens, VideoChoice
 from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.hooks import family as hook_family
-from probe_kit.hooks.contract.protocol import ProtocolName
+from probe_kit.hooks.contract.protocol import ProtocolName, Rotation
 from probe_kit.scene_names import ArmName, Rendering
 from probe_kit.suite.ladder import WORDINGS
 
@@ -126,6 +126,14 @@ Execute = Annotated[
     int | None,
     further_option(
         "--execute", help="Number of actions executed per inference. Default: set by protocol or model."
+    ),
+]
+RotationOfActions = Annotated[
+    Rotation | None,
+    typer.Option(
+        "--rotation",
+        help="roll-pitch-yaw: pass the angles of an action on. axis-angle: convert them, as the release does "
+        "for some models. Default: set by protocol, else roll-pitch-yaw.",
     ),
 ]
 CaptureOnly = Annotated[

@@ -30,6 +30,7 @@ def extract(
     device: common.Device = "cpu",
     dtype: own.Dtype = None,
     execute: own.Execute = None,
+    rotation: own.RotationOfActions = None,
     capture_only: own.CaptureOnly = False,
     label: own.Label = None,
     tokens: own.StoredTokens = "pooled",

@@ -198,6 +198,7 @@ def _acting(settings: RunSettings, instructions: Sequence[str], loaded: "Policy 
         settings.vectors,
         settings.capture_only,
         settings.inference_limit,
+        settings.rotation,
     )
 
 

@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
-from probe_kit.hooks.contract.protocol import ACT2ANSWER, ProtocolRow, as_text
+from probe_kit.hooks.contract.protocol import ACT2ANSWER, PLAIN, ProtocolRow, as_text
 
 if TYPE_CHECKING:
     from probe_kit.hooks.family import Family
 
 SCENES: Mapping[str, str] = {ACT2ANSWER: "act2answer"}
 """Scene preset by protocol."""
+_OF_ACTING = ("execute", "rotation")
 
 
 class ProtocolSettings(Protocol):
@@ -38,6 +39,10 @@ class ProtocolSettings(Protocol):
     @property
     def execute(self) -> int | None:
         """Actions per inference."""
+
+    @property
+    def rotation(self) -> str | None:
+        """What reaches the controller as the rotation of an action."""
 
     @property
     def dtype(self) -> str | None:
@@ -94,8 +99,9 @@ def protocol_identity(settings: ProtocolSettings) -> dict[str, Any]:
     protocol = {**({} if row is None else row.settings()), **_scene(protocol_scene(settings.protocol))}
     default = {**({} if row is None else _defaults(settings, row)), **_scene(scene_of(settings.model))}
     if settings.capture_only:
-        protocol.pop("execute", None)
-        default.pop("execute", None)
+        for name in _OF_ACTING:
+            protocol.pop(name, None)
+            default.pop(name, None)
     return {
         "protocol": {
             "name": settings.protocol,
@@ -140,7 +146,7 @@ def _family(model: str) -> "Family | None":
 def _used(settings: ProtocolSettings) -> dict[str, str]:
     """What the run is made with, under the names of `ProtocolRow.settings`."""
     used = {f"-M {name}": _told(as_text(value)) for name, value in settings.options.items()}
-    plain = {"checkpoint": settings.checkpoint, "execute": settings.execute, "dtype": settings.dtype}
+    plain = {name: getattr(settings, name) for name in ("checkpoint", "execute", "rotation", "dtype")}
     used |= {name: _told(str(value)) for name, value in plain.items() if value is not None}
     return {**used, **({"acts": "capture only"} if settings.capture_only else {}), **_scene(settings.scene)}
 
@@ -159,6 +165,7 @@ def _defaults(settings: ProtocolSettings, row: ProtocolRow) -> dict[str, str]:
     known |= {
         "checkpoint": family.default_checkpoint or "embedded",
         "execute": "the checkpoint's",
+        "rotation": PLAIN,
         "dtype": "the checkpoint's",
     }
     return {name: known[name] for name in row.settings()}

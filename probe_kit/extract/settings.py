@@ -14,6 +14,7 @@ from probe_kit.extract.vqa.templates import P1, Template, find_template
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.capturing.edits import Edit, Vectors
 from probe_kit.hooks.contract.options import read_pairs
+from probe_kit.hooks.contract.protocol import PLAIN, ROTATIONS, Rotation
 from probe_kit.scene_names import SceneName
 from probe_kit.suite.ladder import Wording, check_wordings
 
@@ -32,6 +33,7 @@ _ELSEWHERE = {
     "vectors",
     "capture_only",
     "protocol",
+    "rotation",
 }
 _MOST = {
     "captured_calls": 10_000,
@@ -216,6 +218,8 @@ class ExtractSettings(RunSettings):
     wordings: names of `suite.ladder`, each a condition of the run; None for the items' own words alone.
     captured_calls: policy inferences captured per episode, from the first on.
     execute: actions executed per inference; None for the policy's own.
+    rotation: what reaches the controller as the rotation of an action, see `ProtocolRow`; None for the protocol's,
+    or its angles as they are.
     protocol: a published one, such as `act2answer`: what is not given is as it has it, see `protocols`; its scene
     takes the place of the default one.
     capture_only: capture the first inference of every episode and do not act; for checkpoints of other arms.
@@ -226,6 +230,7 @@ class ExtractSettings(RunSettings):
     wordings: tuple[Wording, ...] | None = None
     captured_calls: int = 1
     execute: int | None = None
+    rotation: Rotation | None = None
     capture_only: bool = False
     protocol: str | None = None
     edits: tuple[Edit, ...] = ()
@@ -237,14 +242,17 @@ class ExtractSettings(RunSettings):
         self._check_one_of("video", get_args(VideoChoice))
         self._check_at_least("captured_calls", 1)
         self._check_at_least("execute", 1)
+        if self.rotation is not None:
+            self._check_one_of("rotation", ROTATIONS)
         if self.wordings is not None:
             check_wordings(self.wordings)
 
     def choices(self) -> dict[str, Any]:
-        """As of every run, with the later fields: capture without acting, and edits."""
+        """As of every run, with the later fields: capture without acting, another rotation, and edits."""
         capture_only_part = {"capture_only": True} if self.capture_only else {}
         edits = {"edits": [edit.to_json() for edit in self.edits]} if self.edits else {}
-        return super().choices() | capture_only_part | edits
+        rotation = {} if self.rotation in (None, PLAIN) else {"rotation": self.rotation}
+        return super().choices() | capture_only_part | rotation | edits
 
     def followed(self) -> Self:
         """The settings with all that was not given as their protocol has it for the model; scripts get its scene.
@@ -259,6 +267,7 @@ class ExtractSettings(RunSettings):
             checkpoint=self.checkpoint or row.checkpoint,
             options={**row.options_for(self.checkpoint), **self.options},
             execute=self.execute if self.execute or self.capture_only else row.execute,
+            rotation=self.rotation if self.rotation or self.capture_only else row.rotation,
             dtype=self.dtype or row.dtype,
         )
 

@@ -20,27 +20,33 @@ from tests.support.pi0_checkpoints import write_intact
 # Section 4 of what is known of the release, in the words of the command line.
 RELEASED = {
     "pi0": {
-        "checkpoint": "juexzz/INTACT-pi0-finetune-bridge", "execute": "1", "dtype": "bfloat16",
+        "checkpoint": "juexzz/INTACT-pi0-finetune-bridge", "execute": "1", "rotation": "axis-angle",
+        "dtype": "bfloat16",
         "-M statistics": "bridge", "-M picture": "squashed", "-M openness": "release",
     },
     "openvla": {
-        "checkpoint": "gen-robot/openvla-7b-rlvla-sft_16k", "execute": "1", "dtype": "bfloat16",
+        "checkpoint": "gen-robot/openvla-7b-rlvla-sft_16k", "execute": "1", "rotation": "roll-pitch-yaw",
+        "dtype": "bfloat16",
         "-M unnorm_key": "sft", "-M temperature": "0.6", "-M resize": "tensor", "-M centre_crop": "false",
     },
     "spatialvla": {
-        "checkpoint": "IPEC-COMMUNITY/spatialvla-4b-224-pt", "execute": "1", "dtype": "bfloat16",
+        "checkpoint": "IPEC-COMMUNITY/spatialvla-4b-224-pt", "execute": "1", "rotation": "roll-pitch-yaw",
+        "dtype": "bfloat16",
         "-M unnorm_key": "bridge_orig/1.0.0", "-M prompt": "bare", "-M lowercase": "false", "-M ensemble": "false",
     },
     "magma": {
-        "checkpoint": "microsoft/Magma-8B", "execute": "1", "dtype": "bfloat16", "-M unnorm_key": "bridge_orig",
+        "checkpoint": "microsoft/Magma-8B", "execute": "1", "rotation": "roll-pitch-yaw",
+        "dtype": "bfloat16", "-M unnorm_key": "bridge_orig",
         "-M prompt": "act2answer", "-M temperature": "0.7", "-M shrink": "256",
     },
     "xiaomi-r0": {
-        "checkpoint": "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX", "execute": "4", "dtype": "bfloat16",
+        "checkpoint": "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX", "execute": "4",
+        "rotation": "axis-angle", "dtype": "bfloat16",
         "-M robot": "bridge_delta", "-M steps": "5", "-M openness": "release",
     },
     "internvla-m1": {
-        "checkpoint": "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "execute": "1", "dtype": "bfloat16",
+        "checkpoint": "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "execute": "1", "rotation": "axis-angle",
+        "dtype": "bfloat16",
         "-M unnorm_key": "bridge_dataset", "-M steps": "10", "-M guidance": "1.5",
     },
 }  # fmt: skip
@@ -125,6 +131,17 @@ def test_options_of_the_protocols_checkpoint_do_not_follow_another_one() -> None
     assert set(deviations(own)) == {"checkpoint", "-M unnorm_key"}
 
 
+def test_the_conversion_of_rotations_is_the_protocols_unless_another_is_asked_for() -> None:
+    assert ExtractSettings("pi0", protocol="act2answer").followed().rotation == "axis-angle"
+    assert ExtractSettings("magma", protocol="act2answer").followed().rotation == "roll-pitch-yaw"
+    plain = ExtractSettings("pi0", protocol="act2answer", rotation="roll-pitch-yaw").followed()
+    assert deviations(plain) == {"rotation": ["axis-angle", "roll-pitch-yaw"]}
+    assert "rotation" not in plain.choices()  # as of runs that were made before there was a choice
+    assert ExtractSettings("pi0", protocol="act2answer", capture_only=True).followed().rotation is None
+    with pytest.raises(UsageError, match="expected one of roll-pitch-yaw, axis-angle"):
+        ExtractSettings("pi0", rotation="quaternion")  # type: ignore[arg-type]
+
+
 def test_a_script_follows_the_scene_alone() -> None:
     settings = ExtractSettings("idle", protocol="act2answer").followed()
     assert settings.scene == SceneSpec.preset("act2answer")
@@ -152,6 +169,7 @@ def test_a_run_names_its_protocol_and_the_report_lists_what_differs(small_suite:
     assert set(said["deviations"]) == {"checkpoint", "dtype", "scene max_steps"}
     assert run.settings["execute"] == 1
     assert run.settings["policy"]["openness"] == "release"
+    assert run.settings["rotation"] == run.certificate["rotation"] == "axis-angle"
     assert run.label == "pi0 · act2answer · checkpoint=pi0 · dtype=float32 · scene max_steps=2"
     assert len(run.episodes) == 4
     facts = dict(provenance("pi0", run, None).facts)

@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 
 from probe_kit.env.robot.controller import ACTION_SIZE
 from probe_kit.errors import PolicyFailedError
-from probe_kit.extract.rollout.action_ensemble import ensemble
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
+from probe_kit.extract.rollout.executed_actions import executed_actions
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import Edit, Vectors
 from probe_kit.hooks.checkpoints.containment import begin_randomness, copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.protocol import PLAIN, Rotation
 
 if TYPE_CHECKING:
     from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
@@ -121,14 +122,17 @@ class PolicyController:
         vectors: Vectors | None = None,
         capture_only: bool = False,
         limit: float | None = None,
+        rotation: Rotation | None = None,
     ) -> None:
         """examples: an observation per instruction of the suite, as the scene will show them.
 
-        limit: seconds that a call of the policy may take, after which this process ends.
+        limit: seconds that a call of the policy may take, after which this process ends. rotation: see
+        `ProtocolRow.rotation`; None for the angles as they are.
         """
         self.policy, self.capture_only, self._limit = policy, capture_only, limit
         self._infer = policy.infer_without_acting if capture_only else policy.act
         self.execute = execute or policy.card.execute
+        self.rotation: Rotation = rotation or PLAIN
         self.captured_calls = captured_calls
         self._edits, self._vectors = edits, vectors
         with while_acting(name, policy.card.checkpoint):
@@ -204,16 +208,20 @@ class PolicyController:
         return self._instruction_ids[instruction]
 
     def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
-        exponent = self.policy.card.ensemble
-        if exponent is None or self.capture_only:
+        if self.capture_only:
             return chunk[: self.execute]
-        turn.past.append(chunk)
-        return ensemble(turn.past, exponent)[None]
+        exponent = self.policy.card.ensemble
+        chunks = [chunk]
+        if exponent is not None:
+            turn.past.append(chunk)
+            chunks = turn.past
+        return executed_actions(chunks, self.execute, exponent, self.rotation)
 
     def certificate(self) -> dict[str, Any]:
         """The policy's card, fire counts of the last capture, and what the capture proved."""
         return {
             "policy": self.policy.card.to_json(),
+            **({} if self.capture_only else {"rotation": self.rotation}),
             "fires_per_inference": self._capturer.fires,
             "capture_check": self._capturer.check,
             **({"edits": self._edit_log} if self._edits else {}),

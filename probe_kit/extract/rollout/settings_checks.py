@@ -31,6 +31,7 @@ def check_meaningless(settings: RunSettings) -> None:
         "--random-weights": settings.random_weights,
         "--batch": settings.batch != 1 or settings.calibrate,
         "--execute": settings.execute is not None,
+        "--rotation": settings.rotation is not None,
         "--dtype": settings.dtype is not None,
         "--tokens all": settings.tokens == "all",
         "--captured-calls": settings.captured_calls != 1,
@@ -47,6 +48,7 @@ def _check_acting(settings: ExtractSettings) -> None:
     acting = {
         "--captured-calls": settings.captured_calls != 1,
         "--execute": settings.execute is not None,
+        "--rotation": settings.rotation is not None,
         "--video": settings.video != "none",
     }
     if meaningless := [option for option, given in acting.items() if given]:

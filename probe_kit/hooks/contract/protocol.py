@@ -3,7 +3,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, get_args
+
+Rotation = Literal["roll-pitch-yaw", "axis-angle"]
+"""What reaches the controller as the rotation of an action; see `ProtocolRow.rotation`."""
+ROTATIONS: tuple[Rotation, ...] = get_args(Rotation)
+PLAIN: Rotation = "roll-pitch-yaw"
 
 
 @dataclass(frozen=True)
@@ -11,7 +16,9 @@ class ProtocolRow:
     """What a protocol uses a family with.
 
     execute: actions executed per inference. options: of the family, whatever the checkpoint. of_checkpoint: the
-    ones that only the protocol's own checkpoint needs. unmatched: what of the protocol cannot be done here.
+    ones that only the protocol's own checkpoint needs. rotation: `roll-pitch-yaw` passes the angles of an action
+    on; `axis-angle` passes axis times angle of the same turn on, which the controller then reads as angles.
+    unmatched: what of the protocol cannot be done here.
     """
 
     checkpoint: str
@@ -19,6 +26,7 @@ class ProtocolRow:
     dtype: str
     options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     of_checkpoint: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    rotation: Rotation = PLAIN
     unmatched: tuple[str, ...] = ()
 
     def options_for(self, checkpoint: str | None) -> dict[str, Any]:
@@ -31,6 +39,7 @@ class ProtocolRow:
         return {
             "checkpoint": self.checkpoint,
             "execute": str(self.execute),
+            "rotation": self.rotation,
             "dtype": self.dtype,
             **{f"-M {name}": as_text(value) for name, value in self.options_for(None).items()},
         }

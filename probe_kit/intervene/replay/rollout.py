@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import CaptureChangedActionError, NoTrajectoryError
 from probe_kit.extract.plan import PlannedEpisode
-from probe_kit.extract.rollout.action_ensemble import ensemble
+from probe_kit.extract.rollout.executed_actions import executed_actions
 from probe_kit.extract.rollout.stage import Answer, Ending
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edit_engine import EditLog
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.protocol import PLAIN
 from probe_kit.intervene.replay.conditions import Condition, ConditionContext, ReplayBatch
 from probe_kit.intervene.replay.session import Chunk, ReplayInput, ReplaySession
 from probe_kit.suite.items import Episode
@@ -91,9 +92,9 @@ def planned_of(session: ReplaySession, replay_input: ReplayInput) -> PlannedEpis
 
 
 def executed(session: ReplaySession, past: Sequence[Chunk]) -> Chunk:
-    """As in the run: the head of the newest chunk, or one action averaged over all."""
-    exponent = session.policy.card.ensemble
-    return past[-1][: int(session.run.settings["execute"])] if exponent is None else ensemble(past, exponent)[None]
+    """As in the run: the head of the newest chunk, or one action averaged over all, with the run's rotation."""
+    settings, exponent = session.run.settings, session.policy.card.ensemble
+    return executed_actions(past, int(settings["execute"]), exponent, settings.get("rotation", PLAIN))
 
 
 def apart_from_stored(session: ReplaySession, replay_input: ReplayInput, plain: RolloutResult) -> float:

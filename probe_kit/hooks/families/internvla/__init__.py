@@ -50,6 +50,7 @@ FAMILIES = (
             ACT2ANSWER: ProtocolRow(
                 "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge",
                 execute=1,
+                rotation="axis-angle",
                 dtype="bfloat16",
                 options={"steps": 10, "guidance": 1.5},
                 of_checkpoint={"unnorm_key": "bridge_dataset"},

@@ -89,6 +89,7 @@ FAMILIES = (
             ACT2ANSWER: ProtocolRow(
                 "juexzz/INTACT-pi0-finetune-bridge",
                 execute=1,
+                rotation="axis-angle",
                 dtype="bfloat16",
                 options={"picture": "squashed", "openness": "release"},
                 of_checkpoint={"statistics": "bridge"},

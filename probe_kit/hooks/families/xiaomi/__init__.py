@@ -41,6 +41,7 @@ FAMILIES = (
             ACT2ANSWER: ProtocolRow(
                 "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX",
                 execute=4,
+                rotation="axis-angle",
                 dtype="bfloat16",
                 options={"steps": 5, "openness": "release"},
                 of_checkpoint={"robot": "bridge_delta"},

@@ -1,0 +1,35 @@
+"""The actions that are executed of the chunks of an episode, as the controller of the arm reads them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.env.rotations import from_rpy, to_vector
+from probe_kit.extract.rollout.action_ensemble import ensemble
+from probe_kit.hooks.contract.protocol import PLAIN, Rotation
+
+_TURN = slice(3, 6)
+
+
+def executed_actions(
+    chunks: Sequence[NDArray[np.float32]], execute: int, exponent: float | None, rotation: Rotation = PLAIN
+) -> NDArray[np.float32]:
+    """(n, 7) float32: what is executed after the newest of an episode's chunks (chunk, 7), oldest first.
+
+    execute: actions of its head. exponent: of `ensemble`, which makes one action of all chunks; None to take the
+    head. rotation: see `ProtocolRow.rotation`.
+    """
+    actions = chunks[-1][:execute] if exponent is None else ensemble(chunks, exponent)[None]
+    return actions if rotation == PLAIN else with_rotation_vectors(actions)
+
+
+def with_rotation_vectors(actions: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A copy of actions (n, 7) with axis times angle, in radians, in place of roll, pitch and yaw.
+
+    Axis and angle are those of R = Rz(yaw) Ry(pitch) Rx(roll), as `euler2axangle` of transforms3d gives them. The
+    released evaluation converts so, and its controller reads the three numbers as Euler angles.
+    """
+    converted = actions.copy()
+    converted[:, _TURN] = [to_vector(from_rpy(angles)) for angles in actions[:, _TURN].astype(np.float64)]
+    return converted
