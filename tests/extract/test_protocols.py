@@ -27,7 +27,8 @@ RELEASED = {
     "openvla": {
         "checkpoint": "gen-robot/openvla-7b-rlvla-sft_16k", "execute": "1", "rotation": "roll-pitch-yaw",
         "dtype": "bfloat16",
-        "-M unnorm_key": "sft", "-M temperature": "0.6", "-M resize": "tensor", "-M centre_crop": "false",
+        "-M unnorm_key": "sft", "-M temperature": "0.6", "-M top_k": "checkpoint",
+        "-M resize": "tensor", "-M centre_crop": "false",
     },
     "spatialvla": {
         "checkpoint": "IPEC-COMMUNITY/spatialvla-4b-224-pt", "execute": "1", "rotation": "roll-pitch-yaw",

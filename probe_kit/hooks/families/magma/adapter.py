@@ -31,7 +31,7 @@ from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTok
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import MAPS
 from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, kv_tap
-from probe_kit.hooks.families.shared.sampling import chooser
+from probe_kit.hooks.families.shared.sampling import CHECKPOINT, TOP, chooser, top_of
 from probe_kit.models.magma import (
     ACTION_QUESTION,
     Choose,
@@ -76,6 +76,7 @@ class Magma(Policy, AnswerModel):
         self.loaded, self.network, self.config = loaded, loaded.network, loaded.config
         self.statistics, self.shrink, self.order, self.temperature = statistics, shrink, prompt, temperature
         self.steps = steps
+        self.top = top_of(CHECKPOINT, (loaded.folder,)) if temperature else TOP
         self._text_folder = loaded.folder if tokenizer is None else Path(tokenizer).expanduser()
         self.decoder: Any = self.network.language_model.model
         layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
@@ -100,7 +101,8 @@ class Magma(Policy, AnswerModel):
         if self._text_folder != loaded.folder and self._text_folder.is_dir():
             files |= side_files(self._text_folder, "tokenizer/")
         side = f"shrunk to {self.shrink} x {self.shrink} first" if self.shrink else "whole, at any resolution"
-        how = f"drawn at temperature {self.temperature:g}" if self.temperature else "the likeliest"
+        among = "all" if self.top is None else f"the {self.top} likeliest"
+        how = f"drawn at temperature {self.temperature:g} among {among}" if self.temperature else "the likeliest"
         return ModelCard(
             family="magma",
             checkpoint=loaded.checkpoint,
@@ -127,6 +129,7 @@ class Magma(Policy, AnswerModel):
                 "question": ACTION_QUESTION,
                 "shrink": str(self.shrink),
                 "temperature": repr(self.temperature),
+                **({} if self.top == TOP else {"top_k": str(self.top)}),
                 **options,
             },
             weights_seed=loaded.weights_seed,
@@ -207,7 +210,7 @@ class Magma(Policy, AnswerModel):
     def _tokens(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.int64]:
         """(B, tokens) ids; one inference. Rows that put out something else than one action are flagged."""
         self.check(seen, seeds)
-        choose = chooser(self.temperature, seeds)
+        choose = chooser(self.temperature, seeds, self.top)
         prompts = [self.prompt(observation.instruction).ids for observation in seen]
         decoded = self.generate(prompts, [self.picture(observation.image) for observation in seen], choose)
         ids: NDArray[np.int64] = decoded.ids.cpu().numpy()

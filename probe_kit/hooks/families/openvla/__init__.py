@@ -33,6 +33,12 @@ FAMILIES = (
             BITS,
             Option("temperature", float, "0: the likeliest; above: drawn among tokens of actions.", "0"),
             Option(
+                "top_k",
+                str,
+                "Draw among so many likeliest; checkpoint: its generation_config.json's, else 50.",
+                "all",
+            ),
+            Option(
                 "resize",
                 str,
                 "tensor: in bfloat16, as Act2Answer's evaluation.",
@@ -45,7 +51,7 @@ FAMILIES = (
                 "gen-robot/openvla-7b-rlvla-sft_16k",
                 execute=1,
                 dtype="bfloat16",
-                options={"temperature": 0.6, "resize": "tensor", "centre_crop": False},
+                options={"temperature": 0.6, "top_k": "checkpoint", "resize": "tensor", "centre_crop": False},
                 of_checkpoint={"unnorm_key": "sft"},
                 unmatched=(OWN_SEEDS, "another filter than the checkpoint's own would not be noticed"),
             )

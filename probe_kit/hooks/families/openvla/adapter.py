@@ -25,7 +25,7 @@ from probe_kit.hooks.families.prismatic.tokenizer import BYTES
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import TOKENS
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
-from probe_kit.hooks.families.shared.sampling import chooser
+from probe_kit.hooks.families.shared.sampling import ALL, chooser, top_of
 from probe_kit.models.prismatic import CROP_AREA, centre_crop
 from probe_kit.models.prismatic.tensor_pictures import prepare_tensor
 
@@ -60,11 +60,13 @@ class OpenVLA(PrismaticModel, Policy):
         tokenizer: str | None = None,
         temperature: float = 0.0,
         resize: str = "pil",
+        top: int | None = None,
     ) -> None:
+        """top: draw from so many of the likeliest ids that name actions; None from all."""
         super().__init__(loaded, steps=len(statistics.low), tokenizer=tokenizer)
         self.prompt_kv = kept_prompt(self.config.text)
         self.statistics, self.template, self.crop = statistics, prompt, crop
-        self.temperature, self.resize = temperature, resize
+        self.temperature, self.resize, self.top = temperature, resize, top if temperature else None
         self.action_tokens = ActionTokens(self.config.action_vocabulary, self.config.action_bins)
         self.card = replace(
             self.card,
@@ -79,6 +81,7 @@ class OpenVLA(PrismaticModel, Policy):
                 "prompt": self.template,
                 "centre_crop": str(self.crop),
                 **({"temperature": repr(temperature)} if temperature else {}),
+                **({} if self.top is None else {"top_k": str(self.top)}),
                 **({"resize": resize} if resize != "pil" else {}),
             },
         )
@@ -88,7 +91,8 @@ class OpenVLA(PrismaticModel, Policy):
         if self.crop:
             notes.append(f"pictures: middle {CROP_AREA:.0%} of the area")
         if self.temperature:
-            notes.append(f"action tokens drawn at temperature {self.temperature:g}")
+            among = "all" if self.top is None else f"the {self.top} likeliest"
+            notes.append(f"action tokens drawn at temperature {self.temperature:g} among {among}")
         if tokenizer == BYTES:
             notes.append("development tokenizer: bytes, which no model was trained with")
         return tuple(notes)
@@ -126,7 +130,7 @@ class OpenVLA(PrismaticModel, Policy):
         pixels = self.pixel_values(self._look(observation.image) for observation in seen)
         tokens = self.action_tokens
         named = range(tokens.vocabulary - tokens.bins, tokens.vocabulary)
-        choose = chooser(self.temperature, seeds, top=None, among=named)
+        choose = chooser(self.temperature, seeds, self.top, named)
         ids: NDArray[np.int64] = self.generate(pixels, rows, choose).ids.cpu().numpy()
         self.flagged = ~np.asarray(self.action_tokens.known(ids).all(axis=1))
         return ids
@@ -187,6 +191,7 @@ def load_openvla(
     bits: int | None = None,
     temperature: float = 0.0,
     resize: str = "pil",
+    top_k: str = ALL,
     weights_seed: int = 0,
 ) -> OpenVLA:
     """Load OpenVLA, one of its fine-tunes, or a LoRA adapter that names its base, from a folder or hub id.
@@ -196,7 +201,7 @@ def load_openvla(
     generation. centre_crop: show the middle 0.9 of the picture's area, as fine-tunes with augmentation expect.
     tokenizer: folder of another tokenizer, or `bytes`. bits: 8 or 4 for a quantised language model.
     temperature: 0 for the likeliest token; above, drawn among the ids that name actions. resize: `pil`, or
-    `tensor` in bfloat16 as Act2Answer's evaluation.
+    `tensor` in bfloat16 as Act2Answer's evaluation. top_k: see `top_of`.
     Raises UsageError, and what `load_checkpoint` raises.
     """
     chooser(temperature, ())
@@ -205,7 +210,8 @@ def load_openvla(
         raise CheckpointError(f"{checkpoint} is a Prismatic model without actions; pass --model prismatic")
     statistics = ActionStatistics.choose(loaded.statistics, unnorm_key)
     template = _template(prompt, loaded)
-    return OpenVLA(loaded, statistics, template, centre_crop, tokenizer, temperature, resize)
+    top = top_of(top_k, loaded.folders)
+    return OpenVLA(loaded, statistics, template, centre_crop, tokenizer, temperature, resize, top)
 
 
 def _template(prompt: str | None, loaded: LoadedPrismatic) -> str:

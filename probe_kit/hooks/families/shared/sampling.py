@@ -1,16 +1,25 @@
 """Choice of output tokens: greedy, or sampled as evaluations do but with fixed seeds."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from probe_kit.errors import UsageError
+from probe_kit._system.bounded_json import read_json_object
+from probe_kit.errors import CheckpointError, UsageError
 
 Choose = Callable[[Tensor], Tensor]
 """(B,) ids of the next tokens from their logits (B, V)."""
 # What `generate` of transformers 4 keeps of the distribution by default.
 TOP = 50
+ALL, CHECKPOINT = "all", "checkpoint"
+_GENERATION_FILE = "generation_config.json"
+# Settings of generation that shape the draw and are not followed here, with the values that change nothing.
+_NEUTRAL = {
+    "top_p": 1, "min_p": 0, "typical_p": 1, "epsilon_cutoff": 0, "eta_cutoff": 0, "repetition_penalty": 1,
+    "no_repeat_ngram_size": 0, "num_beams": 1,
+}  # fmt: skip
 
 
 def greedy(logits: Tensor) -> Tensor:
@@ -21,7 +30,8 @@ def greedy(logits: Tensor) -> Tensor:
 def chooser(temperature: float, seeds: Sequence[int], top: int | None = TOP, among: range | None = None) -> Choose:
     """Greedy for temperature 0; else draws, each row by its own seed.
 
-    top: draw from so many of the likeliest only; None from all. among: draw from these ids only; None from all.
+    top: draw from so many of the likeliest only, and from those as likely as the last of them, as `generate` does;
+    None from all. among: draw from these ids only; None from all.
     Raises UsageError for a negative or non-finite temperature.
     """
     if not 0 <= temperature < float("inf"):
@@ -40,6 +50,41 @@ def chooser(temperature: float, seeds: Sequence[int], top: int | None = TOP, amo
 
 
 def _draw(logits: Tensor, temperature: float, top: int | None, generator: torch.Generator) -> Tensor:
-    best, ids = logits.topk(min(top or logits.shape[0], logits.shape[0]))
+    kept = logits.shape[0]
+    if top is not None and top < kept:
+        kept = int((logits >= logits.topk(top).values[-1]).sum())
+    best, ids = logits.topk(kept)
     place = torch.multinomial(torch.softmax(best / temperature, dim=0), 1, generator=generator)
     return ids[place[0]]
+
+
+def top_of(asked: str, folders: Sequence[Path]) -> int | None:
+    """How many of the likeliest ids are drawn from; None for all.
+
+    asked: a number, `all`, or `checkpoint`: what its generation_config.json says, else `TOP`, as `generate` of
+    transformers 4 does it. folders: where that file may lie, the first one before the others.
+    Raises UsageError for another word, CheckpointError for a file that shapes the draw by other settings too.
+    """
+    if asked == ALL:
+        return None
+    if asked == CHECKPOINT:
+        file = next(
+            (folder / _GENERATION_FILE for folder in folders if (folder / _GENERATION_FILE).is_file()), None
+        )
+        return TOP if file is None else _stored_top(file)
+    if not asked.isdecimal() or int(asked) < 1:
+        raise UsageError(f"top_k is {asked!r}; expected a number from 1 on, {ALL} or {CHECKPOINT}")
+    return int(asked)
+
+
+def _stored_top(file: Path) -> int | None:
+    values = read_json_object(file, CheckpointError, "Download the checkpoint again")
+    others = {name: values[name] for name, neutral in _NEUTRAL.items() if values.get(name) not in (None, neutral)}
+    top = values.get("top_k", TOP)
+    if others or not (top is None or (isinstance(top, int) and not isinstance(top, bool) and top >= 0)):
+        said = ", ".join(f"{name} {value!r}" for name, value in (others or {"top_k": top}).items())
+        raise CheckpointError(
+            f"{file} asks for {said}; only a whole top_k is followed here. Use temperature 0, or another -M top_k "
+            "where the family has that option"
+        )
+    return top or None

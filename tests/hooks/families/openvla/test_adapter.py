@@ -270,6 +270,20 @@ def test_drawn_actions_repeat_by_their_seed_and_name_actions_only(folder: Path, 
         load_openvla(str(folder), tokenizer="bytes", temperature=-1.0)
 
 
+def test_draws_as_the_release_does_are_of_the_50_likeliest_tokens_of_actions(
+    folder: Path, observation: Observation
+) -> None:
+    """At a temperature that makes all kept tokens alike: the first of the seven tokens has 50 values, not 256."""
+    policy = load_openvla(str(folder), tokenizer="bytes", temperature=1e6, top_k="checkpoint")
+    assert policy.card.settings["top_k"] == "50"
+    seen = [observation] * 300
+    found = policy.infer_without_acting(seen, range(300))[:, 0, 0]
+    assert 40 < len(set(found.tolist())) <= 51  # two tokens name the last bin's neighbour alike
+    everything = load_openvla(str(folder), tokenizer="bytes", temperature=1e6)
+    assert "top_k" not in everything.card.settings
+    assert len(set(everything.infer_without_acting(seen, range(300))[:, 0, 0].tolist())) > 100
+
+
 def test_pictures_resized_as_tensors_are_near_those_of_pil_and_not_the_same(
     folder: Path, observation: Observation
 ) -> None:

@@ -1,8 +1,12 @@
+import json
+from pathlib import Path
+
 import pytest
 import torch
+from transformers.generation.logits_process import TemperatureLogitsWarper, TopKLogitsWarper
 
-from probe_kit.errors import UsageError
-from probe_kit.hooks.families.shared.sampling import TOP, chooser
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.hooks.families.shared.sampling import ALL, CHECKPOINT, TOP, chooser, top_of
 
 
 def logits(rows: int) -> torch.Tensor:
@@ -47,3 +51,44 @@ def test_draws_among_some_ids_only_never_leave_them_and_follow_their_distributio
 def test_a_meaningless_temperature_is_refused(temperature: float) -> None:
     with pytest.raises(UsageError, match="temperature"):
         chooser(temperature, [])
+
+
+@pytest.mark.parametrize("top", [1, 5, 50])
+def test_what_can_be_drawn_is_what_transformers_keeps_ties_of_the_last_one_included(top: int) -> None:
+    """In bfloat16 many ids are as likely as the last of the kept ones."""
+    row, among = logits(1).bfloat16(), range(100, 356)
+    masked = torch.full_like(row, -torch.inf)
+    masked[:, among.start : among.stop] = row[:, among.start : among.stop]
+    ids = torch.zeros((1, 1), dtype=torch.long)
+    theirs = TopKLogitsWarper(top)(ids, TemperatureLogitsWarper(0.6)(ids, masked.float()))
+    kept = set(torch.isfinite(theirs[0]).nonzero().flatten().tolist())
+    draw = chooser(0.6, [1], top, among)
+    counts = torch.bincount(torch.cat([draw(row) for _ in range(4000)]), minlength=400)
+    assert set(counts.nonzero().flatten().tolist()) <= kept
+    expected = torch.softmax(theirs[0], dim=0)
+    spread = (expected * (1 - expected) / 4000).sqrt()
+    assert ((counts / 4000 - expected).abs() < 5 * spread + 1e-9).all()
+
+
+def test_ties_with_the_last_of_the_kept_ones_are_kept() -> None:
+    row = torch.tensor([[2.0, 1.0, 1.0, 0.0]])
+    draw = chooser(1.0, [1], 2)
+    assert {int(draw(row)[0]) for _ in range(200)} == {0, 1, 2}
+
+
+def test_how_many_are_kept_is_the_checkpoints_word_or_the_librarys_default(tmp_path: Path) -> None:
+    assert (top_of(ALL, [tmp_path]), top_of("7", [tmp_path]), top_of(CHECKPOINT, [tmp_path])) == (None, 7, TOP)
+    file = tmp_path / "generation_config.json"
+    stored = {"bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 32000, "transformers_version": "4.40.1"}
+    for own, expected in (({}, TOP), ({"top_k": 20}, 20), ({"top_k": 0}, None), ({"top_p": 1.0}, TOP)):
+        file.write_text(json.dumps(stored | own), encoding="utf-8")
+        assert top_of(CHECKPOINT, [tmp_path / "adapter", tmp_path]) == expected
+
+
+@pytest.mark.parametrize("own", [{"top_p": 0.9}, {"repetition_penalty": 1.2}, {"top_k": "many"}, {"top_k": -1}])
+def test_a_draw_that_is_shaped_otherwise_is_refused(tmp_path: Path, own: dict[str, object]) -> None:
+    (tmp_path / "generation_config.json").write_text(json.dumps(own), encoding="utf-8")
+    with pytest.raises(CheckpointError, match=next(iter(own))):
+        top_of(CHECKPOINT, [tmp_path])
+    with pytest.raises(UsageError, match="expected a number from 1 on, all or checkpoint"):
+        top_of("0", [tmp_path])
