@@ -94,6 +94,12 @@ def test_what_is_given_wins_and_is_recorded_as_a_deviation() -> None:
     assert "scene tile_side=0.2033" in run_label(settings)
 
 
+def test_what_cannot_be_matched_of_pi0_is_its_picture_path_and_not_its_statistics() -> None:
+    said = protocol_identity(ExtractSettings("pi0", protocol="act2answer").followed())["protocol"]["unmatched"]
+    assert any("Lanczos" in line and "bilinearly" in line for line in said)
+    assert not any("statistics" in line for line in said)
+
+
 def test_another_scene_that_is_asked_for_is_kept_and_reported() -> None:
     bridge = protocol_scene("act2answer", "bridge")
     settings = ExtractSettings("magma", protocol="act2answer", scene=bridge).followed()
