@@ -31,7 +31,11 @@ FAMILIES = (
             Option("temperature", float, "0: the likeliest token; 0.7: drawn as the release does.", "0"),
             Option("tokenizer", str, "Folder of another tokenizer.", "the checkpoint's"),
             Option(
-                "layer_scale", str, "weight: accept them under that name.", "gamma", choices=("gamma", "weight")
+                "layer_scale",
+                str,
+                "gamma: refuse files that name the vision tower's layer scales weight.",
+                "either name",
+                choices=("gamma", "weight"),
             ),
         ),
         protocols={

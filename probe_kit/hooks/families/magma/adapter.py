@@ -70,7 +70,6 @@ class Magma(Policy, AnswerModel):
         prompt: str = "magma",
         temperature: float = 0.0,
         tokenizer: str | None = None,
-        layer_scale: str = "gamma",
         steps: int = STEPS,
     ) -> None:
         self.loaded, self.network, self.config = loaded, loaded.network, loaded.config
@@ -93,7 +92,7 @@ class Magma(Policy, AnswerModel):
             "backbone": (f"image.{CAMERA}", SEPARATOR, "language", "special", PADDING),
             "action": ("action",),
         }
-        self.card = self._card({"tokenizer": tokenizer or "the checkpoint's", "layer_scale": layer_scale})
+        self.card = self._card({"tokenizer": tokenizer or "the checkpoint's", "layer_scale": loaded.layer_scale})
 
     def _card(self, options: dict[str, str]) -> ModelCard:
         loaded, statistics = self.loaded, self.statistics
@@ -353,7 +352,7 @@ def load_magma(
     prompt: str = "magma",
     temperature: float = 0.0,
     tokenizer: str | None = None,
-    layer_scale: str = "gamma",
+    layer_scale: str | None = None,
     weights_seed: int = 0,
     steps: int = STEPS,
 ) -> Magma:
@@ -362,13 +361,16 @@ def load_magma(
     unnorm_key: data set whose units the actions get; default bridge_orig. statistics: file with action
     statistics. shrink: side to which pictures are shrunk first, 0 for whole pictures. prompt: `magma`, or
     `act2answer` for the order of turns of that release. temperature: 0 for the likeliest token. tokenizer: folder
-    of another tokenizer. layer_scale: `weight` for files that store them under that name. steps: tokens per
+    of another tokenizer. layer_scale: see `load_checkpoint`. steps: tokens per
     inference, for comparisons with other than seven; only seven are an action.
     Raises UsageError, and what `load_checkpoint` raises.
     """
-    for name, value, known in (("prompt", prompt, PROMPTS), ("layer_scale", layer_scale, ("gamma", "weight"))):
+    for name, value, known in (
+        ("prompt", prompt, PROMPTS),
+        ("layer_scale", layer_scale, (None, "gamma", "weight")),
+    ):
         if value not in known:
-            raise UsageError(f"{name} is {value!r}; expected {' or '.join(known)}")
+            raise UsageError(f"{name} is {value!r}; expected {' or '.join(filter(None, known))}")
     if shrink < 0:
         raise UsageError(f"shrink is {shrink}; expected a side in pixels, or 0 for whole pictures")
     chooser(temperature, ())
@@ -388,6 +390,5 @@ def load_magma(
         prompt=prompt,
         temperature=temperature,
         tokenizer=tokenizer,
-        layer_scale=layer_scale,
         steps=steps,
     )

@@ -26,7 +26,8 @@ class LoadedMagma:
     """A loaded network and what belongs to it.
 
     checkpoint: as asked for. folder: where its other files lie. statistics: per data set, what un-normalises its
-    actions. dtype: of the weights, as the card says it. weights_seed: of a random twin.
+    actions. dtype: of the weights, as the card says it. weights_seed: of a random twin. layer_scale: under which
+    name the file holds the layer scales, `gamma` or `weight`.
     """
 
     checkpoint: str
@@ -39,6 +40,7 @@ class LoadedMagma:
     device: str
     notes: tuple[str, ...]
     weights_seed: int | None
+    layer_scale: str = "gamma"
 
 
 def load_checkpoint(
@@ -49,12 +51,13 @@ def load_checkpoint(
     *,
     weights_seed: int = 0,
     statistics: str | None = None,
-    layer_scale: str = "gamma",
+    layer_scale: str | None = None,
 ) -> LoadedMagma:
     """Load a folder or hub id.
 
     dtype: float32 or bfloat16; default what the checkpoint says. statistics: a file with action statistics,
-    above the checkpoint's own and ours. layer_scale: `weight` accepts a file that stores them under that name.
+    above the checkpoint's own and ours. layer_scale: `gamma` refuses a file that names them otherwise; None and
+    `weight` accept both names.
     Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
     """
     folder = checkpoint_folder(checkpoint)
@@ -63,8 +66,9 @@ def load_checkpoint(
     if random_weights:
         network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)
         notes: tuple[str, ...] = ()
+        named = "gamma"
     else:
-        network, audit, notes = _stored(config, folder, _DTYPES[name], layer_scale)
+        network, audit, notes, named = _stored(config, folder, _DTYPES[name], layer_scale)
     network.requires_grad_(False)
     return LoadedMagma(
         checkpoint=checkpoint,
@@ -77,6 +81,7 @@ def load_checkpoint(
         device=device,
         notes=notes,
         weights_seed=weights_seed if random_weights else None,
+        layer_scale=layer_scale or named,
     )
 
 
@@ -94,10 +99,10 @@ def _random(
 
 
 def _stored(
-    config: MagmaConfig, folder: Path, dtype: torch.dtype, layer_scale: str
-) -> tuple[MagmaNetwork, WeightsAudit, tuple[str, ...]]:
+    config: MagmaConfig, folder: Path, dtype: torch.dtype, layer_scale: str | None
+) -> tuple[MagmaNetwork, WeightsAudit, tuple[str, ...], str]:
     weights = read_weights(folder, unlisted=UNUSED_WEIGHTS)
-    tensors, notes = _with_layer_scales(weights, layer_scale)
+    tensors, notes, named = _with_layer_scales(weights, layer_scale)
     unread = [name for name in UNUSED_WEIGHTS if tensors.pop(name, None) is not None]
     if unread:
         notes += (f"{len(unread)} tensors of the contrastive head are in the file and never read",)
@@ -109,41 +114,45 @@ def _stored(
         network.language_model.tie_weights()
     if empty := [key for key, tensor in network.state_dict().items() if tensor.is_meta]:
         raise WeightsError(f"weights in {folder}: {len(empty)} tensors were never filled: {', '.join(empty[:8])}")
-    return network, audit, notes
+    return network, audit, notes, named
 
 
-def _with_layer_scales(weights: Weights, layer_scale: str) -> tuple[dict[str, Tensor], tuple[str, ...]]:
-    """The tensors under the network's names, and a note if some were stored under another.
+def _with_layer_scales(weights: Weights, asked: str | None) -> tuple[dict[str, Tensor], tuple[str, ...], str]:
+    """The tensors under the network's names, a note if some were stored as `.weight`, and the stored name.
 
-    Loaders before transformers 5 rename every `gamma` to `weight`: they find no place for the layer scales, leave
-    timm's initial value, and what they save afterwards holds one or the other.
+    Loaders before transformers 5 rename every `gamma` to `weight`. The released file names them so; a file that
+    such a loader saved later holds the initial constant, which is refused.
     """
     found = {name: match for name in weights.tensors if (match := _BLOCK.fullmatch(name))}
     renamed = {name: match["block"] + ".gamma" for name, match in found.items() if match["name"] == "weight"}
-    notes: tuple[str, ...] = ()
-    if renamed and layer_scale != "weight":
+    if renamed and asked == "gamma":
         raise WeightsError(
-            f"damaged checkpoint: weights in {weights.source} hold {len(renamed)} layer scales of the vision "
-            f"tower as .weight instead of .gamma, such as {min(renamed)}. Loaders that rename gamma to weight "
-            "write such files and never use what they hold. Take the original files; only if you know that these "
-            "values are the trained ones, pass -M layer_scale=weight"
+            f"weights in {weights.source} hold {len(renamed)} layer scales of the vision tower as .weight instead "
+            f"of .gamma, such as {min(renamed)}. Leave -M layer_scale=gamma out to accept them"
         )
-    if renamed:
-        notes = (f"{len(renamed)} layer scales taken from tensors stored as .weight",)
+    if twice := sorted(set(renamed.values()) & set(weights.tensors)):
+        raise WeightsError(
+            f"damaged checkpoint: weights in {weights.source} hold {len(twice)} layer scales twice, as .gamma and "
+            f"as .weight, such as {twice[0]}. Take the original files"
+        )
     tensors = {renamed.get(name, name): tensor for name, tensor in weights.tensors.items()}
     if not weights.random:
-        _check_initial(tensors, weights.source)
-    return tensors, notes
+        _check_trained(tensors, weights.source)
+    if not renamed:
+        return tensors, (), "gamma"
+    return tensors, (f"{len(renamed)} layer scales taken from tensors stored as .weight",), "weight"
 
 
-def _check_initial(tensors: Mapping[str, Tensor], source: str) -> None:
-    scales = [tensor.float() for name, tensor in tensors.items() if _BLOCK.fullmatch(name)]
-    values = {float(value) for scale in scales for value in (scale.min(), scale.max())}
-    if len(values) == 1:
+def _check_trained(tensors: Mapping[str, Tensor], source: str) -> None:
+    """Raise WeightsError for a layer scale with one value in every feature, as before training."""
+    scales = {name: tensor.float() for name, tensor in tensors.items() if _BLOCK.fullmatch(name)}
+    constant = {name: float(scale[0]) for name, scale in scales.items() if bool((scale == scale[0]).all())}
+    if constant:
+        name, value = min(constant.items())
         raise WeightsError(
-            f"damaged checkpoint: weights in {source} hold {len(scales)} layer scales of the vision tower, all of "
-            f"them {values.pop():.3g} in every feature, as before training. A loader that could not place the "
-            "trained ones saved this file. Take the original files"
+            f"damaged checkpoint: weights in {source} hold {len(constant)} layer scales of the vision tower with "
+            f"one value in every feature, as before training, such as {name}: {value:.3g} in every feature. A "
+            "loader that could not place the trained ones saved this file. Take the original files"
         )
 
 

@@ -1,11 +1,14 @@
 import json
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
+from probe_kit.hooks import Observation
 from probe_kit.hooks.families.magma.adapter import load_magma
 from probe_kit.models.magma import UNUSED_WEIGHTS, shipped_statistics
 from tests.support.magma_checkpoints import LAYER_SCALE, small_network, weights, write_checkpoint
@@ -50,25 +53,46 @@ def test_the_index_may_leave_the_unread_head_out_and_nothing_else(tmp_path: Path
         load_magma(str(folder))
 
 
-def test_layer_scales_saved_as_weights_are_named_as_damage(tmp_path: Path) -> None:
+def test_layer_scales_named_weight_are_the_released_files_and_the_card_says_so(tmp_path: Path) -> None:
     folder = write_checkpoint(tmp_path, tensors=renamed(weights(small_network())))
-    with pytest.raises(WeightsError, match=r"damaged checkpoint: .* 5 layer scales .* as \.weight instead of"):
-        load_magma(str(folder))
-
-
-def test_one_renamed_layer_scale_is_damage_too(tmp_path: Path) -> None:
-    tensors = weights(small_network())
-    tensors[LAYER_SCALE.replace(".gamma", ".weight")] = tensors.pop(LAYER_SCALE)
-    with pytest.raises(WeightsError, match="1 layer scales"):
-        load_magma(str(write_checkpoint(tmp_path, tensors=tensors)))
-
-
-def test_renamed_layer_scales_are_taken_on_request_and_the_card_says_so(tmp_path: Path) -> None:
-    folder = write_checkpoint(tmp_path, tensors=renamed(weights(small_network())))
-    loaded = load_magma(str(folder), layer_scale="weight")
+    loaded = load_magma(str(folder))
     assert torch.equal(loaded.network.state_dict()[LAYER_SCALE], small_network().state_dict()[LAYER_SCALE])
     assert "5 layer scales taken from tensors stored as .weight" in loaded.card.notes
     assert loaded.card.settings["layer_scale"] == "weight"
+    with pytest.raises(WeightsError, match=r"5 layer scales .* as \.weight instead of .*layer_scale=gamma"):
+        load_magma(str(folder), layer_scale="gamma")
+
+
+def test_the_actions_of_a_file_do_not_depend_on_how_it_names_its_layer_scales(
+    tmp_path: Path, observation: Observation
+) -> None:
+    tensors = weights(small_network(steered=True))
+    folders = [
+        write_checkpoint(tmp_path / name, tensors=stored)
+        for name, stored in (("gamma", tensors), ("weight", renamed(tensors)))
+    ]
+    seen = [observation] * 2
+    one, other = (
+        load_magma(str(folder), prompt="act2answer", temperature=0.7).act(seen, [1, 2]) for folder in folders
+    )
+    np.testing.assert_array_equal(one, other)
+
+
+def test_a_layer_scale_under_both_names_is_damage(tmp_path: Path) -> None:
+    tensors = weights(small_network())
+    tensors[LAYER_SCALE.replace(".gamma", ".weight")] = tensors[LAYER_SCALE] * 2
+    with pytest.raises(WeightsError, match="1 layer scales twice"):
+        load_magma(str(write_checkpoint(tmp_path, tensors=tensors)))
+
+
+@pytest.mark.parametrize("rename", [dict, renamed])
+def test_one_constant_layer_scale_is_damage_under_either_name(
+    tmp_path: Path, rename: Callable[[dict[str, torch.Tensor]], dict[str, torch.Tensor]]
+) -> None:
+    tensors = weights(small_network())
+    tensors[LAYER_SCALE] = torch.full_like(tensors[LAYER_SCALE], 1e-6)
+    with pytest.raises(WeightsError, match=r"damaged checkpoint: .* 1 layer scales .*stages\.2\.blocks\.1"):
+        load_magma(str(write_checkpoint(tmp_path, tensors=rename(tensors))))
 
 
 def test_layer_scales_left_at_their_initial_value_are_damage(tmp_path: Path) -> None:
