@@ -19,7 +19,14 @@ from probe_kit.errors import (
     UnsupportedInterventionError,
     UsageError,
 )
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, check_files, checkpoint_folder, missing_weights
+from probe_kit.hooks.checkpoints.checkpoint import (
+    CONFIG_FILE,
+    PATTERNS,
+    check_files,
+    checkpoint_folder,
+    hub_name,
+    missing_weights,
+)
 from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
 from probe_kit.hooks.contract.card import ModelCard, SourceWeights
 from probe_kit.hooks.contract.default_scene import RELEASED, DefaultScene
@@ -59,6 +66,7 @@ class Family:
     none, and then only the loader knows one when it sees it. instead: for other such types that people may take
     for one of them, what to do. needs_checkpoint: nothing is there by default. protocols: published protocols that
     use the family, by name, with what they use it with. interventions: what of them its policy supports.
+    files: patterns of the files of a hub repository that are needed.
     home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
     `words_in`, of a family whose default checkpoint knows few words; empty for one that reads any text.
     Raises UsageError if an option is not declared as an `Option`.
@@ -88,6 +96,7 @@ class Family:
     source_weights: SourceWeights | None = None
     sizes: tuple[tuple[str, str], ...] = ()
     interventions: Interventions = ALL_EDITS
+    files: tuple[str, ...] = PATTERNS
     home: DefaultScene = RELEASED
     vocabulary: str = ""
 
@@ -195,7 +204,9 @@ class Family:
             raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
         if place is not None and self.config_types:
             with naming_checkpoint(self.name, place):
-                check_files(checkpoint_folder(place), self.config_types, not random_weights, self.instead)
+                check_files(
+                    checkpoint_folder(place, self.files), self.config_types, not random_weights, self.instead
+                )
         return chosen
 
     def check_intervention(self, kind: InterventionKind) -> None:
@@ -256,7 +267,8 @@ class Family:
         """Whether the hub's cache lacks a file, or the weights beside the default checkpoint's config."""
         from huggingface_hub import try_to_load_from_cache
 
-        found = try_to_load_from_cache(repository, file)
+        name, inside = hub_name(repository) or (repository, "")
+        found = try_to_load_from_cache(name, f"{inside}/{file}" if inside else file)
         whole = repository == self.default_checkpoint and bool(self.config_types)
         return not isinstance(found, str) or (whole and bool(missing_weights(Path(found).parent)))
 

@@ -61,7 +61,9 @@ def test_everything_a_family_still_needs_is_named(monkeypatch: pytest.MonkeyPatc
     ):
         assert known[name].missing() == f"download of {', '.join(needed)}"
     monkeypatch.setattr("probe_kit.hooks.family.find_spec", lambda _: None)
-    assert known["prismatic"].missing() == "extra openvla and a checkpoint of yours (--checkpoint)"
+    released, *towers_and_text = known["prismatic"].missing().split(", ")
+    assert released == "extra openvla and download of TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b"
+    assert [name.partition("/")[0] for name in towers_and_text] == ["timm", "timm", "openvla"]
     assert known["magma"].missing() == "extra magma and download of microsoft/Magma-8B"
     there = ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml")
     monkeypatch.setattr("huggingface_hub.try_to_load_from_cache", lambda *asked: "x" if asked == there else None)

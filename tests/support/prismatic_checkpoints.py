@@ -68,6 +68,77 @@ def write_checkpoint(folder: Path, shards: int = 1, seed: int = 1, **fields: Any
     return folder
 
 
+RELEASED_ID = "TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b"
+_FUSED_LAYERS = {"fc1": "0", "fc2": "2", "fc3": "4"}
+_TIMM = ("vit_large_patch14_reg4_dinov2.lvd142m", "vit_so400m_patch14_siglip_224.webli")
+
+
+def write_hub_file(cache: Path, repository: str, name: str) -> Path:
+    """Where the hub's cache keeps a file of a repository; the caller writes it."""
+    root = cache / f"models--{repository.replace('/', '--')}"
+    (root / "refs").mkdir(parents=True, exist_ok=True)
+    (root / "refs" / "main").write_text("0" * 40, encoding="utf-8")
+    file = root / "snapshots" / ("0" * 40) / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    return file
+
+
+def write_release(cache: Path, seed: int = 1, towers_inside: bool = False, published_side: int = 28) -> Path:
+    """A hub cache with TRI-ML's layout: a run's folder in one repository, and timm's towers in theirs.
+
+    towers_inside: in the file of the run, as after full fine-tuning. published_side: of the pictures that timm's
+    towers were published for. Returns the folder of the run; its tensors are those of `write_checkpoint`.
+    """
+    plain = config_values()
+    network = build_prismatic(PrismaticConfig.from_json(plain), torch.float32, device="cpu")
+    initialise(network, seed)
+    parts: dict[str, dict[str, torch.Tensor]] = {"projector": {}, "llm_backbone": {}, "vision_backbone": {}}
+    for name, tensor in network.state_dict().items():
+        module, _, rest = name.partition(".")
+        if module == "projector":
+            layer, _, kind = rest.partition(".")
+            parts["projector"][f"projector.{_FUSED_LAYERS[layer]}.{kind}"] = tensor
+        elif module == "language_model":
+            parts["llm_backbone"][f"llm.{rest}"] = tensor
+        else:
+            tower, _, kind = rest.partition(".")
+            theirs = {"featurizer": "dino_featurizer", "fused_featurizer": "siglip_featurizer"}[tower]
+            parts["vision_backbone"][f"{theirs}.{kind.replace('scale_factor', 'gamma')}"] = tensor
+    towers = parts["vision_backbone"]
+    if not towers_inside:
+        del parts["vision_backbone"]
+        for begin, timm_id in zip(("dino_featurizer.", "siglip_featurizer."), _TIMM, strict=True):
+            own = {name.removeprefix(begin): tensor for name, tensor in towers.items() if name.startswith(begin)}
+            patches = (published_side // 14) ** 2
+            shape = (1, patches, own["pos_embed"].shape[-1])
+            if published_side != 28:
+                own["pos_embed"] = torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+            save_file(
+                {name: tensor.contiguous() for name, tensor in own.items()},
+                write_hub_file(cache, f"timm/{timm_id}", "model.safetensors"),
+            )
+    repository, _, model = RELEASED_ID.rpartition("/")
+    weights = write_hub_file(cache, repository, f"{model}/checkpoints/latest-checkpoint.pt")
+    torch.save({"model": parts}, weights)
+    inside = ("image_sizes", "timm_model_overrides", "text_config", "torch_dtype")
+    run = {
+        "type": model,
+        "model_id": model,
+        "arch_specifier": "no-align+fused-gelu-mlp",
+        "vision_backbone_id": FUSED,
+        "llm_backbone_id": "llama2-7b-pure",
+        "image_resize_strategy": "resize-naive",
+        "llm_max_length": 2048,
+        **{name: plain[name] for name in inside},  # what makes it small
+    }
+    run["text_config"] = {**plain["text_config"], "rms_norm_eps": 1e-6}
+    folder = weights.parents[1]
+    (folder / "config.json").write_text(json.dumps({"model": run, "stage": "finetune"}), encoding="utf-8")
+    write_hub_file(cache, repository, "prism-clip+7b/config.json").write_text("{}", encoding="utf-8")
+    write_tokenizer(write_hub_file(cache, "openvla/openvla-7b", "config.json").parent)
+    return folder
+
+
 def write_tokenizer(folder: Path) -> Path:
     """A word-level tokenizer; it does not add the beginning of the sequence by itself."""
     tokenizer = Tokenizer(

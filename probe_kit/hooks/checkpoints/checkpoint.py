@@ -18,12 +18,23 @@ _READ = (".json", ".safetensors", ".model", ".txt", ".jinja", ".yaml", ".yml")
 _WEIGHTS = ("model.safetensors", "model-", "adapter_model", "pytorch_model")
 _CONFIGURATIONS = ("*config*.json", "dims.json", "*.yaml", "*.yml")
 PATTERNS = ("*.json", "*.safetensors", "*.model", "*.txt", "*.jinja")
+RUN_WEIGHTS = "checkpoints/latest-checkpoint.pt"
+"""Where a folder of a training run of Prismatic keeps its weights."""
+
+
+def hub_name(checkpoint: str) -> tuple[str, str] | None:
+    """Repository and folder of a hub id `owner/repo` or `owner/repo/folder`; None for what is none of both."""
+    parts = checkpoint.split("/")
+    if len(parts) not in (2, 3) or checkpoint.startswith((".", "/", "~")) or not all(parts):
+        return None
+    return "/".join(parts[:2]), "/".join(parts[2:])
 
 
 def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
-    """The local folder of a folder path or hub id such as `lerobot/pi0_base`.
+    """The local folder of a folder path or hub id such as `lerobot/pi0_base`, or `owner/repo/folder` for one model
+    of a repository that holds several.
 
-    patterns: which files of a hub repository are needed.
+    patterns: which files of a hub repository, or of its folder, are needed; no others are downloaded.
     Raises CheckpointError if the folder is not there or the hub cannot deliver it.
     """
     try:
@@ -32,21 +43,53 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
         raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist ({error})") from None
     if folder.is_dir():
         return _possible(folder)
-    if checkpoint.count("/") != 1 or checkpoint.startswith((".", "/", "~")):
+    named = hub_name(checkpoint)
+    if named is None:
         raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist")
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 
-    why = unreachable()
+    why, (repository, inside) = unreachable(), named
+    wanted = [f"{inside}/{pattern}" if inside else pattern for pattern in patterns]
     try:
-        folder = Path(snapshot_download(checkpoint, allow_patterns=list(patterns), local_files_only=bool(why)))
+        folder = Path(snapshot_download(repository, allow_patterns=wanted, local_files_only=bool(why))) / inside
     except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError, ValueError) as error:
         reason = f"{why}; the cache has no copy" if why else str(error).strip().splitlines()[0]
         raise CheckpointError(
             f"cannot fetch {checkpoint!r} from the hub ({reason}). Check the name, your network and, for gated "
             "models, `hf auth login`; or pass a local folder as --checkpoint"
         ) from error
+    if not folder.is_dir():
+        raise CheckpointError(
+            f"the repository {repository} has no folder {inside!r}; look its folders up on its page"
+        )
     return _possible(folder)
+
+
+def hub_files(checkpoint: str) -> list[str]:
+    """Paths of the files of a hub id, sorted: as the hub lists them, or as the cache has them out of its reach.
+
+    Of `owner/repo/folder`, below that folder. Nothing is downloaded. Raises CheckpointError for what is no hub id,
+    and for a repository that neither has.
+    """
+    named = hub_name(checkpoint)
+    if named is None:
+        raise CheckpointError(f"{checkpoint!r} is no hub id; expected owner/repo or owner/repo/folder")
+    repository, inside = named
+    begin = f"{inside}/" if inside else ""
+    if unreachable():
+        folder = checkpoint_folder(checkpoint, ())
+        found = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+        return sorted(found)
+    from huggingface_hub import HfApi
+    from huggingface_hub.errors import HfHubHTTPError
+
+    try:
+        listed = HfApi().list_repo_files(repository)
+    except (HfHubHTTPError, OSError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0]
+        raise CheckpointError(f"cannot list the files of {repository!r} on the hub ({reason})") from error
+    return sorted(name.removeprefix(begin) for name in listed if name.startswith(begin))
 
 
 def _possible(folder: Path) -> Path:
@@ -125,12 +168,22 @@ def check_files(
     if not file.is_file():
         raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}")
     config = read_json(file, CheckpointError, "Download the checkpoint again")
-    found = config.get("type") or config.get("model_type") if isinstance(config, dict) else None
+    found = _type_of(config)
     if not isinstance(found, str) or found not in types:
         way_out = dict(instead).get(str(found), "Pass the right --model")
         raise CheckpointError(f"{file} holds a {found!r} model; expected {' or '.join(types)}. {way_out}")
     if weights and (lacking := missing_weights(folder)):
         raise WeightsError(f"no weights in {folder}: {lacking}. Download the checkpoint again")
+
+
+def _type_of(config: Any) -> Any:
+    """What kind of model a config.json describes; that of a training run of Prismatic has a part `model`."""
+    if not isinstance(config, dict):
+        return None
+    part = config.get("model")
+    if isinstance(part, dict) and "vision_backbone_id" in part:
+        return "prismatic"
+    return config.get("type") or config.get("model_type")
 
 
 def shard_name(name: object) -> str:
@@ -143,7 +196,7 @@ def shard_name(name: object) -> str:
 def missing_weights(folder: Path) -> str:
     """What is not there of a folder's weights; empty if all files are."""
     index = folder / INDEX_FILE
-    if (folder / WEIGHTS_FILE).is_file():
+    if (folder / WEIGHTS_FILE).is_file() or (folder / RUN_WEIGHTS).is_file():
         return ""
     if index.is_file():
         try:

@@ -105,7 +105,7 @@ def _read_file(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             metadata = file.metadata() or {}
     except (SafetensorError, OSError, ValueError, AttributeError) as error:
         raise WeightsError(f"{path} cannot be read ({error}); download the checkpoint again") from error
-    _check_kinds(tensors, path)
+    check_kinds(tensors, path)
     return tensors, metadata
 
 
@@ -115,8 +115,8 @@ _KINDS = (
 """What weights, and buffers such as positions and masks, are made of."""
 
 
-def _check_kinds(tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Quantised weights would be read as if they were the numbers they stand for."""
+def check_kinds(tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Raise WeightsError for quantised weights: they would be read as if they were the numbers they stand for."""
     strange = [f"{name} ({tensor.dtype})" for name, tensor in tensors.items() if tensor.dtype not in _KINDS]
     if strange:
         raise WeightsError(
@@ -125,19 +125,24 @@ def _check_kinds(tensors: Mapping[str, Tensor], path: Path) -> None:
         )
 
 
-def read_pickle(path: Path) -> Weights:
-    """Read one `.pt` file with `weights_only=True`: it cannot run code. Raises WeightsError if it is none."""
+def unpickled(path: Path) -> Any:
+    """The content of a `.pt` file, read with `weights_only=True`: it cannot run code. Raises WeightsError."""
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        return torch.load(path, map_location="cpu", weights_only=True)
     except (UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
         raise WeightsError(
             f"{path} cannot be read as plain tensors ({error}); it may be damaged or unsafe"
         ) from error
+
+
+def read_pickle(path: Path) -> Weights:
+    """Read the state dict in one `.pt` file; see `unpickled`. Raises WeightsError if it is none."""
+    content = unpickled(path)
     if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
         raise WeightsError(
             f"{path} holds {type(content).__name__} of something else than tensors; expected a state dict"
         )
-    _check_kinds(content, path)
+    check_kinds(content, path)
     return Weights(content, str(path), random=False)
 
 

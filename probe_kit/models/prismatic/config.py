@@ -2,12 +2,13 @@
 
 The file names parts of a fixed table (Karamcheti et al. 2024, and OpenVLA's `PrismaticConfig`); explicit fields
 win over the table. The language model's part is short: what it leaves out is transformers' default, which has
-rms_norm_eps 1e-6 for Llama, not Llama-2's own 1e-5.
+rms_norm_eps 1e-6 for Llama, not Llama-2's own 1e-5. A training run's file, as TRI-ML releases it, has these fields
+under `model` and no part for the language model; that is then the published one, with its own 1e-5.
 """
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,36 @@ _LANGUAGE = {
     "mistral-v0.1-7b-instruct": "mistral",
     "phi-2-3b": "phi",
 }
+_LLAMA = {"vocab_size": 32064, "pad_token_id": 32000, "rms_norm_eps": 1e-5, "max_position_embeddings": 4096}
+_SIZE_13B = {
+    "hidden_size": 5120,
+    "intermediate_size": 13824,
+    "num_hidden_layers": 40,
+    "num_attention_heads": 40,
+    "num_key_value_heads": 40,
+}
+_MISTRAL = {
+    "vocab_size": 32064,
+    "pad_token_id": 32000,
+    "max_position_embeddings": 32768,
+    "rms_norm_eps": 1e-5,
+    "sliding_window": 4096,
+}
+_PHI = {
+    "vocab_size": 50304,
+    "pad_token_id": 50295,
+    "bos_token_id": 50256,
+    "eos_token_id": 50256,
+    "hidden_size": 2560,
+    "intermediate_size": 10240,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 32,
+    "partial_rotary_factor": 0.4,
+}
+# Per transformers' model type: the published language model, with the padding that training added.
+_PUBLISHED: Mapping[str, Mapping[str, Any]] = {"llama": _LLAMA, "mistral": _MISTRAL, "phi": _PHI}
+# Where the files of their tokenizers are; Llama 2's own repository is gated, OpenVLA's copy of it is not.
+_TOKENIZERS = {"llama": "openvla/openvla-7b", "mistral": "mistralai/Mistral-7B-v0.1", "phi": "microsoft/phi-2"}
 MODEL_TYPES = ("prismatic", "openvla")
 RESIZE_STRATEGIES = ("resize-naive", "letterbox", "resize-crop")
 
@@ -63,7 +94,8 @@ class PrismaticConfig:
     towers: one, or two whose patch features are joined (`fused`). text: transformers' configuration of the
     language model. action_vocabulary: text ids below the embedding's padding; the last ones name action bins.
     empty_token: the id that ends every OpenVLA prompt. dtype: as stored, None if the file does not say.
-    statistics: per data set, what un-normalises its actions.
+    statistics: per data set, what un-normalises its actions. tokenizer_id: hub id of the tokenizer's files, of a
+    training run, whose folder has none; None for checkpoints that come with theirs.
     """
 
     model_type: str
@@ -77,6 +109,7 @@ class PrismaticConfig:
     empty_token: int
     dtype: str | None
     statistics: Mapping[str, Any]
+    tokenizer_id: str | None = None
 
     @property
     def fused(self) -> bool:
@@ -94,6 +127,11 @@ class PrismaticConfig:
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "PrismaticConfig":
         """From the content of a `config.json`. Raises CheckpointError naming `source`."""
+        if (run := values.get("model")) is not None:
+            if not isinstance(run, Mapping):
+                raise CheckpointError(f"{source} has no fields under `model`; download the checkpoint again")
+            found = cls.from_json(_of_run(run, source), source)
+            return replace(found, tokenizer_id=_TOKENIZERS[found.text.model_type])
         model_type = values.get("model_type")
         if model_type not in MODEL_TYPES:
             raise CheckpointError(
@@ -124,6 +162,22 @@ class PrismaticConfig:
             dtype=values.get("torch_dtype") or values.get("dtype"),
             statistics=values.get("norm_stats") or {},
         )
+
+
+def _of_run(run: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """The fields of a training run in the words of a checkpoint. Raises CheckpointError for another projector."""
+    vision, language = str(run.get("vision_backbone_id")), str(run.get("llm_backbone_id"))
+    projector = str(run.get("arch_specifier", "gelu-mlp")).removeprefix("no-align+")
+    expected = "fused-gelu-mlp" if len(_TOWERS.get(vision, ())) == 2 else "gelu-mlp"
+    if projector != expected:
+        raise CheckpointError(f"{source}: arch_specifier is {projector!r}; expected {expected} for {vision}")
+    text = {**_PUBLISHED.get(_LANGUAGE.get(language, ""), {}), **(_SIZE_13B if "-13b" in language else {})}
+    return {
+        "torch_dtype": "bfloat16",
+        **{name: value for name, value in run.items() if name not in ("type", "model")},
+        "model_type": "prismatic",
+        "text_config": {**text, **(run.get("text_config") or {})},
+    }
 
 
 def _towers(values: Mapping[str, Any], vision: str, source: str) -> tuple[TowerConfig, ...]:

@@ -1,5 +1,6 @@
 """Prismatic vision-language models, native."""
 
+from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.family import Family
 
@@ -12,15 +13,23 @@ FAMILIES = (
     Family(
         "prismatic",
         "Prismatic vision-language models, OpenVLA's source (one or two towers; Llama 2, Vicuna, Mistral, Phi-2)",
-        None,
+        "TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b",
         "probe_kit.hooks.families.prismatic.adapter:load_prismatic",
         streams="backbone 33 layers, answer 33 layers (7B)",
         embodiment="none: answers, does not act",
         packages=(("timm", "openvla"),),
-        notes="pass --checkpoint in the layout of PrismaticForConditionalGeneration; extra openvla",
+        notes=(
+            "MIT, Llama 2 licence; extra openvla; one .pt file, towers of timm, tokenizer of openvla/openvla-7b; "
+            "also folders in the layout of PrismaticForConditionalGeneration"
+        ),
         verifier="probe_kit.hooks.families.prismatic.verify:verify_prismatic",
         config_types=("prismatic", "openvla"),
-        needs_checkpoint=True,
+        files=(*PATTERNS, RUN_WEIGHTS),
+        hub=(
+            ("timm/vit_large_patch14_reg4_dinov2.lvd142m", "model.safetensors"),
+            ("timm/vit_so400m_patch14_siglip_224.webli", "model.safetensors"),
+            ("openvla/openvla-7b", "tokenizer.json"),
+        ),
         full_size="probe_kit.models.prismatic:full_size_prismatic",
         options=(TOKENIZER, BITS, Option("steps", int, "Greedy tokens per inference.", "1")),
         acts=False,

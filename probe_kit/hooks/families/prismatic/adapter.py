@@ -6,6 +6,7 @@ one the positions whose logits choose the output: the prompt's last token, then 
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, content_hashes, side_files
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Model, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
@@ -33,7 +34,9 @@ from probe_kit.hooks.families.shared.vlm.decoding import Prefill
 from probe_kit.models.packing import Packed
 from probe_kit.models.prismatic import Decoded, PictureSettings, prepare_picture
 
+DEFAULT_CHECKPOINT = "TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b"
 CAMERA = "primary"
+_TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json")
 _PROMPT, _LAST = slice(None, -1), slice(-1, None)
 
 
@@ -85,6 +88,8 @@ class PrismaticModel(Model):
         files: dict[str, Path] = {}
         for number, folder in enumerate(self.loaded.folders):
             files |= side_files(folder, "" if number == len(self.loaded.folders) - 1 else "adapter/")
+        if self.loaded.text is not None:
+            files |= side_files(self.loaded.text, "tokenizer/")
         if tokenizer is not None and Path(tokenizer).is_dir():
             files |= side_files(Path(tokenizer), "tokenizer/")
         return {**content_hashes(files), "tokenizer": tokenizer or "the checkpoint's", "steps": str(self.steps)}
@@ -106,7 +111,7 @@ class PrismaticModel(Model):
         """The checkpoint's. Raises CheckpointError naming the files that are missing."""
         text = self.config.text
         return find_tokenizer(
-            self.loaded.folders, self._chosen_tokenizer, text.bos_token_id, self.config.action_vocabulary
+            self.loaded.text_folders, self._chosen_tokenizer, text.bos_token_id, self.config.action_vocabulary
         )
 
     @abstractmethod
@@ -283,7 +288,7 @@ class Prismatic(PrismaticModel, AnswerModel):
 
 
 def load_prismatic(
-    checkpoint: str | None,
+    checkpoint: str | None = None,
     device: str = "cpu",
     dtype: str | None = None,
     random_weights: bool = False,
@@ -293,12 +298,15 @@ def load_prismatic(
     steps: int = 1,
     weights_seed: int = 0,
 ) -> Prismatic:
-    """Load a Prismatic model in the layout of `PrismaticForConditionalGeneration`, from a folder or hub id.
+    """Load a Prismatic model, from a folder or hub id.
 
+    Its layout is that of `PrismaticForConditionalGeneration`, or of a training run as TRI-ML releases it, of which
+    a hub id has the form `owner/repo/folder`. Towers and tokenizer of such a run are downloaded where they are.
     tokenizer: folder of another tokenizer, or `bytes`. bits: 8 or 4, see `load_checkpoint`. steps: greedy tokens
-    per inference. Raises UsageError without a checkpoint, and what `load_checkpoint` raises.
+    per inference. Raises what `load_checkpoint` raises.
     """
-    if checkpoint is None:
-        raise UsageError("prismatic has no default checkpoint; pass a folder or hub id as --checkpoint")
-    loaded = load_checkpoint(checkpoint, device, dtype, random_weights, bits, weights_seed)
+    loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
+    elsewhere = loaded.config.tokenizer_id
+    if tokenizer is None and elsewhere and not any((own / "tokenizer.json").is_file() for own in loaded.folders):
+        loaded = replace(loaded, text=checkpoint_folder(elsewhere, _TOKENIZER_FILES))
     return Prismatic(loaded, steps, tokenizer)

@@ -10,14 +10,17 @@ import torch
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, WeightsError
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype
+from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, checkpoint_folder, chosen_dtype
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.hooks.families.prismatic.lora import ADAPTER_CONFIG, Adapter, merge_adapter
 from probe_kit.hooks.families.prismatic.quantised import check_quantisation, quantise
+from probe_kit.hooks.families.prismatic.release import read_release
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.prismatic import PrismaticConfig, PrismaticNetwork, build_prismatic
 
 STATISTICS_FILE = "dataset_statistics.json"
+FILES = (*PATTERNS, RUN_WEIGHTS)
+"""What is needed of a hub repository, or of the folder of one model of it."""
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 # Files of OpenVLA-OFT: its actions come from heads that its language model's checkpoint does not name.
 _OTHER_HEADS = ("action_head--*", "proprio_projector--*", "noisy_action_projector--*", "vision_backbone--*")
@@ -28,7 +31,8 @@ class LoadedPrismatic:
     """A loaded network and what belongs to it.
 
     checkpoint: as asked for. folders: where its other files may lie, an adapter's own before that of its base.
-    statistics: per data set, what un-normalises its actions. dtype: of the weights, as the card says it.
+    statistics: per data set, what un-normalises its actions. dtype: of the weights, as the card says it. text: the
+    folder of a tokenizer that does not come with the checkpoint.
     """
 
     checkpoint: str
@@ -42,6 +46,12 @@ class LoadedPrismatic:
     exact: bool
     notes: tuple[str, ...]
     weights_seed: int | None = None
+    text: Path | None = None
+
+    @property
+    def text_folders(self) -> tuple[Path, ...]:
+        """Where the tokenizer may lie."""
+        return self.folders if self.text is None else (*self.folders, self.text)
 
 
 def load_checkpoint(
@@ -52,14 +62,14 @@ def load_checkpoint(
     bits: int | None = None,
     weights_seed: int = 0,
 ) -> LoadedPrismatic:
-    """Load a folder or hub id, which may hold a LoRA adapter that names its base.
+    """Load a folder or hub id, which may hold a LoRA adapter that names its base, or a training run's files.
 
     dtype: float32 or bfloat16; default what the checkpoint says. bits: quantise the language model after the
     audit. Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
     """
     if bits is not None:
         check_quantisation(bits, device)
-    folder = checkpoint_folder(checkpoint)
+    folder = checkpoint_folder(checkpoint, FILES)
     adapter = Adapter.read(folder) if (folder / ADAPTER_CONFIG).is_file() else None
     base = folder if adapter is None else adapter.base_folder()
     _check_other_heads((folder, base))
@@ -112,7 +122,8 @@ def _random(
 def _stored(
     config: PrismaticConfig, folder: Path, dtype: torch.dtype, adapter: Adapter | None
 ) -> tuple[PrismaticNetwork, WeightsAudit]:
-    weights = read_weights(folder)
+    released = folder / RUN_WEIGHTS
+    weights = read_release(released, config) if released.is_file() else read_weights(folder)
     network = build_prismatic(config, dtype)
     tied = {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else set()
     named = weights if adapter is None else Weights(

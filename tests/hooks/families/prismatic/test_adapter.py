@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from probe_kit.errors import InstructionError, ObservationError, UnknownSiteError, UsageError
-from probe_kit.hooks import Observation, Prompt, Site, capture, load_model, load_policy
+from probe_kit.hooks import Observation, Prompt, Site, capture, load_policy
 from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
 from probe_kit.hooks.families.prismatic.frames import frame_of
 from probe_kit.hooks.testing import AnswerModelContract
@@ -152,11 +152,6 @@ def test_a_reading_compares_what_may_stand_behind_the_prompt(
 def test_a_vision_language_model_is_no_policy() -> None:
     with pytest.raises(UsageError, match="does not act"):
         load_policy("prismatic")
-
-
-def test_there_is_no_default_checkpoint() -> None:
-    with pytest.raises(UsageError, match="--checkpoint"):
-        load_model("prismatic")
 
 
 def test_a_prompt_that_does_not_fit_is_refused(model: Prismatic) -> None:
