@@ -48,7 +48,8 @@ RELEASED = {
     "internvla-m1": {
         "checkpoint": "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "execute": "1", "rotation": "axis-angle",
         "dtype": "bfloat16",
-        "-M unnorm_key": "bridge_dataset", "-M steps": "10", "-M guidance": "1.5",
+        "-M unnorm_key": "bridge_dataset", "-M weights": "steps_50000_pytorch_model.pt",
+        "-M steps": "10", "-M guidance": "1.5",
     },
 }  # fmt: skip
 

@@ -17,6 +17,8 @@ from probe_kit.errors import CheckpointError
 from probe_kit.models.qwen import without_precision
 
 RUN_FILE, DIMS_FILE = "config.yaml", "dims.json"
+JSON_FILE = "config.json"
+"""What a run may have instead of its `config.yaml`; the file of a vision-language model has the same name."""
 FRAMEWORKS = ("InternVLA-M1", "InternVLA_M1")
 # Per name: width, blocks, heads.
 _DINO = {"dinov2_vits14": (384, 12, 6), "dinov2_vitb14": (768, 12, 12), "dinov2_vitl14": (1024, 24, 16)}
@@ -104,18 +106,21 @@ class InternVLAConfig:
 def find_config(folder: Path) -> tuple[dict[str, Any], Path]:
     """The run's values and the folder they stand in: `folder` itself, or the one above its `checkpoints/`.
 
-    Raises CheckpointError if neither has a `config.yaml` or `dims.json`.
+    Raises CheckpointError if neither has a `config.yaml`, a `config.json` of a run, or `dims.json`.
     """
     for place in (folder, folder.parent):
         files = [place / name for name in (DIMS_FILE, RUN_FILE) if (place / name).is_file()]
-        if files:
-            values: dict[str, Any] = {}
-            for file in files:
-                values |= _read(file)
+        values: dict[str, Any] = {}
+        for file in files:
+            values |= _read(file)
+        if not (place / RUN_FILE).is_file() and (place / JSON_FILE).is_file():
+            run = _read(place / JSON_FILE)
+            values |= run if "framework" in run else {}
+        if values:
             return values, place
     raise CheckpointError(
-        f"{RUN_FILE} is missing in {folder} and in {folder.parent}; this is not an InternVLA-M1 checkpoint. "
-        "A release has it beside the folder checkpoints/"
+        f"{RUN_FILE} or {JSON_FILE} of a run is missing in {folder} and in {folder.parent}; this is not an "
+        "InternVLA-M1 checkpoint. A release has it beside the folder checkpoints/"
     )
 
 

@@ -43,6 +43,9 @@ FAMILIES = (
             Option("unnorm_key", str, "Data set whose units the actions get.", "bridge_dataset"),
             Option("steps", int, "DDIM steps; as many as divide the training's evenly.", "10"),
             Option("guidance", float, "Scale of guidance; 1 or less runs the condition alone.", "1.5"),
+            Option(
+                "weights", str, "File of a step, by its name.", "the only one, or steps_50000_pytorch_model.pt"
+            ),
             Option("vlm", str, "Folder or hub id of its Qwen2.5-VL; no weights.", "as config.yaml says"),
             Option("tokenizer", str, "Folder of another tokenizer.json.", "the vision-language model's"),
         ),
@@ -53,7 +56,7 @@ FAMILIES = (
                 rotation="axis-angle",
                 dtype="bfloat16",
                 options={"steps": 10, "guidance": 1.5},
-                of_checkpoint={"unnorm_key": "bridge_dataset"},
+                of_checkpoint={"unnorm_key": "bridge_dataset", "weights": "steps_50000_pytorch_model.pt"},
                 unmatched=(OWN_SEEDS,),
             )
         },

@@ -124,7 +124,7 @@ class InternVLA(QwenVLA):
             cameras=(CAMERA,),
             chunk=self.config.head.length,
             execute=1,
-            notes=(note,),
+            notes=(note, *([f"weights of {self.parts.weights.name}"] if self.parts.weights.is_file() else [])),
             audit=filled.audit.to_json(),
             settings={
                 **content_hashes(files),
@@ -266,17 +266,19 @@ def load_internvla(
     guidance: float = GUIDANCE,
     vlm: str | None = None,
     tokenizer: str | None = None,
+    weights: str | None = None,
     weights_seed: int = 0,
 ) -> InternVLA:
     """Load InternVLA-M1 from a run's folder, one of its weight files, a converted folder, or a hub id.
 
     unnorm_key: data set whose units the actions get; default the WidowX arm's or the only one. steps: of DDIM.
     guidance: its scale; 1 or less runs the condition alone. vlm: folder or hub id of Qwen2.5-VL's configuration,
-    tokenizer and processor. tokenizer: folder of another one.
+    tokenizer and processor. tokenizer: folder of another one. weights: name of the file of a step, see
+    `find_parts`; the card names the one that was read.
     Raises CheckpointError, WeightsError, and UsageError for options that cannot be.
     """
     name = checkpoint or DEFAULT_CHECKPOINT
-    parts = find_parts(name, vlm)
+    parts = find_parts(name, vlm, weights, unread=random_weights)
     if not np.isfinite(guidance) or guidance < 0:
         raise UsageError(f"guidance is {guidance}; expected a scale such as 1.5")
 

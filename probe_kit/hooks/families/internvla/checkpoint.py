@@ -1,22 +1,25 @@
 """The files of an InternVLA-M1 checkpoint, which are in several places, read without executing code.
 
-A release is a run's folder: `config.yaml`, `dataset_statistics.json`, and the weights as
-`checkpoints/steps_<n>_pytorch_model.pt`. Configuration and tokenizer of the vision-language model lie elsewhere.
+A release is a run's folder: `config.yaml` or `config.json`, `dataset_statistics.json`, and the weights of several
+steps as `checkpoints/steps_<n>_pytorch_model.pt`, of which one is downloaded and read. Configuration and tokenizer
+of the vision-language model lie elsewhere.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, checkpoint_folder
+from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, checkpoint_folder, hub_files
 from probe_kit.hooks.checkpoints.weights import INDEX_FILE, SINGLE_FILE, Weights, read_pickle, read_weights
 from probe_kit.models.internvla import InternVLAConfig, find_config
 
 STATISTICS_FILE = "dataset_statistics.json"
 WEIGHTS_FOLDER = "checkpoints"
+RELEASED_STEP = "steps_50000_pytorch_model.pt"
+"""The file that Act2Answer's evaluation loads, and the one that is read where there are several."""
 _VLM_TYPE = "qwen2_5_vl"
 _VLM_PATTERNS = ("*.json", "*.txt", "*.jinja")
 _DEVELOPMENT = "qwen2_5_vl_config"
@@ -46,39 +49,57 @@ class Parts:
         return dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
 
 
-def find_parts(checkpoint: str, vlm: str | None) -> Parts:
+def find_parts(checkpoint: str, vlm: str | None, weights: str | None = None, unread: bool = False) -> Parts:
     """The parts of a run's folder, its `checkpoints/`, one `.pt` file of it, a converted folder, or a hub id.
 
     vlm: folder or hub id of the vision-language model's files; default what the run's configuration names.
+    weights: name of a step's file; default the only one, or `RELEASED_STEP` among several. No other is downloaded.
+    unread: nothing is looked for, since no weights will be read.
     Raises CheckpointError naming what is missing or ambiguous.
     """
     given = Path(checkpoint).expanduser()
     if given.is_file():
-        folder, weights = given.parent, given
+        folder, file = given.parent, given
     else:
-        folder = checkpoint_folder(checkpoint, (*PATTERNS, "*.pt", "*.yaml"))
-        weights = _weights(folder)
+        folder = checkpoint_folder(checkpoint, (*PATTERNS, "*.yaml"))
+        file = folder if unread else _weights(folder, weights, None if given.is_dir() else checkpoint)
     values, place = find_config(folder)
     where, content = _vlm(values, place, vlm)
-    return Parts(InternVLAConfig.from_values(values, content, str(place)), place, weights, where)
+    return Parts(InternVLAConfig.from_values(values, content, str(place)), place, file, where)
 
 
-def _weights(folder: Path) -> Path:
-    """Safetensors beside the configuration, or the only .pt file there or in `checkpoints/`."""
+def _weights(folder: Path, chosen: str | None, hub: str | None) -> Path:
+    """Safetensors beside the configuration, or a .pt file there or in `checkpoints/`; of `hub` if it is given."""
     for place in (folder, folder / WEIGHTS_FOLDER):
-        if (place / SINGLE_FILE).is_file() or (place / INDEX_FILE).is_file():
+        if chosen is None and ((place / SINGLE_FILE).is_file() or (place / INDEX_FILE).is_file()):
             return place
-    found = sorted(folder.glob("*.pt")) or sorted((folder / WEIGHTS_FOLDER).glob("*.pt"))
-    if len(found) == 1:
-        return found[0]
-    if not found:
+    if hub is not None:
+        name = _chosen([name for name in hub_files(hub) if name.endswith(".pt")], chosen, hub)
+        return checkpoint_folder(hub, (name,)) / name
+    inside = folder.glob(f"{WEIGHTS_FOLDER}/*.pt")
+    files = sorted(path.relative_to(folder).as_posix() for path in (*folder.glob("*.pt"), *inside))
+    return folder / _chosen(files, chosen, str(folder))
+
+
+def _chosen(files: Sequence[str], chosen: str | None, place: str) -> str:
+    """The path of one .pt file among `files`, by its name. Raises CheckpointError for none and for several."""
+    by_name = {Path(file).name: file for file in files}
+    listed = ", ".join(sorted(by_name))
+    if not files:
         raise CheckpointError(
-            f"no weights in {folder} or its {WEIGHTS_FOLDER}/: expected {SINGLE_FILE} or one .pt file"
+            f"no weights in {place} or its {WEIGHTS_FOLDER}/: expected {SINGLE_FILE} or a .pt file"
         )
-    names = ", ".join(file.name for file in found)
-    raise CheckpointError(
-        f"{found[0].parent} holds several weights: {names}. Pass one of these files as --checkpoint"
-    )
+    if chosen is not None:
+        if chosen not in by_name:
+            raise CheckpointError(f"{place} has no weights {chosen!r}; choose -M weights among {listed}")
+        return by_name[chosen]
+    if len(files) == 1:
+        return files[0]
+    if RELEASED_STEP not in by_name:
+        raise CheckpointError(
+            f"{place} holds several weights: {listed}. Name one with -M weights=FILE, or pass one as --checkpoint"
+        )
+    return by_name[RELEASED_STEP]
 
 
 def _vlm(values: Mapping[str, Any], place: Path, chosen: str | None) -> tuple[Path, Mapping[str, Any]]:

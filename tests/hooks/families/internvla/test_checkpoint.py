@@ -3,16 +3,18 @@ import pickle
 import shutil
 import subprocess
 import sys
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.internvla.adapter import load_internvla
-from probe_kit.hooks.families.internvla.checkpoint import find_parts
+from probe_kit.hooks.families.internvla.checkpoint import RELEASED_STEP, find_parts
 from probe_kit.hooks.families.internvla.convert import convert
 from tests.support.internvla_checkpoints import write_checkpoint, write_vlm
 
@@ -35,12 +37,62 @@ def test_the_run_its_folder_of_weights_and_the_file_are_the_same_checkpoint(run:
 def test_of_several_weights_one_has_to_be_named(run: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     shutil.copy(copy / "checkpoints" / NAME, copy / "checkpoints" / "steps_8_pytorch_model.pt")
-    with pytest.raises(CheckpointError, match=r"steps_7.*steps_8.*--checkpoint"):
+    with pytest.raises(CheckpointError, match=r"steps_7.*steps_8.*-M weights=FILE.*--checkpoint"):
         find_parts(str(copy), None)
+    assert find_parts(str(copy), None, "steps_8_pytorch_model.pt").weights.name == "steps_8_pytorch_model.pt"
+    with pytest.raises(CheckpointError, match=r"no weights 'steps_9.pt'; choose .* steps_7.*steps_8"):
+        find_parts(str(copy), None, "steps_9.pt")
+    shutil.copy(copy / "checkpoints" / NAME, copy / "checkpoints" / RELEASED_STEP)
+    assert find_parts(str(copy), None).weights.name == RELEASED_STEP
+    assert find_parts(str(copy), None, unread=True).weights == copy
     assert find_parts(str(copy / "checkpoints" / NAME), None).weights.name == NAME
     shutil.rmtree(copy / "checkpoints")
     with pytest.raises(CheckpointError, match="no weights"):
         find_parts(str(copy), None)
+
+
+def test_a_runs_configuration_may_be_json(run: Path, tmp_path: Path, observation: Observation) -> None:
+    copy = Path(shutil.copytree(run, tmp_path / "run"))
+    values = yaml.safe_load((copy / "config.yaml").read_text(encoding="utf-8"))
+    (copy / "config.yaml").unlink()
+    (copy / "dims.json").rename(tmp_path / "dims.json")
+    with pytest.raises(CheckpointError, match=r"config\.yaml or config\.json of a run is missing"):
+        find_parts(str(copy), None)
+    (tmp_path / "dims.json").rename(copy / "dims.json")
+    (copy / "config.json").write_text(json.dumps(values), encoding="utf-8")
+    one, other = (load_internvla(str(folder), steps=5) for folder in (run, copy))
+    np.testing.assert_array_equal(one.act([observation], [3]), other.act([observation], [3]))
+    assert f"weights of {NAME}" in other.card.notes
+
+
+def test_of_the_hub_one_step_is_downloaded(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the hub does it: only files that match a pattern come."""
+    there = Path(shutil.copytree(run, tmp_path / "hub"))
+    steps = [f"steps_{number}_pytorch_model.pt" for number in (10000, 30000, 50000)]
+    for name in steps:
+        shutil.copy(there / "checkpoints" / NAME, there / "checkpoints" / name)
+    (there / "checkpoints" / NAME).unlink()
+    here = tmp_path / "cache"
+
+    def download(_name: str, allow_patterns: list[str], **_: object) -> str:
+        files = (file for file in there.rglob("*") if file.is_file())
+        for file in files:
+            path = file.relative_to(there).as_posix()
+            if any(fnmatch(path, pattern) for pattern in allow_patterns):
+                (here / path).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(file, here / path)
+        return str(here)
+
+    listed = [file.relative_to(there).as_posix() for file in there.rglob("*") if file.is_file()]
+    monkeypatch.setattr("huggingface_hub.snapshot_download", download)
+    monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", lambda _, _name: listed)
+    monkeypatch.setattr("probe_kit.hooks.checkpoints.checkpoint.unreachable", lambda: "")
+    assert find_parts("some/run", None, unread=True).weights == here
+    assert not list(here.rglob("*.pt"))
+    assert find_parts("some/run", None).weights == here / "checkpoints" / RELEASED_STEP
+    assert [file.name for file in here.rglob("*.pt")] == [RELEASED_STEP]
+    find_parts("some/run", None, steps[0])
+    assert sorted(file.name for file in here.rglob("*.pt")) == sorted([steps[0], RELEASED_STEP])
 
 
 def test_a_vision_language_model_can_be_named_and_has_to_be_one(run: Path, tmp_path: Path) -> None:
