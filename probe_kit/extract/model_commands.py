@@ -99,7 +99,11 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
             "ready": _ready(family),
             "notes": family.notes,
             "does": " and ".join(verb for verb, can in (("acts", family.acts), ("answers", family.reads)) if can),
-            "protocols": {protocol: row.settings() for protocol, row in family.protocols.items()},
+            "protocols": {
+                " ".join(filter(None, (protocol, row.variant))): row.settings()
+                for protocol, first in family.protocols.items()
+                for row in first.rows
+            },
             "interventions": family.interventions_json(),
             "options": [
                 {"name": option.name, "kind": option.kind.__name__, "help": option.help, "default": option.default}

@@ -90,12 +90,13 @@ def check_protocol(name: str) -> None:
 def protocol_identity(settings: ProtocolSettings) -> dict[str, Any]:
     """What a run says of the protocol it follows, under `protocol`; empty without one.
 
+    variant: which of several checkpoints of the protocol it is, where it has several for the model.
     differs_from_default: what the protocol has and what is the default here, by setting. deviations: what the
     protocol has and what the run has. unmatched: what cannot be done here.
     """
     if settings.protocol is None:
         return {}
-    row, used = protocol_row(settings.model, settings.protocol), _used(settings)
+    row, used = protocol_row(settings.model, settings.protocol, settings.checkpoint), _used(settings)
     protocol = {**({} if row is None else row.settings()), **_scene(protocol_scene(settings.protocol))}
     default = {**({} if row is None else _defaults(settings, row)), **_scene(scene_of(settings.model))}
     if settings.capture_only:
@@ -105,6 +106,7 @@ def protocol_identity(settings: ProtocolSettings) -> dict[str, Any]:
     return {
         "protocol": {
             "name": settings.protocol,
+            **({"variant": row.variant} if row is not None and row.variant else {}),
             "differs_from_default": _different(protocol, default, protocol),
             "deviations": _different(protocol, used, {**used, **protocol}),
             "unmatched": [] if row is None else list(row.unmatched),
@@ -118,9 +120,10 @@ def deviations(settings: ProtocolSettings) -> dict[str, list[str | None]]:
     return found
 
 
-def protocol_row(model: str, protocol: str | None) -> ProtocolRow | None:
-    """The protocol's row of a model; None without a protocol, and for scripts.
+def protocol_row(model: str, protocol: str | None, checkpoint: str | None = None) -> ProtocolRow | None:
+    """The protocol's row of a model and checkpoint; None without a protocol, and for scripts.
 
+    With another checkpoint than the protocol's, and with None, it is the row of the model's first.
     Raises UsageError for a model that the protocol does not use.
     """
     family = _family(model)
@@ -134,7 +137,7 @@ def protocol_row(model: str, protocol: str | None) -> ProtocolRow | None:
             f"the protocol {protocol} does not use {model}; it uses {', '.join(using)}. Leave --protocol out, and "
             f"take its scene with --scene {SCENES[protocol]}"
         )
-    return family.protocols[protocol]
+    return family.protocols[protocol].of(checkpoint)
 
 
 def _family(model: str) -> "Family | None":

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal, Self, get_args
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
-from probe_kit.extract.protocols import deviations, protocol_row, scene_of
+from probe_kit.extract.protocols import protocol_identity, protocol_row, scene_of
 from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, Tokens, VideoChoice
 from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.extract.vqa.templates import P1, Template, find_template
@@ -259,7 +259,7 @@ class ExtractSettings(RunSettings):
 
         Raises UsageError for a model that the protocol does not use.
         """
-        row = protocol_row(self.model, self.protocol)
+        row = protocol_row(self.model, self.protocol, self.checkpoint)
         if row is None:
             return self
         return replace(
@@ -400,7 +400,10 @@ def run_label(settings: RunSettings) -> str:
         return " · ".join([settings.label, *(settings.marks() if asks else [])])
     parts = [settings.model]
     if isinstance(settings, ExtractSettings) and settings.protocol is not None:
-        parts += [settings.protocol, *(f"{name}={run}" for name, (_, run) in deviations(settings).items())]
+        said = protocol_identity(settings)["protocol"]
+        variant = [said["variant"]] if "variant" in said and "checkpoint" not in said["deviations"] else []
+        differing = (f"{name}={run}" for name, (_, run) in said["deviations"].items())
+        parts += [settings.protocol, *variant, *differing]
     else:
         parts += [] if settings.checkpoint is None else [Path(settings.checkpoint).name]
         parts += [f"{name}={value}" for name, value in sorted(settings.options.items())]

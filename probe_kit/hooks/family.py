@@ -170,7 +170,10 @@ class Family:
         """What the card says of the source: a untrained network has none, a foreign checkpoint an unknown one."""
         if card.random_weights:
             return {"source": None, "source_weights": None}
-        own = place in (self.default_checkpoint, *(row.checkpoint for row in self.protocols.values()))
+        own = place in (
+            self.default_checkpoint,
+            *(row.checkpoint for first in self.protocols.values() for row in first.rows),
+        )
         return {"source": self.source, "source_weights": self.source_weights if own else None}
 
     def check(

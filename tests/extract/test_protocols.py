@@ -60,11 +60,32 @@ def test_every_model_of_the_release_that_is_here_has_its_row() -> None:
     assert rows == RELEASED
 
 
+@pytest.mark.parametrize(
+    ("checkpoint", "variant", "unnorm_key"),
+    [
+        (None, "SFT", "sft"),
+        ("gen-robot/openvla-7b-rlvla-sft_16k", "SFT", "sft"),
+        ("gen-robot/openvla-7b-rlvla-rl", "RL", "bridge_orig"),
+        ("openvla/openvla-7b", "base", "bridge_orig"),
+    ],
+)
+def test_openvla_has_a_row_per_checkpoint_and_labels_say_which_it_is(
+    checkpoint: str | None, variant: str, unnorm_key: str
+) -> None:
+    settings = ExtractSettings("openvla", checkpoint, protocol="act2answer").followed()
+    shared = {"temperature": 0.6, "top_k": "checkpoint", "resize": "tensor", "centre_crop": False}
+    assert dict(settings.options) == {"unnorm_key": unnorm_key, **shared}
+    assert deviations(settings) == {}
+    assert protocol_identity(settings)["protocol"]["variant"] == variant
+    assert run_label(settings) == f"openvla · act2answer · {variant}"
+    assert ExtractSettings("openvla", settings.checkpoint, protocol="act2answer").followed() == settings
+
+
 @pytest.mark.parametrize("name", RELEASED)
 def test_the_options_of_a_row_are_the_familys_own(name: str) -> None:
     """What a loader would refuse is refused here, without one."""
     family = own_families()[name]
-    for row in family.protocols.values():
+    for row in (row for first in family.protocols.values() for row in first.rows):
         given = row.options_for(None)
         assert check_options(name, family.options, given) == given
 
@@ -74,7 +95,7 @@ def test_what_is_not_given_is_as_released(name: str) -> None:
     settings = ExtractSettings(name, protocol="act2answer").followed()
     assert settings.scene == SceneSpec.preset("act2answer")
     assert deviations(settings) == {}
-    assert run_label(settings) == f"{name} · act2answer"
+    assert run_label(settings) == f"{name} · act2answer" + (" · SFT" if name == "openvla" else "")
     assert settings.followed() == settings
 
 
@@ -137,6 +158,7 @@ def test_options_of_the_protocols_checkpoint_do_not_follow_another_one() -> None
     assert "unnorm_key" not in own.options
     assert own.options["temperature"] == 0.6
     assert set(deviations(own)) == {"checkpoint", "-M unnorm_key"}
+    assert "SFT" not in run_label(own)
 
 
 def test_the_conversion_of_rotations_is_the_protocols_unless_another_is_asked_for() -> None:
@@ -191,9 +213,11 @@ def test_a_run_names_its_protocol_and_the_report_lists_what_differs(small_suite:
 def test_the_documented_table_is_that_of_the_registry() -> None:
     page = (Path(__file__).parents[2] / "docs" / "protocols.md").read_text(encoding="utf-8")
     for name, family in own_families().items():
-        for row in family.protocols.values():
+        for row in (row for first in family.protocols.values() for row in first.rows):
             options = " ".join(f"{key}={value}" for key, value in row.settings().items() if key.startswith("-M"))
-            line = next(line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
+            begin = f"| `{name}` {row.variant}".rstrip()
+            line = next(line for line in page.splitlines() if line.startswith(begin))
             assert f"`{row.checkpoint}` | {row.execute}" in line
+            assert f"| {row.rotation} |" in line
             for pair in options.replace("-M ", "").split():
                 assert pair in line, (name, pair)

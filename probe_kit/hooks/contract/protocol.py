@@ -18,7 +18,8 @@ class ProtocolRow:
     execute: actions executed per inference. options: of the family, whatever the checkpoint. of_checkpoint: the
     ones that only the protocol's own checkpoint needs. rotation: `roll-pitch-yaw` passes the angles of an action
     on; `axis-angle` passes axis times angle of the same turn on, which the controller then reads as angles.
-    unmatched: what of the protocol cannot be done here.
+    unmatched: what of the protocol cannot be done here. variant: which of several checkpoints it is, as in labels.
+    further: rows of the others; without a checkpoint, the row that holds them is used.
     """
 
     checkpoint: str
@@ -28,6 +29,17 @@ class ProtocolRow:
     of_checkpoint: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     rotation: Rotation = PLAIN
     unmatched: tuple[str, ...] = ()
+    variant: str = ""
+    further: "tuple[ProtocolRow, ...]" = ()
+
+    @property
+    def rows(self) -> "tuple[ProtocolRow, ...]":
+        """This row and the further ones."""
+        return (self, *self.further)
+
+    def of(self, checkpoint: str | None) -> "ProtocolRow":
+        """The row of `checkpoint`; this one for None, and for a checkpoint that the protocol does not use."""
+        return next((row for row in self.rows if row.checkpoint == checkpoint), self)
 
     def options_for(self, checkpoint: str | None) -> dict[str, Any]:
         """The options with `checkpoint`, None for the protocol's own."""

@@ -6,6 +6,24 @@ from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
 from probe_kit.hooks.families.shared.capabilities import TOKENS
 from probe_kit.hooks.family import Family
 
+BRIDGE = "bridge_orig"
+"""The data set of the WidowX arm that Act2Answer imitates."""
+
+
+def _row(variant: str, checkpoint: str, unnorm_key: str, *further: ProtocolRow) -> ProtocolRow:
+    """One of the three that the evaluation compares; they differ in checkpoint and units only."""
+    return ProtocolRow(
+        checkpoint,
+        execute=1,
+        dtype="bfloat16",
+        options={"temperature": 0.6, "top_k": "checkpoint", "resize": "tensor", "centre_crop": False},
+        of_checkpoint={"unnorm_key": unnorm_key},
+        unmatched=(OWN_SEEDS, "another filter than the checkpoint's own would not be noticed"),
+        variant=variant,
+        further=further,
+    )
+
+
 FAMILIES = (
     Family(
         "openvla",
@@ -47,13 +65,12 @@ FAMILIES = (
             ),
         ),
         protocols={
-            ACT2ANSWER: ProtocolRow(
+            ACT2ANSWER: _row(
+                "SFT",
                 "gen-robot/openvla-7b-rlvla-sft_16k",
-                execute=1,
-                dtype="bfloat16",
-                options={"temperature": 0.6, "top_k": "checkpoint", "resize": "tensor", "centre_crop": False},
-                of_checkpoint={"unnorm_key": "sft"},
-                unmatched=(OWN_SEEDS, "another filter than the checkpoint's own would not be noticed"),
+                "sft",
+                _row("RL", "gen-robot/openvla-7b-rlvla-rl", BRIDGE),
+                _row("base", "openvla/openvla-7b", BRIDGE),
             )
         },
         interventions=TOKENS,

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hashing import sha256_json
+from probe_kit.hooks.families.openvla import BRIDGE
 from probe_kit.models.bounds import check_bounds
-
-BRIDGE = "bridge_orig"
-"""The data set of the WidowX arm that Act2Answer imitates."""
 
 
 @dataclass(frozen=True)
