@@ -19,6 +19,6 @@ class DefaultScene:
 
 
 RELEASED = DefaultScene("act2answer")
-"""Of every family that declares no other: policies and readers of one study get the same first frames."""
+"""Of every family that declares no other: policies and VLMs of one study get the same first frames."""
 EMBEDDED = DefaultScene("act2answer", MappingProxyType({"early_stop": True, "max_steps": 40}))
 """Of the embedded models, whose demonstrations took at most 40 actions."""
