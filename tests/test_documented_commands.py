@@ -126,7 +126,7 @@ def test_a_command_is_accepted_as_it_is_typed(
     if leaf.name in ("demo", "doctor", "models"):
         return
     monkeypatch.setattr("probe_kit.extract.prepare", _stop_with, raising=False)
-    monkeypatch.setattr("probe_kit.extract.extraction.prepare_asks", lambda wanted, _: _stop_with(*wanted))
+    monkeypatch.setattr("probe_kit.extract.extraction.prepare_asks", lambda wanted, _, **__: _stop_with(*wanted))
     with contextlib.chdir(tmp_path):
         answer = CliRunner().invoke(app, command.words[1:])
     said = " ".join(answer.stderr.split())
@@ -152,7 +152,7 @@ LOOKED_FOR = {
 """What a command complains of in an empty folder, when nothing is wrong with the command itself."""
 
 
-def _stop_with(*asked: Any) -> Any:
+def _stop_with(*asked: Any, **_: Any) -> Any:
     """In place of loading a model: what can be wrong with the settings before."""
     from probe_kit.extract.prepared import as_protocol
     from probe_kit.extract.rollout.controllers import SCRIPTED

@@ -15,14 +15,19 @@ _GPU_NODES = ("nvidia[0-9]*", "nvidiactl", "nvhost-*", "nvgpu*", "nvmap", "dxg",
 _NVIDIA = Path("/proc/driver/nvidia/gpus")
 
 
-def check_device_name(device: str) -> None:
-    """Raise UsageError for what is no device, or is one that this machine surely lacks; says what it has."""
+def check_device_name(device: str, present: bool = True) -> None:
+    """Raise UsageError for what is no device, or is one that this machine surely lacks; says what it has.
+
+    present: False accepts a device of another machine.
+    """
     found = _DEVICE.fullmatch(device)
     if found is None or found["kind"] not in _KINDS:
         raise UsageError(
             f"device {device!r} cannot be used: it is none of {', '.join(_KINDS)}, with an index such as cuda:1. "
             f"{what_is_here()}"
         )
+    if not present:
+        return
     if (found["kind"] == "cuda" and _surely_without_gpu()) or (
         found["kind"] == "mps" and sys.platform != "darwin"
     ):

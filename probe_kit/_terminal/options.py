@@ -164,7 +164,9 @@ InferenceLimit = Annotated[
 
 # -- planning and output ----------------------------------------------------------------------------------------
 
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.")]
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Print the plan and stop. Needs no weights, network or GPU.")
+]
 AllowMixed = Annotated[
     bool,
     _resuming_option(

@@ -61,7 +61,7 @@ def ask(
     wanted = AskSettings.per_prompt_and_size(chosen.pop("prompt"), chosen.pop("picture_size"), **chosen)
     places = [None if out_folder is None else f"{out_folder.rstrip('/')}/{one.short_name}" for one in wanted]
     runs: list[Run] = []
-    prepared = prepare_asks(wanted, places)
+    prepared = prepare_asks(wanted, places, fetch=not dry_run)
     for number, place in enumerate(places):
         with err.status("loading suite and model"):
             extraction = next(prepared)

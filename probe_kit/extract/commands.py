@@ -75,7 +75,7 @@ def extract(
 
     settings = ExtractSettings.from_options(**chosen)
     with err.status("loading suite and model"):
-        extraction = prepare(settings, out_folder)
+        extraction = prepare(settings, out_folder, fetch=not dry_run)
     location = locate(out_folder or Path("runs") / extraction.default_name())
     print_plan(extraction, location)
     print_sufficiency(extraction)
@@ -97,7 +97,8 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()
     growth = growth_at(location, plan.to_json()["episodes"])
     needed = in_units(sum(space_needed(extraction.further_plan(location), extraction.settings).values()))
-    weights = (identity["weights_sha256"] or "scripted")[:12]
+    weights = "not read" if extraction.declared else (identity["weights_sha256"] or "scripted")[:12]
+    declared = " (of the released size; the weights were not read)" if extraction.declared else ""
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
         **_protocol_row(identity),
@@ -107,7 +108,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
         **({"grows": growth.words} if growth and growth.words else {}),
         **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
-        "streams": "; ".join(_describe(s) for s in plan.streams) or "none",
+        "streams": ("; ".join(_describe(s) for s in plan.streams) or "none") + declared,
         **(
             {"acts": "no: only captured, once per episode; no success rate"}
             if identity.get("capture_only")
@@ -159,7 +160,7 @@ def _pace_row(extraction: "Extraction") -> dict[str, str]:
     """What a calibration chose; nothing where batch and processes were given."""
     if extraction.calibration is not None:
         return {"pace": extraction.calibration.words}
-    return {"pace": "batch auto: every worker chooses its own"} if extraction.settings.calibrate else {}
+    return {"pace": "batch auto: chosen when the model runs"} if extraction.settings.calibrate else {}
 
 
 def _protocol_row(identity: dict[str, Any]) -> dict[str, str]:

@@ -24,10 +24,11 @@ _OF_THE_CHECKPOINT = ("dtype", "execute", "random_weights", "weights_seed")
 """Settings whose value the loaded model may decide."""
 
 
-def check_model(settings: RunSettings, scripted: tuple[str, ...]) -> None:
+def check_model(settings: RunSettings, scripted: tuple[str, ...], fetch: bool = True) -> None:
     """Refuse a model, option, device or checkpoint that cannot be used; imports no torch.
 
-    scripted: names of models that are none. Raises UnknownModelError and what `Family.check` raises.
+    scripted: names of models that are none. fetch: see `Family.check`. Raises UnknownModelError and what
+    `Family.check` raises.
     """
     if settings.ray is not None and find_spec("ray") is None:
         raise MissingExtraError(f"--ray needs ray, which is not installed; `{install_command('ray')}`")
@@ -44,7 +45,7 @@ def check_model(settings: RunSettings, scripted: tuple[str, ...]) -> None:
     device = "cpu" if settings.workers or settings.ray else settings.device
     find_family(settings.model, scripted).check(
         settings.checkpoint, device, settings.dtype, settings.random_weights, settings.options,
-        settings.weights_seed,
+        settings.weights_seed, fetch,
     )  # fmt: skip
 
 

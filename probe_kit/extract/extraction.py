@@ -3,12 +3,12 @@
 import json
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit._terminal.notebook import notebook_progress
-from probe_kit.errors import EpisodesFailedError, StoreError
+from probe_kit.errors import EpisodesFailedError, StoreError, UsageError
 from probe_kit.extract.needs import space_needed
 from probe_kit.extract.plan import Plan
 from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_answer_model
@@ -63,6 +63,8 @@ class Extraction(Prepared):
         is wrong with all episodes at once. Committed episodes stay; the same call resumes after them.
         """
         location = locate(out)
+        if self.declared:
+            raise UsageError("this extraction was planned without its model; prepare it again with fetch=True")
         with location.in_words():
             if not force and (further := self.further_plan(location)).episodes:
                 check_if_full(space_needed(further, self.settings), location)
@@ -141,12 +143,14 @@ def prepare(
     out: Path | str | Location | None = None,
     answer_model: "AnswerModel | None" = None,
     policy: "Policy | None" = None,
+    fetch: bool = True,
 ) -> Extraction:
     """Find the suite, load the model and plan the episodes.
 
     out: where it will be written, if that is known; what is wrong there is then said before the model is loaded.
     answer_model: the model of these `AskSettings`, if it is loaded already. policy: that of these
-    `ExtractSettings`; several runs can share one. Workers load their own.
+    `ExtractSettings`; several runs can share one. Workers load their own. fetch: False plans with the streams that
+    the family declares, without weights, network or GPU; such an extraction cannot be run.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     settings = as_protocol(settings)
@@ -154,10 +158,10 @@ def prepare(
     if settings.workers or settings.ray:
         # This process only plans; the GPUs belong to the workers.
         here = replace(settings, device="cpu", calibrate=False)  # each worker calibrates on its own device
-        planned = load(here, location=location, answer_model=answer_model, policy=policy)
-        return Extraction(settings, planned.plan, planned.card, None)
-    prepared = load(settings, location=location, answer_model=answer_model, policy=policy)
-    return Extraction(prepared.settings, prepared.plan, prepared.card, prepared.controller, prepared.calibration)
+        planned = load(here, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
+        return Extraction(settings, planned.plan, planned.card, None, declared=planned.declared)
+    prepared = load(settings, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
+    return Extraction(**{field.name: getattr(prepared, field.name) for field in fields(prepared)})
 
 
 def extract_run(settings: ExtractSettings, out: Path | str, progress: Progress | None = None) -> Run:
@@ -171,15 +175,19 @@ def ask_run(settings: AskSettings, out: Path | str, progress: Progress | None = 
 
 
 def prepare_asks(
-    settings: Sequence[AskSettings], outs: Sequence[Path | str | Location | None]
+    settings: Sequence[AskSettings], outs: Sequence[Path | str | Location | None], fetch: bool = True
 ) -> Iterator[Extraction]:
     """Several runs of one model, which is loaded once; each is prepared when its turn comes.
 
+    fetch: as of `prepare`.
     What is wrong with any of them, as far as it is known without the model, is said before the first.
     Raises what `prepare` raises.
     """
     for own, out in zip(settings, outs, strict=True):
-        check_run(own, None if out is None else locate(out))
+        check_run(own, None if out is None else locate(out), fetch=fetch)
+    if not fetch:
+        yield from (prepare(own, out, fetch=False) for own, out in zip(settings, outs, strict=True))
+        return
     first = settings[0]
     elsewhere = bool(first.workers or first.ray)
     answer_model = load_answer_model(replace(first, device="cpu") if elsewhere else first)

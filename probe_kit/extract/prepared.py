@@ -14,12 +14,14 @@ from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, Po
 from probe_kit.extract.rollout.examples import check_unfit, example_observations
 from probe_kit.extract.rollout.preflight import run_preflight
 from probe_kit.extract.rollout.settings_checks import check_embodiment, check_meaningless, check_unreachable
+from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import provenance_here
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.extract.vqa.phrases import phrases
 from probe_kit.hashing import sha256_json
+from probe_kit.hooks.contract.views import view_names
 from probe_kit.suite import Suite, default_suite, load_suite
 
 if TYPE_CHECKING:
@@ -31,7 +33,8 @@ class Prepared:
     """What an extraction starts from: the model was loaded and the plan is made.
 
     controller: None if the model is loaded again by workers elsewhere. calibration: what chose the batch, None if
-    it was not requested or is left to workers.
+    it was not requested or is left to workers. declared: no model was loaded; the streams are those that its
+    family declares, and the run has no name yet.
     """
 
     settings: RunSettings
@@ -39,6 +42,7 @@ class Prepared:
     card: dict[str, Any]
     controller: ActingController | AnswerController | None
     calibration: Calibration | None = None
+    declared: bool = False
 
     def identity(self) -> dict[str, Any]:
         """Everything that decides the numbers of an episode: neither which are selected, nor the label.
@@ -72,7 +76,8 @@ class Prepared:
         """
         suite, wordings = self.plan.suite, self.settings.asked_wordings
         named = [self.identity(), suite.whole.content_sha256, suite.categories, wordings]
-        name = [self.settings.model, sha256_json(named)[:8]]
+        # Without the weights' hash there is no name yet.
+        name = [self.settings.model, "…" if self.declared else sha256_json(named)[:8]]
         if isinstance(self.settings, AskSettings):
             name = ["ask", name[0], self.settings.short_name, name[1]]
         return "-".join(name)
@@ -84,28 +89,36 @@ def load(
     location: Location | None = None,
     answer_model: "AnswerModel | None" = None,
     policy: "Policy | None" = None,
+    fetch: bool = True,
 ) -> Prepared:
     """Find the suite, build the scene once unless that was done, load the model and plan the episodes.
 
     location: where it will be written, if that is known, so that it is looked at before the model is loaded.
     answer_model: the model of these `AskSettings`, if it is loaded already; it may be one of your own.
     policy: the model of these `ExtractSettings`, if it is loaded already; several runs then share it.
+    fetch: False makes the plan of the streams that the model's family declares: without weights, network or GPU. A
+    family that declares none is loaded.
     Raises UsageError for a policy of another family or with other weights than the settings name, and what these
     raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     settings = as_protocol(settings)
-    suite = check_run(settings, location, loaded=not (answer_model is None and policy is None))
+    suite = check_run(settings, location, loaded=not (answer_model is None and policy is None), fetch=fetch)
     if not rehearsed:
         run_preflight(settings.scene, plan_episodes(suite, settings.seed))
     wordings, objects = settings.asked_wordings, asked_objects(settings, suite)
     asked = list(plan_episodes(suite, settings.seed, wordings, objects))
     if wordings is not None:
         skipped_items(suite, asked, wordings)
+    if policy is None:
+        _check_instructions(settings, instructions_of(asked), fetch)
+    with_tokens = settings.tokens == "all"
+    if not fetch and (streams := _declared_streams(settings)) is not None:
+        plan = make_plan(suite, streams, settings.seed, settings.stored_calls, with_tokens, wordings, objects)
+        return Prepared(settings, plan, _declared_card(settings), None, declared=True)
     if isinstance(settings, AskSettings):
         controller: ActingController | AnswerController = _asking(settings, suite, answer_model)
     else:
         controller = _acting(settings, instructions_of(asked), policy)
-    with_tokens = settings.tokens == "all"
     plan = make_plan(
         suite, controller.streams, settings.seed, settings.stored_calls, with_tokens, wordings, objects
     )
@@ -120,13 +133,15 @@ def as_protocol(settings: RunSettings) -> RunSettings:
     return settings.followed() if isinstance(settings, ExtractSettings) else settings
 
 
-def check_run(settings: RunSettings, location: Location | None = None, loaded: bool = False) -> Suite:
+def check_run(
+    settings: RunSettings, location: Location | None = None, loaded: bool = False, fetch: bool = True
+) -> Suite:
     """The suite of a run, once everything was checked that can be without scene and model. Raises as `load`.
 
-    loaded: the model is there already, and may be one that no name leads to.
+    loaded: the model is there already, and may be one that no name leads to. fetch: see `Family.check`.
     """
     if not loaded:
-        check_model(settings, tuple(SCRIPTED))
+        check_model(settings, tuple(SCRIPTED), fetch)
     check_meaningless(settings)
     suite = _suite(settings)
     texts = _texts(settings, suite)
@@ -135,6 +150,35 @@ def check_run(settings: RunSettings, location: Location | None = None, loaded: b
     if location is not None:
         check_place(settings, suite, location)
     return suite
+
+
+def _check_instructions(settings: RunSettings, instructions: Sequence[str], fetch: bool) -> None:
+    """Raise InstructionError for what a policy cannot read, before its network is loaded."""
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(settings.model)
+    if family is not None and isinstance(settings, ExtractSettings):
+        family.check_instructions(settings.checkpoint, instructions, settings.options, fetch)
+
+
+def _declared_streams(settings: RunSettings) -> list[StoredStream] | None:
+    """What a run stores of the streams that its family declares; None for one that declares none."""
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(settings.model)
+    declared = None if family is None else family.declared_streams(settings.options)
+    if declared is None:
+        return None
+    if settings.tokens == "none":
+        return []
+    return [StoredStream.of(one.stream, one.tokens, view_names(one.roles)) for one in declared]
+
+
+def _declared_card(settings: RunSettings) -> dict[str, Any]:
+    """What is known of a model that was not loaded."""
+    given = {"dtype": settings.dtype, "execute": getattr(settings, "execute", None)}
+    known = {name: value for name, value in given.items() if value is not None}
+    return {"model": settings.model, "random_weights": settings.random_weights, "weights_sha256": None, **known}
 
 
 def _suite(settings: RunSettings) -> Suite:

@@ -1,7 +1,7 @@
 """A model family: its name, loader, verification, options and requirements. Imports no torch."""
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -25,10 +25,12 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     check_files,
     checkpoint_folder,
     hub_name,
+    is_on_hub,
     missing_weights,
 )
 from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
 from probe_kit.hooks.contract.card import ModelCard, SourceWeights
+from probe_kit.hooks.contract.declared import DeclaredStream
 from probe_kit.hooks.contract.default_scene import RELEASED, DefaultScene
 from probe_kit.hooks.contract.interventions import ALL_EDITS, InterventionKind, Interventions
 from probe_kit.hooks.contract.options import Option, check_options
@@ -66,6 +68,9 @@ class Family:
     none, and then only the loader knows one when it sees it. instead: for other such types that people may take
     for one of them, what to do. needs_checkpoint: nothing is there by default. protocols: published protocols that
     use the family, by name, with what they use it with. interventions: what of them its policy supports.
+    declared: streams of the released sizes, by name of the size, which is empty where there is one; a plan is made
+    of them where no weights are read. words: `module:function(checkpoint, instructions, **options)` that raises
+    InstructionError for what cannot be read, from the checkpoint's small files alone.
     files: patterns of the files of a hub repository that are needed.
     home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
     `words_in`, of a family whose default checkpoint knows few words; empty for one that reads any text.
@@ -96,6 +101,8 @@ class Family:
     source_weights: SourceWeights | None = None
     sizes: tuple[tuple[str, str], ...] = ()
     interventions: Interventions = ALL_EDITS
+    declared: Mapping[str, tuple[DeclaredStream, ...]] = MappingProxyType({})
+    words: str | None = None
     files: tuple[str, ...] = PATTERNS
     home: DefaultScene = RELEASED
     vocabulary: str = ""
@@ -184,10 +191,12 @@ class Family:
         random_weights: bool = False,
         options: Mapping[str, Any] = MappingProxyType({}),
         weights_seed: int = 0,
+        fetch: bool = True,
     ) -> dict[str, Any]:
         """Everything about `load` that can be wrong without weights, in a second instead of a minute.
 
-        Returns the options as the loader gets them. A checkpoint on the hub is downloaded. Raises UsageError,
+        fetch: download a checkpoint that is on the hub, and look for its weights; else only files that are here
+        are looked at, and no weights. Returns the options as the loader gets them. Raises UsageError,
         MissingExtraError, CheckpointError or WeightsError as loading would.
         """
         chosen = check_options(self.name, self.options, options)
@@ -197,7 +206,7 @@ class Family:
             )
         if dtype not in (None, *DTYPES):
             raise UsageError(f"dtype is {dtype!r}; expected one of {', '.join(DTYPES)}")
-        check_device_name(device)
+        check_device_name(device, present=fetch)
         for module, extra in self._missing_packages():
             raise MissingExtraError(
                 f"{self.name} needs {module}, which is not installed; `{install_command(extra)}`"
@@ -205,12 +214,32 @@ class Family:
         place = self.place(checkpoint, chosen.get(SIZE))
         if place is None and self.needs_checkpoint:
             raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
-        if place is not None and self.config_types:
+        if place is not None and self.config_types and (fetch or not is_on_hub(place)):
             with naming_checkpoint(self.name, place):
-                check_files(
-                    checkpoint_folder(place, self.files), self.config_types, not random_weights, self.instead
-                )
+                weights = fetch and not random_weights
+                check_files(checkpoint_folder(place, self.files), self.config_types, weights, self.instead)
         return chosen
+
+    def declared_streams(self, options: Mapping[str, Any]) -> tuple[DeclaredStream, ...] | None:
+        """The streams of the size that `options` choose; None for a family that declares none."""
+        size = check_options(self.name, self.options, options).get(SIZE)
+        return self.declared.get(size or next(iter(self.declared), ""))
+
+    def check_instructions(
+        self, checkpoint: str | None, instructions: Sequence[str], options: Mapping[str, Any], fetch: bool = True
+    ) -> None:
+        """Raise InstructionError for an instruction that the model cannot read, before its network is loaded.
+
+        fetch: download small files that are not here; without it, nothing is checked then.
+        """
+        chosen = check_options(self.name, self.options, options)
+        place = self.place(checkpoint, chosen.pop(SIZE, None))
+        if self.words is None or (not fetch and place is not None and is_on_hub(place)):
+            return
+        with while_loading(self.name, self.words):
+            check = imported(self.words)
+        with naming_checkpoint(self.name, str(place or "what it brings")):
+            check(place, instructions, **chosen)
 
     def check_intervention(self, kind: InterventionKind) -> None:
         """Raises UnsupportedInterventionError, before anything is loaded, for what the family does not support."""

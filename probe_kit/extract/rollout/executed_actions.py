@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.env.rotations import from_rpy, to_vector
-from probe_kit.extract.rollout.action_ensemble import ensemble
 from probe_kit.hooks.contract.protocol import PLAIN, Rotation
 
 _TURN = slice(3, 6)
+_GRIPPER_OPEN = 0.5
 
 
 def executed_actions(
@@ -33,3 +33,18 @@ def with_rotation_vectors(actions: NDArray[np.float32]) -> NDArray[np.float32]:
     converted = actions.copy()
     converted[:, _TURN] = [to_vector(from_rpy(angles)) for angles in actions[:, _TURN].astype(np.float64)]
     return converted
+
+
+def ensemble(chunks: Sequence[NDArray[np.float32]], exponent: float) -> NDArray[np.float32]:
+    """(7,) float32: the action for this step, from the chunks (chunk, 7) of an episode's inferences, oldest first.
+
+    There is an inference per step, so a chunk made n steps ago contributes its n-th action, and one that is too
+    old not at all. Weights grow by e^exponent from each chunk to the next; the gripper is open or closed by their
+    majority.
+    """
+    length = len(chunks[-1])
+    plans = np.array([chunk[age] for age, chunk in enumerate(reversed(chunks[-length:]))], np.float64)[::-1]
+    weights = np.exp(exponent * np.arange(len(plans)))
+    action = np.asarray(weights @ plans / weights.sum(), np.float32)
+    action[-1] = action[-1] > _GRIPPER_OPEN
+    return action

@@ -18,6 +18,8 @@ _READ = (".json", ".safetensors", ".model", ".txt", ".jinja", ".yaml", ".yml")
 _WEIGHTS = ("model.safetensors", "model-", "adapter_model", "pytorch_model")
 _CONFIGURATIONS = ("*config*.json", "dims.json", "*.yaml", "*.yml")
 PATTERNS = ("*.json", "*.safetensors", "*.model", "*.txt", "*.jinja")
+SMALL_FILES = ("*.json", "*.model", "*.txt", "*.jinja", "adapter_model.safetensors")
+"""Those of them that hold no weights, but for an adapter's."""
 RUN_WEIGHTS = "checkpoints/latest-checkpoint.pt"
 """Where a folder of a training run of Prismatic keeps its weights."""
 
@@ -28,6 +30,11 @@ def hub_name(checkpoint: str) -> tuple[str, str] | None:
     if len(parts) not in (2, 3) or checkpoint.startswith((".", "/", "~")) or not all(parts):
         return None
     return "/".join(parts[:2]), "/".join(parts[2:])
+
+
+def is_on_hub(checkpoint: str) -> bool:
+    """Whether a checkpoint is named by a hub id, and not by a folder or file that is here."""
+    return hub_name(checkpoint) is not None and not Path(checkpoint).expanduser().exists()
 
 
 def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:

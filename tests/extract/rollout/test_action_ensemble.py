@@ -7,8 +7,8 @@ import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings
-from probe_kit.extract.rollout.action_ensemble import ensemble
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
+from probe_kit.extract.rollout.executed_actions import ensemble
 from probe_kit.extract.rollout.settings_checks import check_unreachable
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, load_policy

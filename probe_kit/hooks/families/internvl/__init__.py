@@ -1,5 +1,6 @@
 """InternVL, on transformers' own network."""
 
+from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.family import Family
 
@@ -20,6 +21,7 @@ FAMILIES = (
                 "It is laid out for its authors' own code; take the repository of the same name that ends in -HF",
             ),
         ),
+        declared={"8B": answering(37, 4096, 300), "38B": answering(65, 5120, 300)},
         full_size="probe_kit.models.internvl:full_size_internvl",
         stored_names="probe_kit.models.internvl:FILE_NAMES",
         sizes=(

@@ -1,13 +1,16 @@
 """InternVLA-M1, native."""
 
 from probe_kit.hooks.contract.card import SourceWeights
+from probe_kit.hooks.contract.declared import DeclaredStream, backbone, expert
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
-from probe_kit.hooks.contract.sites import QUANTITIES
+from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.capabilities import MERGED
 from probe_kit.hooks.family import Family
 
+_UNCONDITIONAL = "action expert without condition"
+_HEAD = ("condition", "action")
 _BLOCK = ("residual", "attention", "mlp")
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "bridge": _BLOCK, "expert": QUANTITIES, "expert_unconditional": QUANTITIES},
@@ -34,6 +37,14 @@ FAMILIES = (
         verifier="probe_kit.hooks.families.internvla.verify:verify_internvla",
         source="qwen2.5-vl",
         source_weights=SourceWeights("Qwen/Qwen2.5-VL-3B-Instruct", parameters=3_754_622_976),
+        declared={
+            "": (
+                backbone(37, 2048, 130),
+                DeclaredStream(Stream("bridge", 2, 768, part="bridge", quantities=_BLOCK), 64, ("query",)),
+                expert(13, 768, 10, 80, _HEAD),
+                expert(13, 768, 10, 80, _HEAD, name="expert_unconditional", label=_UNCONDITIONAL, probed=False),
+            )
+        },
         full_size="probe_kit.models.internvla:full_size_internvla",
         hub=(
             ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml"),

@@ -1,5 +1,6 @@
 """Magma, native."""
 
+from probe_kit.hooks.contract.declared import backbone, chosen_tokens
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.families.shared.capabilities import MAPS
@@ -16,6 +17,8 @@ FAMILIES = (
         packages=(("timm", "magma"),),
         notes="MIT, Llama 3 licence; extra magma; about 18 GB in bfloat16",
         verifier="probe_kit.hooks.families.magma.verify:verify_magma",
+        words="probe_kit.hooks.families.magma.adapter:check_magma_words",
+        declared={"": (backbone(33, 4096, 320, "separator"), chosen_tokens("action", 33, 4096, 7))},
         full_size="probe_kit.models.magma:full_size_magma",
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "bridge_orig"),

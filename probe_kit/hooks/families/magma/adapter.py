@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, content_hashes, side_files
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Policy, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
@@ -36,6 +36,7 @@ from probe_kit.models.magma import (
     ACTION_QUESTION,
     Choose,
     Decoded,
+    MagmaConfig,
     Picture,
     PictureSettings,
     PictureSpan,
@@ -338,6 +339,17 @@ def _width(stage: Any) -> int:
 def _as_tokens(maps: Tensor) -> Tensor:
     """(N, h · w, C) of (N, C, h, w), in the same memory."""
     return maps.flatten(2).transpose(1, 2)
+
+
+def check_magma_words(
+    checkpoint: str, instructions: Sequence[str], *, tokenizer: str | None = None, prompt: str = "magma", **_: Any
+) -> None:
+    """See `Family.words`."""
+    folder = checkpoint_folder(checkpoint, SMALL_FILES)
+    own = folder if tokenizer is None else Path(tokenizer).expanduser()
+    text = ChatText.of(own, MagmaConfig.from_folder(folder), prompt == "act2answer")
+    for instruction in instructions:
+        text.prompt(ACTION_QUESTION.format(instruction=instruction))
 
 
 def load_magma(

@@ -1,5 +1,6 @@
 """OpenVLA, native."""
 
+from probe_kit.hooks.contract.declared import backbone, chosen_tokens
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
@@ -37,6 +38,8 @@ FAMILIES = (
         verifier="probe_kit.hooks.families.openvla.verify:verify_openvla",
         config_types=("openvla", "prismatic"),
         source="prismatic",
+        words="probe_kit.hooks.families.openvla.adapter:check_openvla_words",
+        declared={"": (backbone(33, 4096, 275), chosen_tokens("action", 33, 4096, 7))},
         full_size="probe_kit.models.prismatic:full_size_openvla",
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "bridge_orig, or the only one"),

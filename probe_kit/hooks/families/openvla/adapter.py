@@ -8,25 +8,26 @@ import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.errors import CheckpointError, InstructionError, UsageError
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
 from probe_kit.hooks.families.prismatic.adapter import PrismaticModel
-from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
-from probe_kit.hooks.families.prismatic.tokenizer import BYTES
+from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, checkpoint_folders, load_checkpoint
+from probe_kit.hooks.families.prismatic.tokenizer import BYTES, find_tokenizer
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import TOKENS
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.sampling import ALL, chooser, top_of
-from probe_kit.models.prismatic import CROP_AREA, centre_crop
+from probe_kit.models.prismatic import CROP_AREA, PrismaticConfig, centre_crop
 from probe_kit.models.prismatic.tensor_pictures import prepare_tensor
 
 DEFAULT_CHECKPOINT = "openvla/openvla-7b"
@@ -42,6 +43,7 @@ _LLAMA_VOCABULARY = 32000
 _LLAMA_PROMPT = [1, 512, 29901, 1724, 3158, 881, 278, 19964, 2125, 304]
 _GRIPPER_OPEN = 0.5
 _DIMENSIONS = 7
+_PATCH = 14
 
 
 class OpenVLA(PrismaticModel, Policy):
@@ -209,14 +211,36 @@ def load_openvla(
     if loaded.config.model_type != "openvla":
         raise CheckpointError(f"{checkpoint} is a Prismatic model without actions; pass --model prismatic")
     statistics = ActionStatistics.choose(loaded.statistics, unnorm_key)
-    template = _template(prompt, loaded)
+    template = _template(prompt, loaded.config)
     top = top_of(top_k, loaded.folders)
     return OpenVLA(loaded, statistics, template, centre_crop, tokenizer, temperature, resize, top)
 
 
-def _template(prompt: str | None, loaded: LoadedPrismatic) -> str:
+def check_openvla_words(
+    checkpoint: str,
+    instructions: Sequence[str],
+    *,
+    prompt: str | None = None,
+    tokenizer: str | None = None,
+    **_: Any,
+) -> None:
+    """See `Family.words`."""
+    folders = checkpoint_folders(checkpoint, SMALL_FILES)
+    config = PrismaticConfig.from_folder(folders[-1])
+    text = find_tokenizer(folders, tokenizer, config.text.bos_token_id, config.action_vocabulary)
+    template = _template(prompt, config)
+    room = int(config.text.max_position_embeddings) - (config.towers[0].image_size // _PATCH) ** 2 - _DIMENSIONS
+    for instruction in instructions:
+        length = len(text.encode(template.replace(_SLOT, instruction.lower())))
+        if length > room:
+            raise InstructionError(
+                f"{instruction!r} makes {length} tokens; this model has room for {room}. Shorten it"
+            )
+
+
+def _template(prompt: str | None, config: PrismaticConfig) -> str:
     """The first release (openvla-7b-v01) was made of Vicuna, and has Vicuna's prompt."""
-    name = prompt or ("openvla-v01" if loaded.config.language_id.startswith("vicuna") else "openvla")
+    name = prompt or ("openvla-v01" if config.language_id.startswith("vicuna") else "openvla")
     template = PROMPTS.get(name, name)
     if _SLOT not in template:
         raise UsageError(f"prompt {name!r} is neither one of {', '.join(PROMPTS)} nor a template with {_SLOT}")

@@ -1,5 +1,6 @@
 """Ovis2.5, native."""
 
+from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.family import Family
 
@@ -14,6 +15,7 @@ FAMILIES = (
         notes="asked without its thought; 18 GB in bfloat16",
         verifier="probe_kit.hooks.families.ovis2_5.adapter:Ovis25.verify",
         config_types=("ovis2_5",),
+        declared={"": answering(37, 4096, 240)},
         full_size="probe_kit.models.ovis2_5:full_size_ovis2_5",
         options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),),
         acts=False,

@@ -1,5 +1,6 @@
 """PaliGemma, on transformers' own network, and the embedded VLM of 0.61 million parameters."""
 
+from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.contract.default_scene import EMBEDDED
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.family import Family
@@ -30,6 +31,7 @@ FAMILIES = (
         notes="Gemma licence, gated; pt, not mix: it was not trained to follow instructions; 5.9 GB in bfloat16",
         verifier="probe_kit.hooks.families.paligemma.adapter:PaliGemma.verify",
         config_types=("paligemma",),
+        declared={"": answering(19, 2048, 290)},
         full_size="probe_kit.models.paligemma:full_size_paligemma",
         stored_names="probe_kit.models.paligemma:FILE_NAMES",
         options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),),

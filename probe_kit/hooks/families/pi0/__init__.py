@@ -1,6 +1,7 @@
 """pi0 through lerobot, and the embedded policies, which are pi0 at 0.84 million parameters."""
 
 from probe_kit.hooks.contract.card import SourceWeights
+from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.default_scene import EMBEDDED
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
@@ -66,6 +67,13 @@ FAMILIES = (
         config_types=("pi0",),
         source="paligemma",
         source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
+        words="probe_kit.hooks.families.pi0.adapter:check_pi0_words",
+        declared={
+            "": (
+                backbone(19, 2048, 304, camera="top"),
+                expert(19, 1024, 10, 5, ("state", "action")),
+            )
+        },
         full_size="probe_kit.models.lerobot.pi0:full_size_pi0",
         options=(
             Option(

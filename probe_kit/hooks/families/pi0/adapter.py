@@ -168,6 +168,11 @@ def load_pi0(
     return Pi0.load(checkpoint, device, dtype, random_weights, weights_seed, evaluation)
 
 
+def check_pi0_words(checkpoint: str, instructions: Sequence[str], *, unread: str = "", **_: Any) -> None:
+    """See `Family.words`; of the options only `unread` decides what the text is read with."""
+    Pi0.check_words(checkpoint, instructions, Evaluation(unread=tuple(name for name in unread.split(",") if name)))
+
+
 def load_pi0_tiny(
     checkpoint: str | None = None,
     device: str = "cpu",

@@ -1,6 +1,7 @@
 """Prismatic vision-language models, native."""
 
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS
+from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.family import Family
 
@@ -30,6 +31,7 @@ FAMILIES = (
             ("timm/vit_so400m_patch14_siglip_224.webli", "model.safetensors"),
             ("openvla/openvla-7b", "tokenizer.json"),
         ),
+        declared={"": answering(33, 4096, 290)},
         full_size="probe_kit.models.prismatic:full_size_prismatic",
         options=(TOKENIZER, BITS, Option("steps", int, "Greedy tokens per inference.", "1")),
         acts=False,

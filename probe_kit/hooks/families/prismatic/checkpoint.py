@@ -1,7 +1,7 @@
 """Loading of Prismatic and OpenVLA checkpoints: plain folders, LoRA adapters, random weights."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,14 @@ class LoadedPrismatic:
     def text_folders(self) -> tuple[Path, ...]:
         """Where the tokenizer may lie."""
         return self.folders if self.text is None else (*self.folders, self.text)
+
+
+def checkpoint_folders(checkpoint: str, files: Sequence[str] = FILES) -> tuple[Path, ...]:
+    """Where the files of a checkpoint may lie: an adapter's own folder before that of its base."""
+    folder = checkpoint_folder(checkpoint, files)
+    if not (folder / ADAPTER_CONFIG).is_file():
+        return (folder,)
+    return folder, Adapter.read(folder).base_folder()
 
 
 def load_checkpoint(

@@ -1,5 +1,6 @@
 """Qwen2.5-VL, on transformers' own network."""
 
+from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.family import Family
 
@@ -14,6 +15,11 @@ FAMILIES = (
         notes="7B 17 GB, 32B 67 GB in bfloat16; 3B is InternVLA-M1's source",
         verifier="probe_kit.hooks.families.qwen2_5_vl.adapter:Qwen25VL.verify",
         config_types=("qwen2_5_vl",),
+        declared={
+            "7B": answering(29, 3584, 110),
+            "32B": answering(65, 5120, 110),
+            "3B": answering(37, 2048, 110),
+        },
         full_size="probe_kit.models.qwen:full_size_qwen2_5_vl",
         stored_names="probe_kit.models.qwen:QWEN2_5_NAMES",
         sizes=(

@@ -1,5 +1,6 @@
 """Qwen3-VL, on transformers' own network."""
 
+from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.family import Family
 
@@ -14,6 +15,11 @@ FAMILIES = (
         notes="8B 18 GB, 32B 67 GB in bfloat16; 4B is Xiaomi-R0's source",
         verifier="probe_kit.hooks.families.qwen3_vl.adapter:Qwen3VL.verify",
         config_types=("qwen3_vl",),
+        declared={
+            "8B": answering(37, 4096, 110, sums=False),
+            "32B": answering(65, 5120, 110, sums=False),
+            "4B": answering(37, 2560, 110, sums=False),
+        },
         full_size="probe_kit.models.qwen:full_size_qwen3_vl",
         sizes=(
             ("8B", "Qwen/Qwen3-VL-8B-Instruct"),

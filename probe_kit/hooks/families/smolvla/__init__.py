@@ -1,5 +1,6 @@
 """SmolVLA through lerobot."""
 
+from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.families.shared.capabilities import FLOW
 from probe_kit.hooks.family import Family
 
@@ -18,6 +19,10 @@ FAMILIES = (
         ),
         verifier="probe_kit.hooks.families.smolvla.verify:verify_smolvla",
         config_types=("smolvla",),
+        words="probe_kit.hooks.families.smolvla.adapter:check_smolvla_words",
+        declared={
+            "": (backbone(17, 960, 113, "state", camera="top"), expert(17, 720, 10, 50, ("action",))),
+        },
         full_size="probe_kit.models.lerobot.smolvla:full_size_smolvla",
         interventions=FLOW,
     ),

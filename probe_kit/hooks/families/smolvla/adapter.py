@@ -141,6 +141,11 @@ class SmolVLA(LerobotFlow):
         return int(patches // vlm.scale_factor**2)
 
 
+def check_smolvla_words(checkpoint: str, instructions: Sequence[str]) -> None:
+    """See `Family.words`."""
+    SmolVLA.check_words(checkpoint, instructions)
+
+
 def load_smolvla(
     checkpoint: str,
     device: str = "cpu",

@@ -1,5 +1,6 @@
 """SpatialVLA, native."""
 
+from probe_kit.hooks.contract.declared import backbone, chosen_tokens
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, ProtocolRow
 from probe_kit.hooks.families.prismatic import TOKENIZER
@@ -16,6 +17,8 @@ FAMILIES = (
         embodiment="as the data set of -M unnorm_key; bridge_orig/1.0.0: WidowX end-effector delta at 5 Hz",
         notes="MIT, Gemma licence; weights 8.1 GB in bfloat16; also …-mix-224-pt, …-sft-bridge, …-sft-fractal",
         verifier="probe_kit.hooks.families.spatialvla.verify:verify_spatialvla",
+        words="probe_kit.hooks.families.spatialvla.adapter:check_spatialvla_words",
+        declared={"": (backbone(27, 2304, 269), chosen_tokens("action", 27, 2304, 3))},
         full_size="probe_kit.models.spatialvla:full_size_spatialvla",
         options=(
             Option(

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
 from probe_kit.hashing import sha256_json
-from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, content_hashes, side_files
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
@@ -40,6 +40,7 @@ from probe_kit.models.spatialvla import (
     Decoded,
     Intrinsics,
     PictureSettings,
+    SpatialVLAConfig,
     known_cameras,
     prepare_picture,
 )
@@ -313,6 +314,22 @@ def _preset(loaded: LoadedSpatialVLA, camera: str) -> Intrinsics | None:
     if camera not in known:
         raise UsageError(f"camera {camera!r} is neither {SCENE} nor one of the checkpoint's: {', '.join(known)}")
     return known[camera]
+
+
+def check_spatialvla_words(
+    checkpoint: str,
+    instructions: Sequence[str],
+    *,
+    prompt: str | None = None,
+    lowercase: bool = True,
+    tokenizer: str | None = None,
+    **_: Any,
+) -> None:
+    """See `Family.words`."""
+    folder = checkpoint_folder(checkpoint, SMALL_FILES)
+    speech = Speech.of(SpatialVLAConfig.from_folder(folder), folder, prompt, lowercase, tokenizer)
+    for instruction in instructions:
+        speech.prompt(instruction)
 
 
 def load_spatialvla(

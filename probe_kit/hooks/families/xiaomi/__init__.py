@@ -1,6 +1,7 @@
 """Xiaomi-Robotics-R0, native."""
 
 from probe_kit.hooks.contract.card import SourceWeights
+from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, ProtocolRow
@@ -9,8 +10,9 @@ from probe_kit.hooks.contract.state_layout import OPENNESS
 from probe_kit.hooks.families.shared.capabilities import MERGED
 from probe_kit.hooks.family import Family
 
+_EXPERT = ("residual", "attention", "middle", "mlp")
 INTERVENTIONS = Interventions(
-    edits={"backbone": QUANTITIES, "expert": ("residual", "attention", "middle", "mlp")},
+    edits={"backbone": QUANTITIES, "expert": _EXPERT},
     unread=("backbone",),
     prompt_kv=True,
     attention=True,
@@ -30,6 +32,12 @@ FAMILIES = (
         verifier="probe_kit.hooks.families.xiaomi.verify:verify_xiaomi",
         source="qwen3-vl",
         source_weights=SourceWeights("Qwen/Qwen3-VL-4B-Instruct", parameters=4_437_815_808),
+        declared={
+            "": (
+                backbone(37, 2560, 125, sums=False),
+                expert(17, 1024, 5, 32, ("special", "state", "action"), quantities=_EXPERT, sums=False),
+            )
+        },
         full_size="probe_kit.models.xiaomi:full_size_xiaomi",
         options=(
             Option("robot", str, "Robot whose statistics, picture and state are used.", "bridge_delta"),

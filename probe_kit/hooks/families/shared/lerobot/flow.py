@@ -379,6 +379,14 @@ class LerobotFlow(Policy):
             mask[index, : len(row)] = True
         return tokens, mask
 
+    @classmethod
+    def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
+        """Raise InstructionError as `tokenise` would, from configuration and tokenizer alone."""
+        text = cls.__new__(cls)  # what tokenises needs no network
+        text.folder = checkpoint_folder(checkpoint)
+        text.config = cls._read_config(text.folder, evaluation)
+        text.tokenise(instructions)
+
     def window(self, camera: str) -> PictureWindow:
         """The part of one camera's picture that this checkpoint looks at."""
         if camera not in self._windows:

@@ -1,0 +1,136 @@
+"""`--dry-run` plans with declared sizes: no weights, no network, no GPU; words are refused before the network."""
+
+import json
+import socket
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from torch import nn
+
+from probe_kit.errors import CheckpointError, InstructionError, UsageError
+from probe_kit.extract import AskSettings, ExtractSettings, prepare
+from probe_kit.extract.extraction import prepare_asks
+from probe_kit.hooks import load_model
+from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.registry import known_families
+from probe_kit.suite import Suite, build_suite
+from tests.support.every_checkpoint import WRITERS
+from tests.support.pi0_checkpoints import write_intact
+
+DECLARING = [name for name, family in known_families().items() if family.declared]
+RELEASED = [(name, size) for name in DECLARING for size in known_families()[name].declared]
+
+
+@pytest.fixture
+def nowhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """No network, an empty cache of the hub; the scene is built by other tests."""
+
+    def refuse(*_: Any, **__: Any) -> Any:
+        raise AssertionError("a dry run asked the network")
+
+    monkeypatch.setattr("probe_kit.extract.prepared.run_preflight", lambda *_: None)
+    monkeypatch.setattr(socket, "create_connection", refuse)
+    monkeypatch.setattr("probe_kit.hooks.checkpoints.hub.urlopen", refuse)
+    monkeypatch.setattr("huggingface_hub.snapshot_download", refuse)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "empty"))
+
+
+def settings_of(name: str, suite: Suite, **given: Any) -> ExtractSettings | AskSettings:
+    kind = ExtractSettings if known_families()[name].acts else AskSettings
+    return kind(name, suite=suite.folder, categories=("color",), items=2, tokens="pooled", device="cuda", **given)
+
+
+@pytest.mark.usefixtures("nowhere")
+@pytest.mark.parametrize(("name", "size"), RELEASED)
+def test_a_plan_needs_no_weights_no_network_and_no_gpu(name: str, size: str, small_suite: Suite) -> None:
+    options = {"size": size} if size else {}
+    planned = prepare(settings_of(name, small_suite, options=options), fetch=False)
+    declared = known_families()[name].declared[size]
+    shapes = [(one.stream.name, one.stream.layers, one.stream.width, one.stream.iterations) for one in declared]
+    assert [(own.name, own.layers, own.width, own.iterations) for own in planned.plan.streams] == shapes
+    assert planned.plan.bytes > 0
+    assert len(planned.plan.episodes) == 4
+    assert planned.identity()["weights_sha256"] is None
+    with pytest.raises(UsageError, match="planned without its model"):
+        planned.run("anywhere")
+
+
+def test_every_family_of_the_hub_declares_its_sizes() -> None:
+    for name, family in known_families().items():
+        on_the_hub = family.default_checkpoint is not None
+        assert bool(family.declared) == on_the_hub, name
+        assert family.sizes == () or [size for size, _ in family.sizes] == list(family.declared)
+
+
+@pytest.mark.parametrize(("name", "size"), RELEASED)
+def test_declared_streams_are_those_of_the_models_line(name: str, size: str) -> None:
+    text = known_families()[name].streams
+    for one in known_families()[name].declared[size]:
+        shown = one.stream.name.removesuffix("_unconditional")
+        if f"({size})" in text or not size:
+            assert f"{shown} {one.stream.layers} layers" in text
+        if one.stream.iterations and one.stream.name != "answer":
+            assert f"layers x {one.stream.iterations}" in text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "size"), RELEASED)
+def test_declared_sizes_are_those_of_the_released_network(name: str, size: str) -> None:
+    """Of every stream there is a list of so many blocks whose weights have its width; on the meta device."""
+    family = known_families()[name]
+    network = family.function("full_size")(*([size] if size else []))
+    lists = [
+        (len(module), {side for parameter in module[0].parameters() for side in parameter.shape})
+        for module in network.modules()
+        if isinstance(module, nn.ModuleList) and len(module)
+    ]
+    for one in family.declared[size]:
+        fits = [blocks for blocks, sides in lists if blocks == one.stream.layers - 1 and one.stream.width in sides]
+        assert fits, one
+
+
+@pytest.mark.parametrize("name", DECLARING)
+def test_declared_streams_have_the_names_and_roles_of_the_loaded_model(name: str, tmp_path: Path) -> None:
+    """Of a tiny checkpoint; only sizes and the camera's name are others."""
+    write, options = WRITERS[name]
+    model = load_model(name, str(write(tmp_path / "model")), **options)
+    declared = {one.stream.name: one for one in next(iter(known_families()[name].declared.values()))}
+    assert declared.keys() == model.streams.keys()
+    for stream in model.streams.values():
+        one = declared[stream.name]
+        assert replace(one.stream, layers=1, width=1, iterations=None) == replace(
+            stream, layers=1, width=1, iterations=None
+        )
+        assert (one.stream.iterations is None) == (stream.iterations is None)
+        declared_roles, own_roles = ({role.partition(".")[0] for role in roles} for roles in (
+            one.roles, model.role_names[stream.name]))  # fmt: skip
+        assert declared_roles == own_roles - {PADDING}
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_questions_are_planned_without_their_model(small_suite: Suite) -> None:
+    asks = [settings_of("qwen3-vl", small_suite)] * 2
+    assert [one.declared for one in prepare_asks(asks, [None, None], fetch=False)] == [True, True]  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_folder_that_is_not_there_is_refused_without_the_network(small_suite: Suite) -> None:
+    with pytest.raises(CheckpointError, match="does not exist"):
+        prepare(settings_of("pi0", small_suite, checkpoint="./nowhere"), fetch=False)
+
+
+@pytest.mark.parametrize("fetch", [True, False])
+def test_words_that_a_policy_cannot_read_are_refused_before_its_network_is_built(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fetch: bool
+) -> None:
+    folder = write_intact(tmp_path / "pi0")
+    suite = build_suite(tmp_path / "suite", ["color"], 2)
+    monkeypatch.setattr("probe_kit.hooks.families.pi0.adapter.build_pi0", lambda *_: pytest.fail("it was built"))
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    config["tokenizer_max_length"] = 3
+    (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
+    settings = ExtractSettings("pi0", str(folder), suite=suite.folder, options={"statistics": "bridge"})
+    with pytest.raises(InstructionError, match=r"this checkpoint reads 3\. Shorten it"):
+        prepare(settings, fetch=fetch)
