@@ -1,37 +1,51 @@
 """What the paper's whole study would take: a formula over measured inputs. An extrapolation, not a measurement.
 
-    python benchmarks/cost_model.py [--inference 0.3] [--cores 8] [--models 7] [--set simulate=0.9 ...]
+    python benchmarks/cost_model.py [--gpus 1 8 64] [--set inference=0.1 cores=4 ...]
 
 A worker has one GPU and some cores. Simulation, inference and writing overlap, so an episode takes as long as the
 slowest of them:
 
-    seconds per episode and worker = max(calls x inference, simulate / cores, raw bytes / (writing cores x write))
+    seconds per episode and worker =
+        max(calls x inference / gain, simulate / cores, raw bytes / (writing cores x write))
     hours = models x episodes x that / GPUs + models x load x ceil(GPUs / models) / GPUs, at least one load
     disk  = models x episodes x (token bytes / ratio + 2 x pooled bytes / pooled_ratio + beside); columns are the 2
 
-`--set` changes an input; every one is printed with where it comes from. Bytes of activations are exact: shapes of
-the families at their released sizes.
+Calls per episode are those of the protocol: its actions, divided by how many of a chunk it executes. The first
+table is the paper's whole evaluation, part by part. `--set` changes an input; every one is printed with where it
+comes from. Bytes of activations are exact: the streams that the families declare for their released sizes.
 """
 
 import argparse
 from dataclasses import dataclass
 from math import ceil
 
+from probe_kit.env import SceneSpec
 from probe_kit.extract.run_layout import StoredStream
+from probe_kit.hooks.contract.views import view_names
+from probe_kit.hooks.registry import known_families
 
-RESIDUAL = ("residual",)
-FAMILIES: dict[str, tuple[StoredStream, ...]] = {
-    "pi0": (
-        StoredStream("backbone", 19, 2048, None, 816, ("mean", "last", "mean:language", "mean:image"), None, "",
-                     RESIDUAL),
-        StoredStream("expert", 19, 1024, 10, 51, ("mean", "mean:action"), None, "", RESIDUAL),
-    ),
-    "openvla": (
-        StoredStream("backbone", 33, 4096, None, 290, ("mean", "last", "mean:language", "mean:image"), None, "",
-                     RESIDUAL),
-        StoredStream("action", 33, 4096, 7, 1, ("mean",), None, "", RESIDUAL),
-    ),
-}  # fmt: skip
+FAMILIES = ("pi0", "openvla")
+ACTIONS = SceneSpec.preset("act2answer").max_steps
+SUITE, CATEGORY = 3440, 300
+"""Episodes of the paper's suite, and of one of its categories with 150 items."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of the paper's evaluation: episodes, and inferences in each."""
+
+    name: str
+    episodes: int
+    calls: int
+
+
+STUDY = (
+    Part("Table 2: seven VLAs, an inference per action", 7 * SUITE, ACTIONS),
+    Part("Table 2: Xiaomi-R0, four actions per inference", SUITE, ACTIONS // 4),
+    Part("Table 5: five settings, three VLAs, four categories", 5 * 3 * 4 * CATEGORY, ACTIONS),
+    Part("Table 2: nine VLMs, a question in two orders", 9 * SUITE, 2),
+    Part("Table 4: eight further rows of VLMs", 8 * SUITE, 2),
+)
 
 
 @dataclass(frozen=True)
@@ -44,11 +58,12 @@ class Input:
 
 
 INPUTS = {
-    "episodes": Input(3440, "per model", "the paper's suite: 1,720 questions in two layouts"),
+    "episodes": Input(SUITE, "per model", "the paper's suite: 1,720 questions in two layouts"),
     "models": Input(7, "checkpoints", "the paper also has co-trained variants; an assumption"),
-    "calls": Input(12, "inferences per episode", "60 actions, 5 executed per inference; families differ"),
+    "calls": Input(ACTIONS, "inferences per episode", "80 actions, 1 executed per inference; Xiaomi-R0: 20"),
     "inference": Input(0.3, "s on a GPU", "NOT MEASURED here (no GPU): an assumption, pass your own"),
-    "simulate": Input(0.25, "CPU-s per episode", "benchmarks/env.py speed: 60 actions, a picture every fifth"),
+    "gain": Input(1, "of a batch", "1: batch 1; benchmarks/throughput.py measures yours"),
+    "simulate": Input(2.2, "CPU-s per episode", "act2answer, expert: 80 actions, a picture before each"),
     "cores": Input(8, "per GPU, that simulate", "an assumption about the machine"),
     "writing": Input(2, "cores per GPU, that write", "an assumption about the machine"),
     "write": Input(181e6, "raw bytes per CPU-s", "benchmarks/extract.py, --codec zstd, synthetic activations"),
@@ -63,7 +78,13 @@ INPUTS = {
 
 def raw_bytes(family: str, tokens: bool) -> int:
     """Of one episode with one captured inference."""
-    return sum(stream.raw_bytes(tokens) for stream in FAMILIES[family])
+    return sum(stream.raw_bytes(tokens) for stream in streams_of(family))
+
+
+def streams_of(family: str) -> list[StoredStream]:
+    """What a run of the released size stores."""
+    declared = known_families()[family].declared[""]
+    return [StoredStream.of(one.stream, one.tokens, view_names(one.roles)) for one in declared]
 
 
 @dataclass(frozen=True)
@@ -79,7 +100,7 @@ class Estimate:
 def estimate(inputs: dict[str, float], pooled: int, tokens: int, gpus: int) -> Estimate:
     """The formula of this file's first words. pooled, tokens: bytes per episode."""
     parts = {
-        "inference": inputs["calls"] * inputs["inference"],
+        "inference": inputs["calls"] * inputs["inference"] / inputs["gain"],
         "simulation": inputs["simulate"] / inputs["cores"],
         "writing": (pooled + tokens) / (inputs["writing"] * inputs["write"]),
     }
@@ -106,6 +127,11 @@ def main() -> None:
     for name, one in INPUTS.items():
         source = one.source if inputs[name] == one.value else "given"
         print(f"{name:10}{inputs[name]:>14,g}  {one.unit:26} {source}")
+    print()
+    for part in STUDY:
+        print(_part(part.name, part.episodes, part.episodes * part.calls, inputs))
+    episodes, calls = sum(part.episodes for part in STUDY), sum(part.episodes * part.calls for part in STUDY)
+    print(_part("the whole evaluation, one GPU", episodes, calls, inputs))
     heads = ("family", "tokens", "GPUs", "MB raw / episode", "episodes / s", "hours", "disk TB", "bound by")
     print("\n" + _line(*heads))
     for family in FAMILIES:
@@ -116,6 +142,11 @@ def main() -> None:
                 rate, hours = f"{gpus / found.per_worker:.2f}", f"{found.hours:.1f}"
                 kept, disk = "all" if tokens else "pooled", f"{found.disk / 1e12:.2f}"
                 print(_line(family, kept, str(gpus), f"{raw / 1e6:.1f}", rate, hours, disk, found.bound))
+
+
+def _part(name: str, episodes: int, calls: int, inputs: dict[str, float]) -> str:
+    hours = calls * inputs["inference"] / inputs["gain"] / 3600
+    return f"{name:54}{episodes:>8,} episodes{calls:>11,} inferences{hours:>8.1f} h"
 
 
 def _line(*cells: str) -> str:

@@ -57,6 +57,7 @@ class Calibration:
         return (
             f"batch {self.batch}, {processes} (measured: the model takes {call:.0f} ms a call, a simulator "
             f"{turn:.0f} ms a turn; the model would wait {self.waits:.0%} of the time)"
+            + ("; results repeat up to rounding, --batch 1 repeats every byte" if self.batch > 1 else "")
         )
 
 

@@ -251,13 +251,13 @@ AskedObject = Annotated[
 # -- speed --------------------------------------------------------------------------------------------------
 
 Batch = Annotated[
-    object,
+    object | None,
     speed_option(
         "--batch",
         parser=_batch,
         metavar="N|auto",
         help="Number of observations per model call. Above 1, results repeat up to rounding. auto: measure for "
-        "some seconds and choose --batch and --env-workers.",
+        "some seconds and choose --batch and --env-workers. Default: auto on a GPU, else 1.",
     ),
 ]
 AskBatch = Annotated[

@@ -51,7 +51,7 @@ def extract(
     early_stop: own.EarlyStop = False,
     random_weights: common.RandomWeights = False,
     weights_seed: common.WeightsSeed = 0,
-    batch: own.Batch = 1,
+    batch: own.Batch = None,
     env_workers: common.EnvWorkers = None,
     workers: common.Workers = 0,
     ray: common.RayAddress = None,

@@ -79,6 +79,11 @@ def scene_of(model: str, protocol: str | None = None, name: str | None = None, *
     return SceneSpec.preset(family.home.preset, **{**family.home.changes, **changes})
 
 
+def has_network(model: str) -> bool:
+    """Whether `model` is a family, and no script."""
+    return model in _families()
+
+
 def check_protocol(name: str) -> None:
     """Raise UsageError for an unknown protocol."""
     if name not in SCENES:

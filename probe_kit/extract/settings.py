@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal, Self, get_args
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
-from probe_kit.extract.protocols import protocol_identity, protocol_row, scene_of
+from probe_kit.extract.protocols import has_network, protocol_identity, protocol_row, scene_of
 from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, Tokens, VideoChoice
 from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.extract.vqa.templates import P1, Template, find_template
@@ -141,15 +141,18 @@ class RunSettings:
         model: str,
         options: Sequence[str] | None = None,
         scene: SceneName | None = None,
-        batch: int | Literal["auto"] = 1,
+        batch: int | Literal["auto"] | None = None,
         **given: Any,
     ) -> Self:
         """Settings from the options of a command; an option that is None has the default of protocol or model.
 
         options: KEY=VALUE of the family. scene: a preset, of which those of `SCENE_OPTIONS` that are neither None
-        nor False replace fields. batch: `auto` calibrates. given: other fields by name.
+        nor False replace fields. batch: `auto` calibrates; None is `auto` for a policy on a GPU without given
+        env_workers, and else 1. given: other fields by name.
         Raises UsageError and SceneError for values that cannot be used, TypeError for a name that is no field.
         """
+        if batch is None:
+            batch = "auto" if cls._calibrates_by_default(model, given) else 1
         changes = {name: given.pop(name, None) for name in SCENE_OPTIONS}
         changes = {name: value for name, value in changes.items() if value is not None and value is not False}
         return cls(
@@ -160,6 +163,12 @@ class RunSettings:
             calibrate=batch == "auto",
             **given,
         )
+
+    @classmethod
+    def _calibrates_by_default(cls, model: str, given: Mapping[str, Any]) -> bool:
+        """Whether a command without --batch measures which one is fast."""
+        del model, given
+        return False
 
     def _check_one_of(self, name: str, allowed: Iterable[str]) -> None:
         if getattr(self, name) not in allowed:
@@ -246,6 +255,12 @@ class ExtractSettings(RunSettings):
             self._check_one_of("rotation", ROTATIONS)
         if self.wordings is not None:
             check_wordings(self.wordings)
+
+    @classmethod
+    def _calibrates_by_default(cls, model: str, given: Mapping[str, Any]) -> bool:
+        """On a GPU, where a batch of one leaves most of it unused; scripts have no network."""
+        on_gpu = str(given.get("device", "cpu")).startswith("cuda")
+        return on_gpu and given.get("env_workers") is None and has_network(model)
 
     def choices(self) -> dict[str, Any]:
         """As of every run, with the later fields: capture without acting, another rotation, and edits."""

@@ -41,3 +41,16 @@ def test_only_what_is_asked_is_drawn_of_the_embedded_suite(
     assert len(suite.items) == 2
     (drawn,) = (tmp_path / "suites").iterdir()
     assert {item.category for item in load_suite(drawn).items} == {"color"}
+
+
+def test_a_policy_on_a_gpu_chooses_its_batch_unless_one_is_given() -> None:
+    def chosen(model: str, **given: object) -> tuple[int, bool]:
+        settings = ExtractSettings.from_options(model=model, **given)  # type: ignore[arg-type]
+        return settings.batch, settings.calibrate
+
+    assert chosen("pi0", device="cuda") == (1, True)
+    assert chosen("pi0", device="cuda:1", batch=1) == (1, False)
+    assert chosen("pi0", device="cuda", batch=8) == (8, False)
+    assert chosen("pi0", device="cuda", env_workers=4) == (1, False)
+    assert chosen("pi0") == chosen("expert", device="cuda") == (1, False)
+    assert chosen("pi0", batch="auto") == (1, True)

@@ -41,8 +41,9 @@ class TestInternVLA(AdapterContract):
 
     @pytest.fixture
     def other_options(self, run: Path) -> dict[str, Any]:
-        vlm = str(run.parent / "vlm")
-        return {"steps": 5, "guidance": 1.0, "unnorm_key": "fractal20220817_data", "vlm": vlm, "tokenizer": vlm}
+        vlm, weights = str(run.parent / "vlm"), "steps_7_pytorch_model.pt"
+        return {"steps": 5, "guidance": 1.0, "unnorm_key": "fractal20220817_data", "vlm": vlm, "tokenizer": vlm,
+                "weights": weights}  # fmt: skip
 
     @pytest.fixture
     def policy(self, loaded: InternVLA) -> InternVLA:
@@ -54,6 +55,7 @@ class TestConvertedInternVLA(AdapterContract):
 
     family = "internvla-m1"
     options = {"steps": 2}
+    unloadable_options = frozenset({"weights"})  # it has one file, and no steps
 
     @pytest.fixture(scope="class")
     def checkpoint(self, run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:

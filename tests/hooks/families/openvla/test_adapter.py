@@ -57,7 +57,7 @@ class TestFusedLlama(AdapterContract):
     def other_options(self, tmp_path: Path) -> dict[str, Any]:
         words = str(write_tokenizer(tmp_path))
         return {"unnorm_key": "other", "prompt": "openvla-v01", "centre_crop": True, "tokenizer": words,
-                "temperature": 0.6, "resize": "tensor"}  # fmt: skip
+                "temperature": 0.6, "resize": "tensor", "top_k": "7"}  # fmt: skip
 
     @pytest.fixture
     def policy(self, fused: OpenVLA) -> OpenVLA:
