@@ -214,6 +214,8 @@ class Family:
         place = self.place(checkpoint, chosen.get(SIZE))
         if place is None and self.needs_checkpoint:
             raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
+        if self.declared and place is not None and not is_on_hub(place) and not Path(place).exists():
+            checkpoint_folder(place)  # of the hub's families; says that it is not there, or finds the user's home
         if place is not None and self.config_types and (fetch or not is_on_hub(place)):
             with naming_checkpoint(self.name, place):
                 weights = fetch and not random_weights

@@ -116,9 +116,11 @@ def test_questions_are_planned_without_their_model(small_suite: Suite) -> None:
 
 
 @pytest.mark.usefixtures("nowhere")
-def test_a_folder_that_is_not_there_is_refused_without_the_network(small_suite: Suite) -> None:
+@pytest.mark.parametrize("name", ["pi0", "magma"])
+def test_a_folder_that_is_not_there_is_refused_without_the_network(name: str, small_suite: Suite) -> None:
+    """Also of families whose checkpoints only their loader knows."""
     with pytest.raises(CheckpointError, match="does not exist"):
-        prepare(settings_of("pi0", small_suite, checkpoint="./nowhere"), fetch=False)
+        prepare(settings_of(name, small_suite, checkpoint="./nowhere"), fetch=False)
 
 
 @pytest.mark.parametrize("fetch", [True, False])

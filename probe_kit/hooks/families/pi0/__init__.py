@@ -105,6 +105,7 @@ FAMILIES = (
                     OWN_SEEDS,
                     "pictures are resized with Lanczos, as INT-ACT resizes one; the release's unpublished fork "
                     "resizes a batch bilinearly",
+                    "rotations are converted as INT-ACT's adapter does; the release's fork of it is unpublished",
                 ),
             )
         },

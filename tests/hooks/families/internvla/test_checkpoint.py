@@ -55,10 +55,10 @@ def test_a_runs_configuration_may_be_json(run: Path, tmp_path: Path, observation
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     values = yaml.safe_load((copy / "config.yaml").read_text(encoding="utf-8"))
     (copy / "config.yaml").unlink()
-    (copy / "dims.json").rename(tmp_path / "dims.json")
+    (copy / "dims.json").rename(copy / "aside")
     with pytest.raises(CheckpointError, match=r"config\.yaml or config\.json of a run is missing"):
         find_parts(str(copy), None)
-    (tmp_path / "dims.json").rename(copy / "dims.json")
+    (copy / "aside").rename(copy / "dims.json")
     (copy / "config.json").write_text(json.dumps(values), encoding="utf-8")
     one, other = (load_internvla(str(folder), steps=5) for folder in (run, copy))
     np.testing.assert_array_equal(one.act([observation], [3]), other.act([observation], [3]))
