@@ -37,6 +37,5 @@ def test_every_contradiction_that_was_recomputed_is_on_the_page() -> None:
     rows = section("Where the paper contradicts itself")
     for one in data("paper-recomputed.json")["disagree"]:
         for value in (one["printed"], one["recomputed"]):
-            found = [value] if isinstance(value, int | float) else re.findall(r"\d+\.\d+|\b\d\d\b", str(value))
-            assert all(f"{number:g}" in rows if isinstance(number, float) else str(number) in rows
-                       for number in found), one  # fmt: skip
+            for number in re.findall(r"\d+\.\d+|\b\d\d\b", str(value)):
+                assert f"{float(number):g}" in rows, (number, one)

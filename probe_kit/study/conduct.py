@@ -100,8 +100,10 @@ def _play(one: PlannedCell, loaded: dict[str, Any], progress: Progress | None, e
         loaded["answer_model"] = load_answer_model(settings)
     if isinstance(settings, ExtractSettings) and settings.model not in SCRIPTED and "policy" not in loaded:
         loaded["policy"] = load_acting_policy(settings)
-    part = "answer_model" if isinstance(settings, AskSettings) else "policy"
-    extraction = prepare(settings, one.location, **{part: loaded.get(part)})
+    if isinstance(settings, AskSettings):
+        extraction = prepare(settings, one.location, answer_model=loaded["answer_model"])
+    else:
+        extraction = prepare(settings, one.location, policy=loaded.get("policy"))
 
     def tell(done: int, planned: int, outcome: str) -> None:
         if progress is not None:
