@@ -98,7 +98,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     growth = growth_at(location, plan.to_json()["episodes"])
     needed = in_units(sum(space_needed(extraction.further_plan(location), extraction.settings).values()))
     weights = "not read" if extraction.declared else (identity["weights_sha256"] or "scripted")[:12]
-    declared = " (of the released size; the weights were not read)" if extraction.declared else ""
+    declared = " (of the released size; the weights were not read)" if extraction.declared and plan.streams else ""
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
         **_protocol_row(identity),
@@ -168,7 +168,8 @@ def _protocol_row(identity: dict[str, Any]) -> dict[str, str]:
         return {}
     said = identity["protocol"]
     changed = ", ".join(f"{name}={run} instead of {was}" for name, (was, run) in said["deviations"].items())
-    return {"protocol": said["name"] + (f", but {changed}" if changed else ", as released")}
+    name = " ".join(filter(None, (said["name"], said.get("variant"))))
+    return {"protocol": name + (f", but {changed}" if changed else ", as released")}
 
 
 def _describe(stored: Any) -> str:
