@@ -81,7 +81,7 @@ def scene_of(model: str, protocol: str | None = None, name: str | None = None, *
 
 def has_network(model: str) -> bool:
     """Whether `model` is a family, and no script."""
-    return model in _families()
+    return _family(model) is not None
 
 
 def check_protocol(name: str) -> None:

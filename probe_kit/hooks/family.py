@@ -70,7 +70,7 @@ class Family:
     use the family, by name, with what they use it with. interventions: what of them its policy supports.
     declared: streams of the released sizes, by name of the size, which is empty where there is one; a plan is made
     of them where no weights are read. words: `module:function(checkpoint, instructions, **options)` that raises
-    InstructionError for what cannot be read, from the checkpoint's small files alone.
+    InstructionError for what cannot be read, from the checkpoint's small files alone; see `check_instructions`.
     files: patterns of the files of a hub repository that are needed.
     home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
     `words_in`, of a family whose default checkpoint knows few words; empty for one that reads any text.

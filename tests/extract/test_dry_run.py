@@ -14,13 +14,13 @@ from probe_kit.extract import AskSettings, ExtractSettings, prepare
 from probe_kit.extract.extraction import prepare_asks
 from probe_kit.hooks import load_model
 from probe_kit.hooks.contract.views import PADDING
-from probe_kit.hooks.registry import known_families
+from probe_kit.hooks.registry import own_families
 from probe_kit.suite import Suite, build_suite
 from tests.support.every_checkpoint import WRITERS
 from tests.support.pi0_checkpoints import write_intact
 
-DECLARING = [name for name, family in known_families().items() if family.declared]
-RELEASED = [(name, size) for name in DECLARING for size in known_families()[name].declared]
+DECLARING = [name for name, family in own_families().items() if family.declared]
+RELEASED = [(name, size) for name in DECLARING for size in own_families()[name].declared]
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def nowhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def settings_of(name: str, suite: Suite, **given: Any) -> ExtractSettings | AskSettings:
-    kind = ExtractSettings if known_families()[name].acts else AskSettings
+    kind = ExtractSettings if own_families()[name].acts else AskSettings
     return kind(name, suite=suite.folder, categories=("color",), items=2, tokens="pooled", device="cuda", **given)
 
 
@@ -47,7 +47,7 @@ def settings_of(name: str, suite: Suite, **given: Any) -> ExtractSettings | AskS
 def test_a_plan_needs_no_weights_no_network_and_no_gpu(name: str, size: str, small_suite: Suite) -> None:
     options = {"size": size} if size else {}
     planned = prepare(settings_of(name, small_suite, options=options), fetch=False)
-    declared = known_families()[name].declared[size]
+    declared = own_families()[name].declared[size]
     shapes = [(one.stream.name, one.stream.layers, one.stream.width, one.stream.iterations) for one in declared]
     assert [(own.name, own.layers, own.width, own.iterations) for own in planned.plan.streams] == shapes
     assert planned.plan.bytes > 0
@@ -58,7 +58,7 @@ def test_a_plan_needs_no_weights_no_network_and_no_gpu(name: str, size: str, sma
 
 
 def test_every_family_of_the_hub_declares_its_sizes() -> None:
-    for name, family in known_families().items():
+    for name, family in own_families().items():
         on_the_hub = family.default_checkpoint is not None
         assert bool(family.declared) == on_the_hub, name
         assert family.sizes == () or [size for size, _ in family.sizes] == list(family.declared)
@@ -66,8 +66,8 @@ def test_every_family_of_the_hub_declares_its_sizes() -> None:
 
 @pytest.mark.parametrize(("name", "size"), RELEASED)
 def test_declared_streams_are_those_of_the_models_line(name: str, size: str) -> None:
-    text = known_families()[name].streams
-    for one in known_families()[name].declared[size]:
+    text = own_families()[name].streams
+    for one in own_families()[name].declared[size]:
         shown = one.stream.name.removesuffix("_unconditional")
         if f"({size})" in text or not size:
             assert f"{shown} {one.stream.layers} layers" in text
@@ -79,7 +79,7 @@ def test_declared_streams_are_those_of_the_models_line(name: str, size: str) -> 
 @pytest.mark.parametrize(("name", "size"), RELEASED)
 def test_declared_sizes_are_those_of_the_released_network(name: str, size: str) -> None:
     """Of every stream there is a list of so many blocks whose weights have its width; on the meta device."""
-    family = known_families()[name]
+    family = own_families()[name]
     network = family.function("full_size")(*([size] if size else []))
     lists = [
         (len(module), {side for parameter in module[0].parameters() for side in parameter.shape})
@@ -96,7 +96,7 @@ def test_declared_streams_have_the_names_and_roles_of_the_loaded_model(name: str
     """Of a tiny checkpoint; only sizes and the camera's name are others."""
     write, options = WRITERS[name]
     model = load_model(name, str(write(tmp_path / "model")), **options)
-    declared = {one.stream.name: one for one in next(iter(known_families()[name].declared.values()))}
+    declared = {one.stream.name: one for one in next(iter(own_families()[name].declared.values()))}
     assert declared.keys() == model.streams.keys()
     for stream in model.streams.values():
         one = declared[stream.name]
