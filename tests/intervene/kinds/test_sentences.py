@@ -13,6 +13,8 @@ from probe_kit.intervene.kinds.erase.table import erasure_sentences
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
 from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict, classify_use
 from probe_kit.intervene.kinds.image_swap.words import image_swap_sentences, instruction_swap_sentences
+from probe_kit.intervene.kinds.joint.effects import EVERY, MINIMAL, JointEffect
+from probe_kit.intervene.kinds.joint.table import joint_sentences
 from probe_kit.intervene.kinds.registry import KINDS
 from probe_kit.intervene.kinds.site_effects import PatchEffect
 from probe_kit.intervene.kinds.site_table import site_sentences
@@ -154,6 +156,22 @@ TAKE = "erasures that take the answer from the action beyond their controls"
 def test_erasures_say_what_is_lost(row: ErasureEffect, said: str) -> None:
     (sentence,) = erasure_sentences([row], context(None))
     assert sentence == f"Color: {said}"
+
+
+def joint(part: str, cells: str, finding: str) -> JointEffect:
+    return JointEffect(
+        category="color", part=part, cells=cells, n_episodes=48, n_groups=12, alone=1.0, alone_ci=(0.9, 1.1),
+        needed=1.0, needed_ci=(0.9, 1.1), p=0.01, p_fwe=0.01, finding=finding,
+    )  # fmt: skip
+
+
+def test_joint_places_say_where_the_answer_is_read_or_that_this_is_open() -> None:
+    every = joint(EVERY, "kv.00 + kv.01", "carries it")
+    rows = [every, joint("cell", "kv.01 image", "read here")]
+    assert joint_sentences(rows, context(None)) == ["Color: read at kv.01 image."]
+    rows = [every, joint(MINIMAL, "kv.00 + kv.01", "read jointly")]
+    assert joint_sentences(rows, context(None)) == ["Color: no single place: read jointly at kv.00 + kv.01."]
+    assert joint_sentences([every], context(None)) == ["Color: where the answer is read remains open."]
 
 
 def test_every_kind_that_tests_something_says_what_it_found() -> None:

@@ -4,10 +4,11 @@ from probe_kit.intervene.kinds.kind import Kind
 
 KIND = Kind(
     name="joint",
-    summary="Joint places: each cell patched alone, all but it, and the smallest set that carries the effect.",
+    summary="Patch sets of places: each alone, all but it, smallest set.",
     build="probe_kit.intervene.kinds.joint.intervention:JointPlaces.from_options",
     effects="probe_kit.intervene.kinds.joint.effects:measured_joint_places",
     table="probe_kit.intervene.kinds.joint.table:joint_table",
+    sentences="probe_kit.intervene.kinds.joint.table:joint_sentences",
     options={
         "sites": "of cells that run in parallel: several blocks of kv, or one layer; default kv.*",
         "roles": "of the cells' tokens; default image,language,state",

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from probe_kit.intervene.kinds.base import TableContext
-from probe_kit.intervene.kinds.joint.effects import EVERY, MINIMAL, SECOND, JointEffect
+from probe_kit.intervene.kinds.joint.effects import EVERY, MINIMAL, SECOND, JointEffect, describe_joint_places
+from probe_kit.suite.categories import category_of
 
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
@@ -15,6 +16,7 @@ _LEGEND = (
     "several; nothing alone: neither, which leaves a part of a set; smallest set: searched in one half of the "
     "groups, scored in the other; p: that the action moves toward the target side, of cells max-T over all"
 )
+_OPEN = "where the answer is read remains open"
 _PARTS = {EVERY: "all cells of", MINIMAL: "smallest set:", SECOND: "without it:"}
 
 
@@ -38,6 +40,14 @@ def joint_table(rows: Sequence[JointEffect], context: TableContext) -> "Responsi
             ),
         ),
     )
+
+
+def joint_sentences(rows: Sequence[JointEffect], _: TableContext) -> list[str]:
+    """One per category: which cells carry the answer, alone or together."""
+    found: dict[str, list[JointEffect]] = {}
+    for row in rows:
+        found.setdefault(row.category, []).append(row)
+    return [f"{category_of(name).title}: {describe_joint_places(own) or _OPEN}." for name, own in found.items()]
 
 
 def _cells(row: JointEffect) -> "tuple[Cell, ...]":
