@@ -130,7 +130,7 @@ Execute = Annotated[
 ]
 RotationOfActions = Annotated[
     Rotation | None,
-    typer.Option(
+    further_option(
         "--rotation",
         help="roll-pitch-yaw: pass the angles of an action on. axis-angle: convert them, as the release does "
         "for some models. Default: set by protocol, else roll-pitch-yaw.",
