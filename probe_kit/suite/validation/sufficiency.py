@@ -55,7 +55,7 @@ class Smallest:
     @property
     def words(self) -> str:
         """In a few words."""
-        return f"{self.category}: {self.items} items in {self.groups} independent groups"
+        return f"{self.category}: {self.items} items in {self.groups} independent group{'s' * (self.groups != 1)}"
 
     def items_for(self, groups: int) -> int | None:
         """The fewest items that `--items` can select with so many groups; None if the whole suite lacks them."""
@@ -91,7 +91,8 @@ def sufficiencies(suite: Suite, scored: bool, probed: bool) -> Iterator[Sufficie
     if scored:
         margin, items = 100 * chance_margin(smallest.items), items_for_width(2 * MARGIN)
         more = "" if smallest.items >= items else f"; ± {100 * MARGIN:g} takes {items} items"
-        yield Sufficiency("success rate", None, f"Δ = ± {margin:.1f} points{more}")
+        told = margin < 50  # else not even 100 % is beyond guessing
+        yield Sufficiency("success rate", None if told else False, f"Δ = ± {margin:.1f} points{more}")
     if not probed:
         return
     yield Sufficiency("probes", *smallest.has(GROUPS_FOR_PROBES, "`train` refuses it"))
