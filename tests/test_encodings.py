@@ -77,7 +77,7 @@ def test_the_scan_sees_what_it_looks_for(tmp_path: Path) -> None:
     assert sum(map(is_text, calls(path))) == 0
 
 
-@pytest.fixture(scope="module", params=["ASCII", "ISO-8859-1"])
+@pytest.fixture(scope="module", params=["ASCII", pytest.param("ISO-8859-1", marks=pytest.mark.slow)])
 def locale(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """The environment of a machine whose locale is not UTF-8."""
     plain = {**os.environ, "PYTHONUTF8": "0", "PYTHONPATH": str(ROOT)}

@@ -24,15 +24,15 @@ PICTURE = re.compile(r"(?:\.plot\(\)|^pk\.layer_curve\(.*\)|^Image\.open\(.*\)|^
 """How a cell ends that is there to show a picture; a semicolon would hide it where no backend is inline."""
 
 
-SCENE = 'scene=pk.SceneSpec.preset("act2answer", max_steps=4), '
+SCENE = 'scene=pk.SceneSpec.preset("act2answer", max_steps=4), batch=12, '
 SHORT = {
     'ExtractSettings("pi0-tiny", ': f'ExtractSettings("pi0-tiny", {SCENE}',
     "ExtractSettings(model, ": f"ExtractSettings(model, {SCENE}",
     "permutations=24": "permutations=3",
     '["color", "state"]': '["color"]',
-    '"kv.*"': '"kv.02"',
+    '"backbone.*", "kv.*"': '"backbone.03", "kv.02"',
 }
-"""Episodes that end after one inference, few label permutations, one category, and one block of the memory."""
+"""Short episodes, few label permutations, one category, two places."""
 
 
 def shortened(source: str) -> str:

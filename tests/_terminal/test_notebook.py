@@ -70,7 +70,9 @@ def shown(
     return dict(zip(cells, done, strict=True))
 
 
-@pytest.mark.parametrize("shown", [INLINE, "agg"], indirect=True, ids=["inline", "agg"])
+@pytest.mark.parametrize(
+    "shown", [INLINE, pytest.param("agg", marks=pytest.mark.slow)], indirect=True, ids=["inline", "agg"]
+)
 def test_every_figure_is_one_picture_whatever_the_backend(shown: dict[str, NotebookNode]) -> None:
     pictures = {name: kinds(shown[name]).count("image/png") for name in FIGURES}
     assert pictures == dict.fromkeys(FIGURES, 1)

@@ -45,10 +45,17 @@ def run(little_runs: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(little_runs / "run", tmp_path / "run"))
 
 
-@pytest.fixture
-def equal_sizes(small_suite: Suite, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def uncompressed(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run without compression: all objects of an array have one size."""
-    return write_little_run(tmp_path / "plain", small_suite.select(["color"]), codec="none").path
+    folder = tmp_path_factory.mktemp("uncompressed") / "run"
+    return write_little_run(folder, small_suite.select(["color"]), codec="none").path
+
+
+@pytest.fixture
+def equal_sizes(uncompressed: Path, tmp_path: Path) -> Path:
+    """A copy of the uncompressed run that a test may damage."""
+    return Path(shutil.copytree(uncompressed, tmp_path / "plain"))
 
 
 def edit(path: Path, change: Edit) -> None:
@@ -231,7 +238,9 @@ def test_a_part_of_an_exchanged_shard_is_no_number(equal_sizes: Path, site: int)
         opened.tokens(opened.sites("backbone")[site])
 
 
-@pytest.mark.parametrize("array", ARRAYS)
+@pytest.mark.parametrize(
+    "array", [ARRAYS[0], *(pytest.param(array, marks=pytest.mark.slow) for array in ARRAYS[1:])]
+)
 def test_chunks_of_another_seed_are_found(
     equal_sizes: Path, small_suite: Suite, tmp_path: Path, array: str
 ) -> None:

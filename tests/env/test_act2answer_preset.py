@@ -166,7 +166,7 @@ def test_pushed_tiles_and_a_rammed_table_leave_no_trace_in_the_next_episode(env)
     assert episode_digest.released_digest(env, seed=3, look=True) == reference, "looking moves the pictures alone"
 
 
-@pytest.mark.parametrize("start_jitter", [0.0, 0.003])
+@pytest.mark.parametrize("start_jitter", [pytest.param(0.0, marks=pytest.mark.slow), 0.003])
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_hand_that_closed_before_holds_the_cube_as_one_that_closes_now(arm, start_jitter, make_env):
     """Closing is simulated once per place of the cube; random actions behind it tell any difference."""

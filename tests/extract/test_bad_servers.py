@@ -169,6 +169,7 @@ def test_nothing_is_committed_that_the_server_kept_only_in_part(
     assert objects(run) == whole
 
 
+@pytest.mark.slow
 def test_every_record_of_which_the_server_first_keeps_a_part_is_written_again(
     suite: Suite, whole: dict[str, bytes], bad_server: BadServer
 ) -> None:
@@ -193,6 +194,7 @@ def test_every_record_of_which_the_server_first_keeps_a_part_is_written_again(
     assert objects(run) == whole
 
 
+@pytest.mark.slow
 def test_a_record_that_the_server_never_keeps_whole_is_an_error_and_gone(
     suite: Suite, whole: dict[str, bytes], bad_server: BadServer
 ) -> None:

@@ -48,7 +48,12 @@ def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "point", ["before-put", pytest.param("after-put", marks=pytest.mark.slow), "before-commit", "after-commit"]
+    "point",
+    [
+        "before-commit",
+        "after-commit",
+        *(pytest.param(f"{when}-put", marks=pytest.mark.slow) for when in ("before", "after")),
+    ],
 )
 def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
     point: str, suite: Suite, whole: Path, tmp_path: Path

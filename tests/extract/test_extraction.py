@@ -27,6 +27,7 @@ from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.suite import Suite, build_suite
 
 SHORT = SceneSpec(max_steps=2)
+IN_HAND = SceneSpec(start_grasped=True)
 
 
 def files(run: Path) -> dict[str, str]:
@@ -122,7 +123,7 @@ def test_a_nan_action_stops_the_run_and_commits_nothing(
 
 def test_the_expert_is_always_right_and_its_mirror_image_always_wrong(small_suite: Suite, tmp_path: Path) -> None:
     for model, outcome in (("expert", "correct"), ("expert-mirrored", "wrong")):
-        settings = ExtractSettings(model, suite=small_suite.folder, categories=("shape",), items=2)
+        settings = ExtractSettings(model, suite=small_suite.folder, categories=("shape",), items=2, scene=IN_HAND)
         run = extract_run(settings, tmp_path / model)
         assert (run.episodes["outcome"] == outcome).all()
         assert len(run.episodes) == 4
@@ -243,7 +244,8 @@ def test_a_run_that_does_not_fit_the_disk_is_refused_unless_forced(
 def test_the_first_episode_can_be_filmed(two_items: Suite, tmp_path: Path) -> None:
     from PIL import Image
 
-    run = extract_run(ExtractSettings("expert", suite=two_items.folder, video="first"), tmp_path / "run")
+    settings = ExtractSettings("expert", suite=two_items.folder, scene=IN_HAND, video="first")
+    run = extract_run(settings, tmp_path / "run")
     (film,) = (run.path / "videos").glob("*.gif")
     assert "color-correct" in film.name
     with Image.open(film) as gif:

@@ -43,15 +43,20 @@ def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-@pytest.fixture
-def copied(recorded_run: Run, bucket: str) -> Run:
-    """A real run, with all tokens, in a bucket."""
-    here, there = recorded_run.location, locate(f"{bucket}/run")
+def copy_to(bucket: str, here: Location) -> Run:
+    """The run without its probes in a bucket, sealed there."""
+    there = locate(f"{bucket}/run")
     for key in here.keys(""):
-        if not key.startswith((COLUMNS, "probes")):
+        if not key.startswith((COLUMNS, "probes", "interventions")):
             there.write(key, here.read(key))
     assert seal(there)
     return open_run(there)
+
+
+@pytest.fixture
+def copied(recorded_run: Run, bucket: str) -> Run:
+    """A real run, with all tokens, in a bucket."""
+    return copy_to(bucket, recorded_run.location)
 
 
 @pytest.mark.slow
@@ -114,15 +119,12 @@ def test_a_store_that_ignores_conditions_is_refused_for_several_writers(suite: S
     assert len(run.episodes) == 4
 
 
-def test_reading_gives_the_same_numbers_from_a_bucket(recorded_run: Run, copied: Run) -> None:
+def test_numbers_and_probes_of_a_bucket_are_those_of_a_folder(recorded_run: Run, copied: Run) -> None:
     assert copied.sealed
     np.testing.assert_array_equal(copied.column(SITE), recorded_run.column(SITE))
     for ours, theirs in zip(copied.tokens(SITE), recorded_run.tokens(SITE), strict=True):
         np.testing.assert_array_equal(ours, theirs)
     assert copied.xarray().sizes == recorded_run.xarray().sizes
-
-
-def test_probes_of_a_bucket_are_stored_in_it(recorded_run: Run, copied: Run) -> None:
     chosen = {"categories": ["color"], "views": ["mean"], "permutations": 0}
     results = train_probes(copied, **chosen)
     expected = train_probes(recorded_run, **chosen)
@@ -139,7 +141,8 @@ def flip_a_bit(location: Location, key: str) -> None:
     location.write(key, bytes(content))
 
 
-def test_damage_in_a_bucket_is_found_and_never_read_as_numbers(copied: Run) -> None:
+def test_damage_in_a_bucket_is_found_and_never_read_as_numbers(little_runs: Path, bucket: str) -> None:
+    copied = copy_to(bucket, locate(little_runs / "run"))
     shard = next(key for key in copied.location.keys("data.zarr/expert/tokens") if "/c/7/" in key)
     flip_a_bit(copied.location, shard)
     assert verify_run(copied.location).ok

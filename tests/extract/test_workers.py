@@ -22,12 +22,12 @@ SHORT = SceneSpec(max_steps=2)
 
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    """Twelve episodes."""
+    """Six items; runs of the policy play four of them."""
     return build_suite(tmp_path_factory.mktemp("suite") / "six", ["color"], 6)
 
 
 def settings(suite: Suite, **changes: object) -> ExtractSettings:
-    return ExtractSettings("pi0-tiny", suite=suite.folder, scene=SHORT, **changes)
+    return ExtractSettings("pi0-tiny", suite=suite.folder, items=4, scene=SHORT, **changes)
 
 
 def commits(run: Path) -> dict[str, bytes]:
@@ -82,7 +82,7 @@ def test_an_episode_that_fails_twice_is_named_and_all_others_are_kept(
 ) -> None:
     from probe_kit.extract.rollout.controllers import PolicyController
 
-    poison = prepare(ExtractSettings("expert", suite=suite.folder)).plan.episodes[5]
+    poison = prepare(ExtractSettings("expert", suite=suite.folder, items=4)).plan.episodes[5]
     act = PolicyController.act
 
     def act_badly(self, turns):
@@ -96,15 +96,16 @@ def test_an_episode_that_fails_twice_is_named_and_all_others_are_kept(
     assert poison.episode.episode_id in caught.value.__notes__[0]
     assert caught.value.exit_code == 1
     run = open_run(tmp_path / "run", allow_partial=True)
-    assert (len(run.episodes), list(run.failed), run.sealed) == (11, [poison.episode.episode_id], True)
+    assert (len(run.episodes), list(run.failed), run.sealed) == (7, [poison.episode.episode_id], True)
     with pytest.raises(RunIncompleteError, match="1 failed"):
         open_run(tmp_path / "run")
     monkeypatch.undo()
-    assert len(extract_run(settings(suite), tmp_path / "run").episodes) == 12
+    assert len(extract_run(settings(suite), tmp_path / "run").episodes) == 8
     assert not (tmp_path / "run/failed").exists()
 
 
-@pytest.mark.parametrize("model", ["expert", pytest.param("pi0-tiny", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["expert", "pi0-tiny"])
 def test_two_workers_one_of_them_killed_give_the_same_bytes(model: str, suite: Suite, tmp_path: Path) -> None:
     alone = ExtractSettings(model, suite=suite.folder, scene=SHORT, env_workers=0)
     plain = extract_run(alone, tmp_path / "plain").path

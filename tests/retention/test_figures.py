@@ -58,7 +58,7 @@ Drawn = tuple[RetentionTable, dict[str, Figure]]
 @pytest.fixture(
     scope="module",
     params=[
-        "one category",
+        pytest.param("one category", marks=pytest.mark.slow),
         "two categories and two models",
         pytest.param("twelve categories and two models", marks=pytest.mark.slow),
     ],

@@ -30,6 +30,7 @@ from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.train import ArrayRun, ProbeCurve, load_results
 from probe_kit.train.controls.fit_controls import add_untrained
+from tests.retention.conftest import runs_in
 
 ProbedRun = Callable[..., ArrayRun]
 PERFECT = ([1.0, 1.0], [[1.0, 1.0]])
@@ -48,10 +49,10 @@ WORLDS = {
 Found = tuple[str, float, float, float]
 
 
-@pytest.fixture(params=WORLDS)
-def table(request: pytest.FixtureRequest, probed_run: ProbedRun) -> RetentionTable:
+@pytest.fixture(scope="module", params=WORLDS)
+def table(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> RetentionTable:
     """A run of the world against an equal one, and a group of two good ones."""
-    world = WORLDS[request.param]
+    world, probed_run = WORLDS[request.param], runs_in(tmp_path_factory.mktemp("world"))
     runs = {name: [probed_run(world, name)] for name in ("one", "again")}
     return retention_table(
         {**runs, "other": [probed_run(dict.fromkeys(world, GOOD), f"other{at}") for at in "ab"]}

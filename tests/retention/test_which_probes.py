@@ -73,7 +73,10 @@ MIXTURES = {
 }
 
 
-@pytest.mark.parametrize("name", MIXTURES)
+FIRST, *OTHERS = MIXTURES
+
+
+@pytest.mark.parametrize("name", [FIRST, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_rows_of_other_settings_are_pointed_out_in_every_format(probed_run: ProbedRun, name: str) -> None:
     value, words = MIXTURES[name]
     one, other = (probed_run({"color": SIGNAL}, model) for model in ("one", "other"))

@@ -128,6 +128,7 @@ def test_token_views_are_probed_beside_pooled_ones_with_fewer_permuted_labels(pl
     assert (tokens.fold_of == mean.fold_of).all()
 
 
+@pytest.mark.slow
 def test_the_number_of_token_permuted_labels_matters_only_for_token_views(planted_run: PlantedRun) -> None:
     run = with_tokens(planted_run(), strength=2.0)
     pooled = [train_probes(run, permutations=3, token_permutations=count).key for count in (1, 2)]

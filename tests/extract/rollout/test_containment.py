@@ -123,7 +123,10 @@ def fork(_: Any, chunks: Any) -> Any:
     return chunks
 
 
-@pytest.mark.parametrize("spoil", [reseed, scribble, change_later, move, deafen, fork])
+@pytest.mark.parametrize(
+    "spoil",
+    [reseed, scribble, change_later, *(pytest.param(one, marks=pytest.mark.slow) for one in (move, deafen, fork))],
+)
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_what_a_policy_changes_around_itself_changes_no_number_and_is_put_back(
     spoil: Any, settings: ExtractSettings, plain: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -188,13 +191,25 @@ def generator_exit(_: Any) -> Any:
     ("spoil", "words"),
     [
         (press, "failed while it acted: KeyboardInterrupt"),
-        (generator_exit, "failed while it acted: GeneratorExit"),
+        pytest.param(generator_exit, "failed while it acted: GeneratorExit", marks=pytest.mark.slow),
         (lambda _: Wild(), "the policy gave a Wild for 1 observations"),
-        (lambda chunks: chunks.tolist(), "the policy gave a list for 1 observations"),
-        (lambda chunks: torch.from_numpy(chunks), "the policy gave a Tensor for 1 observations"),
+        pytest.param(
+            lambda chunks: chunks.tolist(), "the policy gave a list for 1 observations", marks=pytest.mark.slow
+        ),
+        pytest.param(
+            lambda chunks: torch.from_numpy(chunks),
+            "the policy gave a Tensor for 1 observations",
+            marks=pytest.mark.slow,
+        ),
         (lambda chunks: chunks.astype(np.float64), r"ndarray of shape \(1, \d+, 7\) and float64"),
-        (lambda chunks: chunks.astype(object), r"ndarray of shape \(1, \d+, 7\) and object"),
-        (lambda chunks: chunks[:, :0], r"ndarray of shape \(1, 0, 7\) and float32"),
+        pytest.param(
+            lambda chunks: chunks.astype(object),
+            r"ndarray of shape \(1, \d+, 7\) and object",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            lambda chunks: chunks[:, :0], r"ndarray of shape \(1, 0, 7\) and float32", marks=pytest.mark.slow
+        ),
         (lambda chunks: chunks * np.inf, "is not finite"),
     ],
 )

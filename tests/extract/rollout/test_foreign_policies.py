@@ -52,11 +52,19 @@ def fall(_: Any) -> Any:
         (leave, r"PolicyFailedError: pi0-tiny failed while it acted: it called sys.exit\(0\)"),
         (fall, "PolicyFailedError: pi0-tiny failed while it acted: KeyError: 'no such thing'"),
         (lambda chunks: chunks * np.nan, r"ActionError: action .* is not finite \(NaN or infinity\)"),
-        (lambda chunks: chunks[:, :, :6], r"PolicyFailedError: the policy gave a ndarray of shape \(1, \d+, 6\)"),
-        (lambda chunks: chunks[0], "PolicyFailedError: the policy gave a ndarray of shape"),
         (lambda _: None, "PolicyFailedError: the policy gave a NoneType for 1 observations"),
+        pytest.param(
+            lambda chunks: chunks[:, :, :6],
+            r"PolicyFailedError: the policy gave a ndarray of shape \(1, \d+, 6\)",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            lambda chunks: chunks[0],
+            "PolicyFailedError: the policy gave a ndarray of shape",
+            marks=pytest.mark.slow,
+        ),
     ],
-    ids=["exit", "error", "NaN", "too short", "no batch", "None"],
+    ids=["exit", "error", "NaN", "None", "too short", "no batch"],
 )
 def test_what_a_policy_does_wrong_gives_its_episodes_up_by_name(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, spoil: Any, words: str

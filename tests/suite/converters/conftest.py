@@ -42,7 +42,11 @@ def write_json(value: Any, path: Path) -> None:
 @pytest.fixture
 def compbench_root(tmp_path: Path) -> Path:
     """Two sets: FER with twelve pairs, and MIT-States with both types, an empty dict and a backslash."""
-    root = tmp_path / "compbench"
+    return write_compbench(tmp_path / "compbench")
+
+
+def write_compbench(root: Path) -> Path:
+    """The two sets of `compbench_root` in the folder `root`."""
     fer = []
     for number in range(12):
         names = [f"fer-2013/test/happy/im{number}_{side}.png" for side in "ab"]

@@ -9,18 +9,27 @@ import pytest
 from probe_kit.errors import SuiteError
 from probe_kit.suite import Suite
 from probe_kit.suite.converters import convert
+from tests.suite.converters.conftest import write_compbench
 
 Rows = list[dict[str, Any]]
 
 
+@pytest.fixture(scope="module")
+def pending(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A curation file for all pairs."""
+    folder = tmp_path_factory.mktemp("pending")
+    path = folder / "review.jsonl"
+    convert("mllm-compbench", write_compbench(folder / "compbench"), folder / "unreviewed", emit_curation=path)
+    return path.read_text(encoding="utf-8")
+
+
 @pytest.fixture
-def review(compbench_root: Path, tmp_path: Path) -> Callable[[Callable[[Rows], None]], Suite]:
-    """Emits a curation file for all pairs, lets `change` edit its rows, and converts with it."""
+def review(pending: str, compbench_root: Path, tmp_path: Path) -> Callable[[Callable[[Rows], None]], Suite]:
+    """Lets `change` edit the rows of the curation file, and converts with it."""
 
     def run(change: Callable[[Rows], None]) -> Suite:
         path = tmp_path / "review.jsonl"
-        convert("mllm-compbench", compbench_root, tmp_path / "unreviewed", emit_curation=path)
-        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        rows = [json.loads(line) for line in pending.splitlines()]
         change(rows)
         path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
         return convert("mllm-compbench", compbench_root, tmp_path / "reviewed", curation=path)

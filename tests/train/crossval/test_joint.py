@@ -218,6 +218,7 @@ def test_c_is_solved_in_parts_where_one_column_of_labels_does_not_fit(monkeypatc
     assert sizes == [60, 60, 20, 5] * 3  # C by threes, then the outer folds, for every column of labels
 
 
+@pytest.mark.slow
 def test_59_permuted_labels_of_many_tokens_stay_within_the_stated_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Features, their turned copy, COLUMN_MEMORY and blocks; held at once they would be many times as much."""
     counts = np.full(60, 150)
