@@ -41,9 +41,12 @@ def check_model(settings: RunSettings, scripted: tuple[str, ...], fetch: bool = 
     if settings.model in scripted:
         return
 
+    family = find_family(settings.model, scripted)
+    if not asked and not family.acts:
+        raise UsageError(f"{settings.model} answers and does not act; use `probe-kit ask`, or a model that acts")
     # Elsewhere there may be other devices than here.
     device = "cpu" if settings.workers or settings.ray else settings.device
-    find_family(settings.model, scripted).check(
+    family.check(
         settings.checkpoint, device, settings.dtype, settings.random_weights, settings.options,
         settings.weights_seed, fetch,
     )  # fmt: skip

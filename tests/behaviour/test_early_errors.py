@@ -33,7 +33,7 @@ CASES = {
     f"{EXTRACT} smolvla --checkpoint damaged": (3, "is not JSON"),
     f"{EXTRACT} pi0 --checkpoint without-weights": (3, "neither model.safetensors"),
     f"{EXTRACT} pi0 --checkpoint with-a-shard-missing": (3, "b.safetensors of model.safetensors.index.json"),
-    f"{EXTRACT} prismatic": (2, "no default checkpoint"),
+    f"{EXTRACT} prismatic": (2, "answers and does not act"),
     f"{EXTRACT} pi0-tiny --device nonsense": (2, "This machine has cpu"),
     f"{EXTRACT} pi0-tiny --dtype int8": (2, "is not one of"),
     f"{EXTRACT} pi0-tiny -M foo=3": (2, "no model option foo"),
@@ -120,7 +120,7 @@ def test_families_say_what_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
     assert known["pi0-tiny"].missing() == ""
     assert known["pi0"].missing() == "download of juexzz/INTACT-pi0-finetune-bridge, google/paligemma-3b-pt-224"
     assert known["openvla"].missing() == "extra openvla and download of openvla/openvla-7b"
-    assert known["prismatic"].missing() == "extra openvla and a checkpoint of yours (--checkpoint)"
+    assert known["prismatic"].missing().startswith("extra openvla and download of TRI-ML/prismatic-vlms/prism-")
 
 
 def test_a_cached_config_without_weights_is_no_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
