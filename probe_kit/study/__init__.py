@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from probe_kit.study.conduct import ModelFailure, conduct_study
     from probe_kit.study.mistakes import Mistake, StudyFileError
     from probe_kit.study.plan import StudyPlan, plan_study
+    from probe_kit.study.probing import ProbeFailure, fit_probes
     from probe_kit.study.reading import LoadedStudy, load_study
     from probe_kit.study.tables.make import make_table
     from probe_kit.study.tables.named_table import NamedTable
@@ -17,9 +18,11 @@ __all__ = [
     "Mistake",
     "ModelFailure",
     "NamedTable",
+    "ProbeFailure",
     "StudyFileError",
     "StudyPlan",
     "conduct_study",
+    "fit_probes",
     "load_study",
     "make_table",
     "plan_study",
@@ -36,6 +39,8 @@ __getattr__, __dir__ = lazy_names(
         "plan_study": "plan",
         "ModelFailure": "conduct",
         "conduct_study": "conduct",
+        "ProbeFailure": "probing",
+        "fit_probes": "probing",
         "NamedTable": "tables.named_table",
         "make_table": "tables.make",
     },

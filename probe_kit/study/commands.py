@@ -7,10 +7,11 @@ import typer
 
 from probe_kit._terminal.console import counter, marked, out, print_json, print_text, progress, say
 from probe_kit._terminal.options import AsJson, EnvWorkers, Partial
+from probe_kit.train.command_options import Jobs
 
 if TYPE_CHECKING:
     from probe_kit.retention.columns.text_table import TextTable
-    from probe_kit.study import StudyPlan
+    from probe_kit.study import ModelFailure, ProbeFailure, StudyPlan
     from probe_kit.study.plan import PlannedCell
 
 app = typer.Typer(help="Run a whole study from one file.", no_args_is_help=True)
@@ -34,12 +35,14 @@ def run(
     ] = False,
     as_json: AsJson = False,
     env_workers: EnvWorkers = None,
+    no_probes: Annotated[bool, typer.Option("--no-probes", help="Fit no probes.")] = False,
+    jobs: Jobs = None,
 ) -> None:
-    """Play and ask what a study needs and is not stored yet.
+    """Play and ask what a study needs and is not stored yet, then fit its probes.
 
     Each model is loaded once for all of its runs. A model that fails stops itself alone. The same command resumes.
     """
-    from probe_kit.study import conduct_study, load_study, plan_study
+    from probe_kit.study import conduct_study, fit_probes, load_study, plan_study
 
     study = load_study(file)
     plan = plan_study(study, only)
@@ -55,12 +58,21 @@ def run(
                 counters[one.cell.name] = counter(bar, one.cell.name)
             counters[one.cell.name](done, planned, outcome)
 
-        failures = conduct_study(plan, tell, lambda one: say(marked("[red]{}[/]", one)), env_workers)
+        def count(name: str, done: int, sites: int, last: str) -> None:
+            name = f"probes of {name}"
+            if name not in counters:
+                counters[name] = counter(bar, name)
+            counters[name](done, sites, last)
+
+        failed: list[ModelFailure | ProbeFailure] = []
+        failed += conduct_study(plan, tell, lambda one: say(marked("[red]{}[/]", one)), env_workers)
+        unfitted = [] if no_probes else fit_probes(study, only, count, jobs)
+        failed += [one for one in unfitted if not one.missing]
     after = plan_study(study, only)
     _print_plan(after)
-    for failure in failures:
+    for failure in failed:
         say(marked("[red]{}[/]", failure))
-    if failures or after.totals()["missing"]:
+    if failed or after.totals()["missing"]:
         raise typer.Exit(UNFINISHED)
 
 

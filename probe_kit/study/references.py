@@ -52,10 +52,13 @@ def _categories(path: tuple[str | int, ...], names: list[str] | None, suite: Pla
 def _items(
     path: tuple[str | int, ...], items: int | None, suite: PlannedSuite, categories: list[str] | None
 ) -> Iterator[Mistake]:
-    """`celebrity` has 70 items where others have 150: a category with fewer gives all that it has."""
-    chosen = [suite.items[name] for name in slugs(categories or list(suite.items)) if name in suite.items]
-    if items is not None and chosen and items > max(chosen):
-        yield Mistake(path, f"{items} items are asked for; no category has more than {max(chosen)}")
+    few = [
+        f"{name} has {suite.items[name]}"
+        for name in slugs(categories or list(suite.items))
+        if items is not None and suite.items.get(name, items) < items
+    ]
+    if few:
+        yield Mistake(path, f"{items} items are asked for, and {', '.join(few)}")
 
 
 # -- models ------------------------------------------------------------------------------------------------------
@@ -132,7 +135,7 @@ def _blocks(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
             yield from each_unknown((*place, part), part[:-1], getattr(block, part) or (), list(known))
         yield from _kinds(study, block, place)
         yield from _categories((*place, "categories"), block.categories, suite)
-        yield from _items((*place, "items"), block.items, suite, block.categories)
+        yield from _items((*place, "items"), block.items, suite, block.categories or study.suite.categories)
         if block.conditions and block.tokens == "none":
             yield Mistake((*place, "tokens"), "a policy's run stores pooled or all tokens; none is for asks")
 

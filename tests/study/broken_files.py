@@ -111,7 +111,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     ('kind = "success"', 'kind = "sucess"  # here', "tables.success.kind: should be 'success'"),
     # names of other tables
     ('categories = ["color", "Shape"]', 'categories = ["colour"]  # here', "unknown category 'colour'; known: "),
-    ("items = 24", "items = 200  # here", "no category has more than 150"),
+    ("items = 24", "items = 200  # here", "200 items are asked for, and color has 150, shape has 150"),
     ('family = "vlm-tiny"', 'family = "vlm-tini"  # here', "unknown family 'vlm-tini'"),
     ('family = "vlm-tiny"', 'family = "vlm-tiny"\noptions = { warm = 1 }  # here', "models.reader.options"),
     ('vlm = "reader"', 'vlm = "raeder"  # here', "unknown model 'raeder'; known: "),

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import RunIncompleteError, UsageError
 from probe_kit.extract import open_run
-from probe_kit.study import conduct_study, load_study, make_table, plan_study
+from probe_kit.study import conduct_study, fit_probes, load_study, make_table, plan_study
 from probe_kit.suite import Suite
 
 TEXT = """
@@ -139,6 +139,25 @@ def test_tables_are_made_of_stored_runs_alone_and_name_what_is_missing(file: Pat
     ]
 
 
+def test_a_file_that_asks_for_more_items_plays_the_missing_ones_alone(file: Path) -> None:
+    conduct_study(plan_study(load_study(file)), env_workers=0)
+    more = file.with_name("more.toml")
+    more.write_text(file.read_text(encoding="utf-8").replace("items = 2", "items = 4"), encoding="utf-8")
+    assert states(more)["expert/short"] == ("partial", 4)
+    place = Path(
+        next(one.location for one in plan_study(load_study(more)).cells if one.cell.name == "expert/short")
+    )
+    before = {path.name: path.read_bytes() for path in (place / "commits").iterdir()}
+    conduct_study(plan_study(load_study(more), only="expert"), env_workers=0)
+    assert states(more)["expert/short"] == ("whole", 8)
+    assert states(file)["expert/short"] == ("whole", 4)  # more than what it needs
+    after = {path.name: path.read_bytes() for path in (place / "commits").iterdir()}
+    assert len(after) == 8
+    assert {name: after[name] for name in before} == before
+    shown = {one["system"]: one["items"] for one in make_table(load_study(file), "main", partial=True).numbers}
+    assert shown["expert"] == 2
+
+
 @pytest.mark.slow
 def test_a_policy_is_loaded_once_for_all_of_its_runs(
     small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -160,3 +179,24 @@ def test_a_policy_is_loaded_once_for_all_of_its_runs(
     assert [one.model for one in conduct_study(plan_study(load_study(file)), env_workers=0)] == ["broken"]
     assert loaded == ["pi0-tiny"]
     assert states(file)["idle/dark"] == states(file)["idle/short"] == ("whole", 4)
+
+
+@pytest.mark.slow
+def test_probes_of_the_file_are_fitted_once_and_shown(small_suite: Suite, tmp_path: Path) -> None:
+    text = TEXT.format(out=tmp_path / "out", suite=small_suite.folder).replace("items = 2", "items = 12")
+    network = 'family = "pi0-tiny"\nrandom_weights = true'
+    text = text.replace('family = "idle"', f'{network}\nuntrained = "expert"\nweights_seed = 1')
+    text = text.replace('family = "expert"', network).replace('categories = ["color"]', 'categories = ["color"]')
+    probes = '[probes.main]\nruns = ["main"]\npermutations = 19\ncontrols = ["position"]\n'
+    file = tmp_path / "study.toml"
+    file.write_text(f'{text}{probes}[tables.probing]\nkind = "probing"\nruns = ["main"]\n', encoding="utf-8")
+    study = load_study(file)
+    conduct_study(plan_study(study))
+    (missing,) = fit_probes(study)
+    assert (missing.run, missing.missing) == ("broken/short", True)
+    made = make_table(study, "probing", partial=True)
+    assert [cells[:2] for cells in made.text.cells] == [("expert", "mean"), ("idle", "mean")]
+    stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("probes/*/*") if path.name == "scores.csv"}
+    assert len(stored) == 2
+    fit_probes(study)
+    assert {path: path.stat().st_mtime_ns for path in stored} == stored

@@ -305,8 +305,8 @@ class Run:
 
     @cached_property
     def planned_items(self) -> Mapping[str, str]:
-        """Category of every item of the plan by its id, in whatever wording it was asked."""
-        return {str(one["item_id"]): str(one["category"]) for one in self._plan_of_items}
+        """Category of every item of the plan by its id, whatever is shown of the run: its suite has them all."""
+        return {str(one["item_id"]): str(one["category"]) for one in self.root.plan}
 
     @cached_property
     def _plan_of_items(self) -> list[dict[str, Any]]:

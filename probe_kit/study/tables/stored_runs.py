@@ -61,8 +61,7 @@ def stored_runs(
             missing.append(f"{label} is missing: {cell.unavailable}")
             continue
         try:
-            run = open_run(locate(cell.location(study.study.folder)), allow_partial=partial)
-            found.append(StoredRun(cell, _part(run, cell, selection, categories)))
+            found.append(open_cell(study, cell, selection, partial, categories))
         except ProbeKitError as error:
             if not partial:
                 raise RunIncompleteError(
@@ -73,12 +72,25 @@ def stored_runs(
     return StoredRuns(tuple(found), tuple(missing))
 
 
+def open_cell(
+    study: LoadedStudy,
+    cell: Cell,
+    selection: Selection,
+    partial: bool = False,
+    categories: Sequence[str] | None = None,
+) -> StoredRun:
+    """The stored run of a cell, restricted to a selection. Raises what `open_run` raises."""
+    run = open_run(locate(cell.location(study.study.folder)), allow_partial=partial)
+    return StoredRun(cell, _part(run, cell, selection, categories))
+
+
 def _part(run: "Run", cell: Cell, selection: Selection, categories: Sequence[str] | None) -> "Run":
-    """What the table shows of a run, which may hold more for other blocks."""
-    chosen = [name for name in selection.categories if categories is None or name in categories]
-    if tuple(chosen) == cell.selection.categories and selection.items == cell.selection.items:
+    """What is shown of a run, which may hold more: of other blocks, or of a former state of the file."""
+    wanted = selection.counts(cell.suite)
+    counts = {name: count for name, count in wanted.items() if categories is None or name in categories}
+    if counts == run.items["category"].value_counts().to_dict():
         return run
-    return run.only(chosen, selection.items)
+    return run.only(list(counts), selection.items)
 
 
 def _label(study: LoadedStudy, cell: Cell, several: bool) -> str:

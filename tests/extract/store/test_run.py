@@ -127,7 +127,8 @@ def test_a_run_shows_the_first_items_of_some_categories(recorded_run: Run) -> No
     first = list(dict.fromkeys(whole.loc[whole["category"] == "color", "item_id"]))[:4]
     mine = whole["item_id"].isin(first).to_numpy()
     assert part.episodes["item_id"].unique().tolist() == first
-    assert (part.planned, len(part.items), set(part.planned_items.values())) == (8, 4, {"color"})
+    assert (part.planned, len(part.items)) == (8, 4)
+    assert part.planned_items == recorded_run.planned_items  # by which its suite is found again
     for site in (Site("backbone", 2), Site("expert", 3, iteration=7)):
         np.testing.assert_array_equal(part.column(site), recorded_run.column(site)[mine])
         np.testing.assert_array_equal(part.tokens(site)[1], recorded_run.tokens(site)[1][mine])
