@@ -1,22 +1,27 @@
 """Verdicts on policies whose wiring is known: what they read, and where, is written down in `wirings`."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
+import numpy as np
 import pytest
+from sklearn.linear_model import LogisticRegression
 
 from probe_kit.errors import UsageError
+from probe_kit.hooks import Site, capture
 from probe_kit.intervene import ConditionOutcomes, ImageSwapEffect, UseVerdict, classify_all
 from probe_kit.intervene.edits.sites import resolve_sites
 from probe_kit.intervene.kinds.base import Measurement
 from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
-from probe_kit.intervene.kinds.interchange.intervention import PatchedFromSource
+from probe_kit.intervene.kinds.interchange.intervention import PatchedFromSource, patches_within
 from probe_kit.intervene.kinds.joint.effects import JointEffect, describe_joint_places, measured_joint_places
 from probe_kit.intervene.kinds.joint.intervention import JointPlaces
 from probe_kit.intervene.kinds.site_effects import patch_effects
 from probe_kit.intervene.replay.conditions import Condition
 from probe_kit.intervene.results.site_maps import localised_sites
+from probe_kit.intervene.results.ties import describe_tie, tie_at_site
 from probe_kit.intervene.store.settings import PER_STEP
-from tests.intervene.wirings import WIRINGS, WiredSession, outcomes_of
+from tests.intervene.wirings import WIRINGS, WORDS, WiredSession, outcomes_of, replay_inputs
 
 SUITE = "suite@1#0123456789ab"
 VERDICTS = {
@@ -186,3 +191,71 @@ def test_layers_that_follow_each_other_are_no_parallel_cells(wired: WiredSession
         JointPlaces(categories=("copied",), sites=("kv.01",), roles=("image",)).conditions(wired)
     with pytest.raises(UsageError, match="share no token"):
         JointPlaces(roles=("all", "image"))
+
+
+# -- ties --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class OneDirection:
+    """The direction of the answer in the words' mean, as a probe finds it: the same for every episode."""
+
+    vector: np.ndarray
+    control_names: tuple[str, ...] = ("control-1",)
+
+    def basis(self, name: str, episode: str, category: str) -> np.ndarray:
+        del episode, category
+        other = np.zeros_like(self.vector)
+        other[-1] = 1.0
+        return (other if name.startswith("control") else self.vector)[None]
+
+
+def probed_direction(session: WiredSession, name: str, site: Site) -> np.ndarray:
+    """(D,) unit weights of a logistic probe of the answer in the mean over the words."""
+    features, labels = [], []
+    for one in replay_inputs(name):
+        with capture(session.policy, [site]) as cache:
+            session.act(one.seen, one.seed)
+        features.append(cache[site][0, WORDS].mean(0).numpy())
+        labels.append(one.side_correct)
+    weights = LogisticRegression(C=0.1).fit(np.array(features), labels).coef_[0]
+    return (weights / np.linalg.norm(weights)).astype(np.float32)
+
+
+def tie_of(session: WiredSession, name: str, layer: int) -> str:
+    """At the words of one layer of the backbone."""
+    (place,) = resolve_sites(f"backbone.{layer:02d}", session.policy)
+    direction = OneDirection(probed_direction(session, name, place.only_site))
+    conditions: list[Condition] = [PatchedFromSource(place, "language", place.sites)]
+    conditions += patches_within("probe", direction, place, "language", place.sites)
+    whole, *along = patch_effects(outcomes_of(session, [name], conditions), SUITE)
+    return tie_at_site(whole, [row for row in along if not row.is_control])
+
+
+@pytest.mark.parametrize(
+    ("name", "ties"),
+    [
+        ("copied", {1: "read", 2: "unread"}),
+        ("bypass", {1: "unread", 2: "unread"}),  # was *used* beside a copy that nothing reads
+        ("elsewhere", {1: "unread", 2: "unread"}),
+        ("code", {1: "another code", 2: "unread"}),
+        ("decoy", {1: "read"}),  # two copies that always agree are one direction to any patch
+    ],
+)
+def test_the_copy_that_probes_read_is_told_from_the_one_that_is_used(
+    wired: WiredSession, name: str, ties: dict[int, str]
+) -> None:
+    assert {layer: tie_of(wired, name, layer) for layer in ties} == ties
+
+
+def test_the_tie_of_all_sites_is_said_in_one_sentence() -> None:
+    read, unread = ("backbone.01", "all"), ("backbone.02", "all")
+    assert describe_tie({read: "read", unread: "unread"}) == "the readable copy is read (backbone.01 all)"
+    elsewhere = "the readable copy is not the one used: the answer passes elsewhere"
+    assert describe_tie({read: "unread", unread: "unread"}) == elsewhere
+    assert "another code in the same place (backbone.01 all)" in describe_tie(
+        {read: "another code", unread: "unread"}
+    )
+    for open_ in ("in part", "not tested"):
+        assert describe_tie({read: open_, unread: "unread"}) == ""  # type: ignore[dict-item]
+    assert describe_tie({}) == ""

@@ -117,7 +117,7 @@ WIRINGS: Mapping[str, Wiring] = {
     "repair": Wiring(_with_repair, ONE_COPY),
     "bypass": Wiring(lambda seen: torch.tensor(seen.answer), ONE_COPY),
     "elsewhere": Wiring(lambda seen: seen.marks, {COPY: 1.0}),
-    "code": Wiring(_product, {COPY: 1.0}, has_product=True),
+    "code": Wiring(_product, {COPY: 1.0}, has_product=True, items=24),
     "decoy": Wiring(lambda seen: 2 * seen.words(), {ANSWER: 0.5, LOUD: 4.0}),
     "weak": Wiring(lambda seen: -0.6 + 0.5 * seen.words(), ONE_COPY),
     "shifted": Wiring(lambda seen: -1 + 0.3 * seen.words(), ONE_COPY),

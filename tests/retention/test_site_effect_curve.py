@@ -120,6 +120,22 @@ def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_
     assert (display.passes["all"].percent.tolist(), display.read.percent.tolist()) == ([100, 100], [100, 0])
 
 
+def test_the_tie_is_of_the_layers_at_which_a_probe_is_significant(run: ArrayRun) -> None:
+    """Layer 1 is read by probes: unread if nothing passes there, read if the probe's direction carries it."""
+
+    def tie() -> str:
+        (row,) = (row for row in retention_table([run]).rows if row.category == "color")
+        return used(row).tie
+
+    assert tie() == "whether the readable copy is the one used was not tested"
+    answers = outcomes_of({"color": follower(48)})
+    store(run, "interchange", inside(answers, backbone__00=1.0, backbone__01=0.0), direction="none")
+    assert tie() == "the readable copy is not the one used: the answer passes elsewhere"
+    both = inside(inside(answers, "|all|probe", backbone__01=1.0), "|all|control-1", backbone__01=0.0)
+    store(run, "interchange", both, direction="probe", seed="0")
+    assert tie() == "the readable copy is read (backbone.01 all)"
+
+
 def test_a_direction_alone_is_no_search_and_no_map(run: ArrayRun) -> None:
     """It turned *used* into *inconclusive*, and stopped the report for want of a map to draw."""
     answers = outcomes_of({"color": follower(48)})

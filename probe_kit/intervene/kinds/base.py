@@ -241,7 +241,7 @@ def frame_of(rows: Sequence[EffectLike]) -> "pd.DataFrame":
     flat = []
     for row in rows:
         plain = row.to_json()
-        limits = {name: plain.pop(name) for name in list(plain) if name.endswith("_ci")}
+        limits = {name: plain.pop(name) or (None, None) for name in list(plain) if name.endswith("_ci")}
         ends = {
             f"{name}_{end}": pair[at] for name, pair in limits.items() for at, end in enumerate(("low", "high"))
         }

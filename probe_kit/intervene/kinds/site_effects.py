@@ -20,7 +20,8 @@ from probe_kit.intervene.kinds.base import (
     common_columns,
     test_against_controls,
 )
-from probe_kit.intervene.kinds.image_swap.effects import net_interval, swap_p_values
+from probe_kit.intervene.kinds.image_swap.effects import net_interval
+from probe_kit.intervene.kinds.swap_shares import share_of_swap
 from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes
 from probe_kit.statistics.significance import SIGNIFICANCE
 
@@ -36,14 +37,15 @@ class PatchEffect(EffectRow):
 
     net: share of episodes whose action flips to the target side, minus those that flip away from it; net_left,
     net_right: the same by target side. coefficient: of steering, else empty. effect: share of what the whole image
-    swap does to where the action goes; None if that does nothing, so that a share would be a ratio of noise.
-    mean_displacement, control_displacement: metres toward the target side, of the edit and of its matched
-    controls. t, p, p_fwe: of the displacement beyond the controls', one-sided, by sign flips of whole groups;
-    p_fwe against the largest t of all edits of the category.
+    swap does to where the action goes, with its 95 % interval by groups; None if that does nothing, so that a
+    share would be a ratio of noise. mean_displacement, control_displacement: metres toward the target side, of the
+    edit and of its matched controls. t, p, p_fwe: of the displacement beyond the controls', one-sided, by sign
+    flips of whole groups; p_fwe against the largest t of all edits of the category.
     """
 
     coefficient: str
     effect: float | None
+    effect_ci: tuple[float, float] | None
     net_left: float
     net_right: float
     mean_displacement: float
@@ -118,17 +120,18 @@ def _of_category(
     names = [ConditionName.parse(outcomes.conditions[row]) for row in rows]
     displacements = push * (outcomes.displacement[rows] - clean)
     tests = test_against_controls(displacements, names, outcomes, suite, (), ())
-    share = _shares(outcomes, rows)
     found = []
     for at, (row, name, test) in enumerate(zip(rows, names, tests, strict=True)):
         flips = _flips(push, clean, outcomes.displacement[row])
+        share = share_of_swap(outcomes, outcomes.displacement[row] - clean, suite)
         columns: dict[str, Any] = common_columns(outcomes, row, name)
         found.append(
             PatchEffect(
                 category=category,
                 **columns,
                 coefficient=name.coefficient,
-                effect=None if share is None else float(share[at]),
+                effect=None if share is None else share.value,
+                effect_ci=None if share is None else (share.low, share.high),
                 net=float(flips.mean()),
                 net_ci=net_interval(flips, outcomes, suite),
                 net_left=_mean(flips[push > 0]),
@@ -148,18 +151,6 @@ def _flips(push: Values, clean: Values, edited: Values) -> Values:
     """(E,) 1 where the action flips to the target side, −1 where it flips away from it, else 0."""
     flips: NDArray[np.float64] = (push * edited > 0).astype(float) - (push * clean > 0)
     return flips
-
-
-def _shares(outcomes: ConditionOutcomes, rows: Sequence[int]) -> NDArray[np.float64] | None:
-    """(S,) of what the image swap does; None if the images were not swapped, or that does nothing."""
-    if IMAGE_SWAP not in outcomes.conditions:
-        return None
-    if min(swap_p_values(outcomes)) >= SIGNIFICANCE:
-        return None
-    clean = outcomes.of(CLEAN)
-    total = outcomes.of(IMAGE_SWAP) - clean
-    found: NDArray[np.float64] = ((outcomes.displacement[rows] - clean) * total).sum(axis=1) / (total**2).sum()
-    return found
 
 
 def _mean(values: NDArray[np.float64]) -> float:

@@ -10,6 +10,7 @@ from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.kinds.image_swap.effects import stored_image_swaps
 from probe_kit.intervene.results.places import stored_places
+from probe_kit.intervene.results.ties import stored_ties
 from probe_kit.retention.behaviour.success_rate import (
     SuccessRate,
     capture_only,
@@ -86,12 +87,16 @@ def run_rows(
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
     judged, found = RunUnderRule.of(run, settings.rule, settings.last_steps), stored_image_swaps(run)
     places = stored_places(run) if found else {}
+    ties = {view: stored_ties(run, results, view) if found else {} for view in shown}
     drawn = [
         _row(judged, results, settings, group, str(category), episodes, view)
         for category, episodes in judged.run.episodes.groupby("category", sort=False)
         for view in shown
     ]
-    return [replace(one, row=add_image_swap(one.row, found, places)) for one in drawn]
+    return [
+        replace(one, row=add_image_swap(one.row, found, places, ties[one.row.view].get(one.row.category, "")))
+        for one in drawn
+    ]
 
 
 def _row(

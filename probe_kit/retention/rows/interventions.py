@@ -14,18 +14,19 @@ from probe_kit.retention.rows.row import RetentionRow
 
 
 def add_image_swap(
-    row: RetentionRow, found: Mapping[str, ImageSwapEffect], places: Mapping[str, Places]
+    row: RetentionRow, found: Mapping[str, ImageSwapEffect], places: Mapping[str, Places], tie: str = ""
 ) -> RetentionRow:
     """The row with the effect of the image swap on its category, judged by its own probes.
 
-    found: by category; may be empty. places: by category, where it passes and is read.
+    found: by category; may be empty. places: by category, where it passes and is read. tie: of the row's category
+    and view, see `intervene.results.ties`.
     """
     own = found.get(row.category)
     if own is None:
         return row
     encoded = row.backbone.has_signal if row.backbone.exceeds else None
     category, control = row.category, control_for(row.category, found)
-    use = classify_use(encoded, own, control, places.get(category))
+    use = classify_use(encoded, own, control, places.get(category), tie)
     effect = SwapEffect(
         follow_rate=own.follow_rate,
         reversal_rate=own.reversal_rate,

@@ -264,18 +264,23 @@ class Places:
 
 
 def classify_use(
-    encoded: bool | None, found: ImageSwapEffect, control: str | None, places: Places | None = None
+    encoded: bool | None,
+    found: ImageSwapEffect,
+    control: str | None,
+    places: Places | None = None,
+    tie: str = "",
 ) -> UseVerdict:
     """The verdict of the image swap, with what probes and interventions inside the network say of it.
 
     encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
-    without probes. control: see `classify_behaviour`. places: None if nothing was tried inside.
+    without probes. control: see `classify_behaviour`. places: None if nothing was tried inside. tie: see
+    `results.ties.describe_tie`; empty if it was not tested.
     """
     own = classify_behaviour(found, control)
     if own.behaviour in ("not used", "inconclusive"):
         return own
-    tie = "" if encoded is None else NOT_TESTED if encoded else NO_COPY
-    return replace(own, place=str(places or ""), tie=tie)
+    said = "" if encoded is None else (tie or NOT_TESTED) if encoded else NO_COPY
+    return replace(own, place=str(places or ""), tie=said)
 
 
 def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
@@ -301,13 +306,14 @@ def classify_all(
     found: Mapping[str, ImageSwapEffect],
     encoded: Mapping[str, bool | None],
     places: Mapping[str, Places] = MappingProxyType({}),
+    ties: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, UseVerdict]:
     """Of every category that was intervened on.
 
-    encoded, places: by category; one that is not there was not probed, or not looked for inside.
+    encoded, places, ties: by category; one that is not there was not probed, or not looked for inside.
     """
     return {
-        name: classify_use(encoded.get(name), one, control_for(name, found), places.get(name))
+        name: classify_use(encoded.get(name), one, control_for(name, found), places.get(name), ties.get(name, ""))
         for name, one in found.items()
     }
 

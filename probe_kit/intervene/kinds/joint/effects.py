@@ -51,9 +51,8 @@ class JointEffect:
     key: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; an interval that is missing has missing ends."""
-        nothing = (None, None)
-        return asdict(self) | {"alone_ci": self.alone_ci or nothing, "needed_ci": self.needed_ci or nothing}
+        """Plain values."""
+        return asdict(self)
 
 
 def measured_joint_places(measurement: Measurement) -> list[JointEffect]:
