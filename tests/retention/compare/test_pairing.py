@@ -151,6 +151,24 @@ def test_the_first_run_is_compared_with_every_other_or_every_other_with_the_one_
     assert pairs(retention_table(groups, against="y")) == [("x", "y"), ("z", "y")]
 
 
+def test_pairs_that_are_named_are_compared_as_one_family(tmp_path: Path) -> None:
+    runs = [run(tmp_path / name, hits(0.9 - 0.2 * at, at)) for at, name in enumerate("abc")]
+    first, second, third = (str(one.location) for one in runs)
+    table = retention_table(runs, pairs=[(second, first), (third, second)])
+    assert pairs(table) == [("b", "a"), ("c", "b")]
+    alone = retention_table(runs, pairs=[(second, first)])
+    one, both = (difference(own, "a", "color") for own in (alone, table))
+    assert (one.p, one.sr, one.sr_ci) == (both.p, both.sr, both.sr_ci)
+    tested = sorted(row.p for row in table.differences if row.category != "mean" and row.p is not None)
+    assert len(tested) == 4
+    assert both.p_holm is not None
+    assert one.p_holm is not None
+    assert both.p_holm >= one.p_holm
+    assert retention_table(runs, pairs=()).differences == []
+    with pytest.raises(UsageError, match="elsewhere is none of the runs"):
+        retention_table(runs, pairs=[("elsewhere", first)])
+
+
 def test_a_name_that_is_no_run_or_several_is_refused(tmp_path: Path) -> None:
     runs = [run(tmp_path / name, hits(0.5, at), called="pi0") for at, name in enumerate("ab")]
     with pytest.raises(UsageError, match=r"--against 'c' is none of the runs a \(pi0 · .*\), b"):
