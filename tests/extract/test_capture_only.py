@@ -132,9 +132,8 @@ def test_a_checkpoint_of_another_arm_is_captured(base: Path, small_suite: Suite,
 def test_a_run_that_acts_is_another_run(capture_run: Run, small_suite: Suite) -> None:
     acting = prepare(replace(ACTING, suite=small_suite.folder)).identity()
     assert "capture_only" not in acting
-    assert {key: value for key, value in capture_run.settings.items() if key != "capture_only"} == json.loads(
-        json.dumps(acting)
-    )
+    own = capture_run.root.own_settings
+    assert {key: value for key, value in own.items() if key != "capture_only"} == json.loads(json.dumps(acting))
 
 
 @pytest.mark.parametrize(
