@@ -66,6 +66,7 @@ class Extraction(Prepared):
         if self.declared:
             raise UsageError("this extraction was planned without its model; prepare it again with fetch=True")
         with location.in_words():
+            self._check_settings(location)
             if not force and (further := self.further_plan(location)).episodes:
                 check_if_full(space_needed(further, self.settings), location)
             writer = self.writer(location)
@@ -80,6 +81,13 @@ class Extraction(Prepared):
                 seal(location)
         return open_run(location)
 
+    def _check_settings(self, location: Location) -> None:
+        """Raise SettingsMismatchError if a run with other settings is there: before its plan is compared."""
+        if location.exists(RUN_FILE):
+            root = read_root(location)
+            root.check_continuable()
+            check_other_settings(root.own_settings, json.loads(canonical_json(self.identity())), str(location))
+
     def further_plan(self, location: Location) -> Plan:
         """The plan of the episodes that the run at `location` does not plan yet: all of them where there is none.
 
@@ -89,7 +97,6 @@ class Extraction(Prepared):
             return self.plan
         root = read_root(location)
         root.check_continuable()
-        check_other_settings(root.own_settings, json.loads(canonical_json(self.identity())), str(location))
         rows = further_rows(root.plan, self.plan.to_json()["episodes"], str(location))
         added = {row["episode_id"] for row in rows}
         return self.plan.only(one for one in self.plan.episodes if one.episode.episode_id in added)

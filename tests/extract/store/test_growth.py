@@ -13,7 +13,7 @@ import pytest
 import zarr
 
 from probe_kit.errors import NoProbesError, RunDamagedError, RunIncompleteError, SettingsMismatchError
-from probe_kit.extract import Run, open_run, seal, verify_run
+from probe_kit.extract import Extraction, ExtractSettings, Run, open_run, seal, verify_run
 from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.store.format.plans import count_plans, plan_key
 from probe_kit.extract.store.growth import growth_at
@@ -156,6 +156,18 @@ def test_the_plan_of_more_items_holds_the_plan_of_fewer(query: Any, small_suite:
         for fewer, more in ((0, 1), (1, 2)):
             assert plans[fewer].items() <= plans[more].items()
             assert named[fewer].items() <= named[more].items()
+
+
+def test_a_plan_that_was_made_without_its_model_is_compared_with_the_stored_one(
+    small_suite: Suite, tmp_path: Path
+) -> None:
+    """As by `--dry-run`, which knows no weights."""
+    run = extracted(tmp_path / "run", small_suite, COLOR[:1])
+    plan = replace(plan_of(small_suite, COLOR[1]), bytes=800)
+    declared = Extraction(ExtractSettings("pi0-tiny"), plan, {"weights_sha256": None}, None, declared=True)
+    further = declared.further_plan(run.location)
+    assert {one.episode.episode_id for one in further.episodes}.isdisjoint(run.episodes["episode_id"])
+    assert (len(further.episodes), further.bytes) == (4, 400)
 
 
 # -- never fewer ------------------------------------------------------------------------------------------
