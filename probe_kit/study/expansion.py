@@ -47,16 +47,16 @@ def excludes(rule: dict[str, str], model: str, way: str) -> bool:
     return all(names[part] == value for part, value in rule.items())
 
 
-def expand(study: Study, suite: PlannedSuite, beside: Path) -> tuple[list[Cell], list[Mistake]]:
+def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]]:
     """The cells of a study whose names are all known, and mistakes that only their settings show.
 
-    beside: folder that paths of the file are relative to. Blocks that ask for the same run share its cell.
+    Blocks that ask for the same run share its cell.
     """
     found: dict[tuple[str, str, int], Cell] = {}
     mistakes: list[Mistake] = []
     for member in members(study):
         try:
-            settings = _settings(study, member, beside)
+            settings = _settings(study, member)
         except ProbeKitError as error:
             mistakes.append(Mistake(_blamed(study, member, str(error)), str(error)))
             continue
@@ -86,7 +86,7 @@ def _blamed(study: Study, member: Member, said: str) -> tuple[str | int, ...]:
     """The table whose values a settings error is of, and the key in it that the message names."""
     home, name = ("conditions" if member.block.conditions else "asks"), member.way
     try:
-        _settings_of(study, member.model, ConditionTable(), None, Path())
+        _settings_of(study, member.model, ConditionTable(), None)
     except ProbeKitError:
         home, name = "models", member.model
     given = getattr(study, home)[name].model_fields_set
@@ -94,12 +94,12 @@ def _blamed(study: Study, member: Member, said: str) -> tuple[str | int, ...]:
     return (home, name, *named[:1])
 
 
-def _settings(study: Study, member: Member, beside: Path) -> RunSettings:
+def _settings(study: Study, member: Member) -> RunSettings:
     if member.block.asks:
         ask = study.asks[member.way]
         tokens = member.block.tokens or "none"
-        return replace(_asked(study, member.model, ask, beside), tokens=tokens, seed=member.seed)
-    found = _settings_of(study, member.model, study.conditions[member.way], member.block.tokens, beside)
+        return replace(_asked(study, member.model, ask), tokens=tokens, seed=member.seed)
+    found = _settings_of(study, member.model, study.conditions[member.way], member.block.tokens)
     return replace(found, seed=member.seed)
 
 
@@ -123,13 +123,11 @@ def _scene(study: Study, model: ModelTable) -> str | None:
     return model.scene or (None if model.protocol else study.scene)
 
 
-def _settings_of(
-    study: Study, name: str, condition: ConditionTable, tokens: str | None, beside: Path
-) -> ExtractSettings:
+def _settings_of(study: Study, name: str, condition: ConditionTable, tokens: str | None) -> ExtractSettings:
     """Of a policy, with what its protocol decides."""
     fields = condition.model_dump(exclude_none=True)
     if condition.background is not None:
-        fields["background"] = beside / condition.background
+        fields["background"] = Path(condition.background)
     if condition.picture_size is not None:
         fields["picture_size"] = read_size(condition.picture_size)
     settings = ExtractSettings.from_options(
@@ -144,11 +142,10 @@ def _settings_of(
     return replace(settings, options=study.models[name].options).followed()
 
 
-def _asked(study: Study, name: str, ask: AskTable, beside: Path) -> AskSettings:
-    prompt = str(beside / ask.prompt) if ask.prompt.endswith(".txt") else ask.prompt
+def _asked(study: Study, name: str, ask: AskTable) -> AskSettings:
     settings = AskSettings.from_options(
         **_common(study, name),
-        prompt=find_template(prompt),
+        prompt=find_template(ask.prompt),
         picture_size=read_size(ask.picture_size),
         picture=ask.picture,
         query=ask.query,

@@ -24,14 +24,14 @@ class PlannedSuite:
     here: bool = True
 
 
-def planned_suite(table: SuiteTable, beside: Path) -> tuple[PlannedSuite, list[Mistake]]:
-    """The suite that a file names, and what is wrong with it. beside: folder that its path is relative to."""
+def planned_suite(table: SuiteTable) -> tuple[PlannedSuite, list[Mistake]]:
+    """The suite that a file names, and what is wrong with it."""
     if table.path is None:
         return _embedded(), []
-    folder = Path(table.path) if Path(table.path).is_absolute() else beside / table.path
+    folder = Path(table.path)
     counts = {slug(name): count for name, count in table.counts.items()}
     if folder.is_dir():
-        return _from_folder(folder, counts)
+        return _from_folder(folder, table.counts)
     if counts:
         ordered = {name: counts[name] for name in in_order(counts)}
         return PlannedSuite(f"not here: {table.path}", ordered, folder, "suite.counts", here=False), []
@@ -71,9 +71,12 @@ def _from_folder(folder: Path, counts: Mapping[str, int]) -> tuple[PlannedSuite,
     except SuiteError as error:
         return _unknown(str(folder), folder, str(error))
     items = count_by_category(suite.items)
-    other = {name: count for name, count in counts.items() if items.get(name) != count}
     wrong = [
-        Mistake(("suite", "counts", name), f"{name} has {items.get(name, 0)} items in {folder}, not {count}")
-        for name, count in other.items()
+        Mistake(
+            ("suite", "counts", name),
+            f"{slug(name)} has {items.get(slug(name), 0)} items in {folder}, not {count}",
+        )
+        for name, count in counts.items()
+        if items.get(slug(name)) != count
     ]
     return PlannedSuite(suite.content_sha256, items, folder, str(folder)), wrong

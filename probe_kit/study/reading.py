@@ -53,6 +53,7 @@ def _shipped() -> list[Path]:
 def load_study(name: str | Path) -> LoadedStudy:
     """Read a study file and expand it; loads no model, draws no picture and needs no network.
 
+    Paths in the file are relative to the working directory, as on the command line.
     name: a path, or the name of a study of the package. Raises UsageError if there is none, and StudyFileError,
     which lists all mistakes with their lines.
     """
@@ -66,10 +67,10 @@ def load_study(name: str | Path) -> LoadedStudy:
         raise UsageError(f"{file}: {error}. The file is TOML 1.0") from error
     except ValidationError as error:
         raise StudyFileError(str(file), text, _mistakes(error)) from None
-    suite, mistakes = planned_suite(study.suite, file.parent)
+    suite, mistakes = planned_suite(study.suite)
     mistakes += reference_mistakes(study, suite)
     if not mistakes:
-        cells, mistakes = expand(study, suite, file.parent)
+        cells, mistakes = expand(study, suite)
     if mistakes:
         raise StudyFileError(str(file), text, mistakes)
     return LoadedStudy(file, study, suite, tuple(cells))

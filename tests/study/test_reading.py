@@ -7,6 +7,7 @@ import pytest
 from probe_kit.errors import UsageError
 from probe_kit.study import LoadedStudy, StudyFileError, load_study, plan_study
 from probe_kit.study.places import line_of
+from probe_kit.suite import Suite
 from tests.study.broken_files import BASE, ELSEWHERE, MISTAKES
 
 
@@ -187,3 +188,20 @@ def test_the_embedded_study_needs_no_download(tmp_path: Path, monkeypatch: pytes
     assert all(cell.settings.checkpoint is None for cell in study.cells)
     assert {cell.model for cell in study.cells} == set(study.study.models)
     assert plan_study(study).totals()["episodes"] == 1344
+
+
+def test_paths_are_relative_to_the_working_directory_also_in_studies_of_the_package(
+    small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "suites").mkdir()
+    (tmp_path / "suites" / "paper").symlink_to(small_suite.folder, target_is_directory=True)
+    with pytest.raises(
+        StudyFileError, match=r"suite.counts.Emotion: emotion has 0 items in suites/paper, not 150"
+    ):
+        load_study("paper")
+    (tmp_path / "files").mkdir()
+    text = changed(("[suite]", '[suite]\npath = "suites/paper"'), ("items = 24", "items = 12"))
+    study = load_study(written(tmp_path / "files", text))
+    assert study.suite.identity == small_suite.content_sha256
+    assert study.cells[0].settings_to_play.suite == Path("suites/paper")
