@@ -80,7 +80,7 @@ COMMON: dict[str, Any] = {
 
 def patch(place: str, effect: float | None, p: float, centimetres: float = 3.0) -> PatchEffect:
     return PatchEffect(
-        **COMMON, place=place, coefficient="", effect=effect, net=0.4, net_left=0.4, net_right=0.4,
+        **COMMON, place=place, coefficient="", effect=effect, effect_ci=None, net=0.4, net_left=0.4, net_right=0.4,
         mean_displacement=centimetres / 100, control_displacement=None, t=2.0, p=p, p_fwe=p,
     )  # fmt: skip
 

@@ -115,8 +115,8 @@ def place(name: str, role: str, effect: float, p: float = 0.001) -> PatchEffect:
     return PatchEffect(
         category="color", place=name, role=role, direction="", coefficient="", is_control=False,
         n_episodes=8, n_items=4,
-        effect=effect, net=0.0, net_ci=(0.0, 0.0), net_left=0.0, net_right=0.0, mean_displacement=0.0,
-        control_displacement=None,
+        effect=effect, effect_ci=(effect, effect), net=0.0, net_ci=(0.0, 0.0), net_left=0.0, net_right=0.0,
+        mean_displacement=0.0, control_displacement=None,
         t=0.0, p=p, p_fwe=p, max_action_change=0.0, fires=0, no_op_fires=0, relative_change=0.0,
     )  # fmt: skip
 
