@@ -13,6 +13,7 @@ from probe_kit.retention.columns.text import (
 )
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.known_used import OVERALL, KnownUsedTable
 from probe_kit.retention.compare.vlm_vla import VlmVlaDifference
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.retention.table import RetentionTable
@@ -95,6 +96,47 @@ def vlm_vla_table(found: Sequence[VlmVlaDifference]) -> NamedTable:
     note = f"{_TEST.replace('this comparison', 'the table')}{other}"
     columns = ("systems", "category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p (Holm)", "items")
     return NamedTable(TextTable("VLM − VLA", note, columns, cells), tuple(numbers))
+
+
+def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
+    """Items that a VLM answers right, a probe decodes and a policy acts on right, each in both layouts."""
+    shown = [(join, row) for join in joins for row in join.rows]
+    cells = tuple(
+        (
+            f"{join.asked} · {join.acted}",
+            row.category if row.category == OVERALL else category_of(row.category).title,
+            str(row.n_items),
+            *(_count(count) for count in (row.answered_correctly, row.encoded, row.acted_correctly)),
+            _count(row.answered_and_encoded),
+            with_limits(percent(row.share_not_acted_on), row.share_not_acted_on_ci or (None, None), percent),
+        )
+        for join, row in shown
+    )
+    numbers = [
+        {
+            "vlm": join.asked,
+            "policy": join.acted,
+            "view": join.view,
+            "category": row.category,
+            "items": row.n_items,
+            "answered": row.answered_correctly,
+            "encoded": row.encoded,
+            "acted_on": row.acted_correctly,
+            "answered_and_encoded": row.answered_and_encoded,
+            "share_not_acted_on": row.share_not_acted_on,
+            "ci": row.share_not_acted_on_ci,
+            "signal": row.has_signal,
+        }
+        for join, row in shown
+    ]
+    note = "items right in both layouts, which guessing manages in 25 %; lost: share of answered and encoded ones"
+    columns = ("systems", "category", "items", "answered", "encoded", "acted on", "answered and encoded", "lost %")
+    made = NamedTable(TextTable("Stages", note, columns, cells), tuple(numbers))
+    return made.with_note(list(dict.fromkeys(text.removesuffix(".") for join in joins for text in join.notes)))
+
+
+def _count(number: int | None) -> str:
+    return "–" if number is None else str(number)
 
 
 def _once(differences: Sequence[Difference]) -> list[Difference]:

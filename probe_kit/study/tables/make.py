@@ -1,11 +1,13 @@
 """Making of a study's named tables."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from probe_kit.errors import UsageError
+from probe_kit.errors import NoProbesError, UsageError
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
+from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
 from probe_kit.retention.compare.vlm_vla import vlm_vla_differences
 from probe_kit.retention.table import RetentionTable
 from probe_kit.study.cells import Cell, Selection
@@ -13,10 +15,12 @@ from probe_kit.study.mistakes import unknown
 from probe_kit.study.planned_suite import slugs
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ComparisonTable, TableTable
-from probe_kit.study.tables.compared import difference_table, group_table, vlm_vla_table
+from probe_kit.study.tables.compared import difference_table, group_table, stages_table, vlm_vla_table
 from probe_kit.study.tables.named_table import NamedTable
 from probe_kit.study.tables.rates import probing_table, score_table, sides_table, success_table
 from probe_kit.study.tables.stored_runs import StoredRun, StoredRuns, of_blocks, stored_runs
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.store import load_results
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
@@ -55,6 +59,8 @@ def _made(study: LoadedStudy, table: TableTable, runs: StoredRuns, name: str) ->
     if table.kind == "vlm-vla":
         read = [scored(run, "text") for run in opened]
         return vlm_vla_table(vlm_vla_differences(read, labels, _sources(study, runs.found)))
+    if table.kind == "stages":
+        return stages_table(_joins(study, runs, labels))
     comparison = study.study.comparisons.get(table.comparison or "")
     if comparison is None:
         raise UsageError(f"tables of kind {table.kind!r} are not made by this version; {name!r} is one")
@@ -123,6 +129,27 @@ def _sources(study: LoadedStudy, found: tuple[StoredRun, ...]) -> list[tuple[str
         and study.study.models[policy.cell.model].vlm == vlm.cell.model
         and vlm.cell.seed == policy.cell.seed
     ]
+
+
+def _joins(study: LoadedStudy, runs: StoredRuns, labels: Mapping[str, str]) -> list[KnownUsedTable]:
+    """Every policy run joined with the run of its VLM, with the probes of the policy where there are any."""
+    opened = {one.place: one.run for one in runs.found}
+    joins = [
+        replace(
+            match_runs(scored(opened[vlm], "text"), opened[policy], _probes(opened[policy])),
+            asked=labels[vlm],
+            acted=labels[policy],
+        )
+        for vlm, policy in _sources(study, runs.found)
+    ]
+    return correct_joins(joins)
+
+
+def _probes(run: "Run") -> ProbeResults | None:
+    try:
+        return load_results(run)
+    except NoProbesError:
+        return None
 
 
 def _groups(study: LoadedStudy, names: list[str], runs: StoredRuns) -> "dict[str, list[Run]]":
