@@ -12,9 +12,10 @@ from probe_kit.suite.categories import in_order
 
 @dataclass(frozen=True)
 class PlannedSuite:
-    """identity: what cells are named by. items: by category. folder: None for the embedded suite.
+    """identity: `name@version`; items are compared by their content when a run grows. items: by category.
 
-    source: where the numbers of items are from. here: whether the suite can be played from.
+    folder: None for the embedded suite. source: where the numbers of items are from. here: whether the suite can be
+    played from.
     """
 
     identity: str
@@ -79,4 +80,4 @@ def _from_folder(folder: Path, counts: Mapping[str, int]) -> tuple[PlannedSuite,
         for name, count in counts.items()
         if items.get(slug(name)) != count
     ]
-    return PlannedSuite(suite.content_sha256, items, folder, str(folder)), wrong
+    return PlannedSuite(f"{suite.name}@{suite.version}", items, folder, str(folder)), wrong
