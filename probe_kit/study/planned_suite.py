@@ -12,7 +12,7 @@ from probe_kit.suite.categories import in_order
 
 @dataclass(frozen=True)
 class PlannedSuite:
-    """identity: `name@version`; items are compared by their content when a run grows. items: by category.
+    """identity: `name@version`; when a run grows, items are compared by content. items: by category.
 
     folder: None for the embedded suite. source: where the numbers of items are from. here: whether the suite can be
     played from.
