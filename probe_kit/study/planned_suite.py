@@ -14,8 +14,8 @@ from probe_kit.suite.categories import in_order
 class PlannedSuite:
     """identity: `name@version`; when a run grows, items are compared by content. items: by category.
 
-    folder: None for the embedded suite. source: where the numbers of items are from. here: whether the suite can be
-    played from.
+    folder: None for the embedded suite. source: where the numbers of items are from. here: whether the suite can
+    be played from.
     """
 
     identity: str
