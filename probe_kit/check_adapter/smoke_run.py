@@ -1,6 +1,5 @@
 """A run of two episodes, as `probe-kit extract` or `probe-kit ask` makes it, in a folder that is removed."""
 
-import csv
 from collections.abc import Mapping
 from dataclasses import replace
 from itertools import product
@@ -9,6 +8,7 @@ from typing import Any
 
 from PIL import Image, ImageDraw
 
+from probe_kit._system.csv_text import csv_of_rows
 from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extract_run
 from probe_kit.hooks.conformance.check import require
 from probe_kit.suite import Terms, suite_from_csv
@@ -51,10 +51,9 @@ def _one_item(instruction: str, folder: Path) -> Path:
         picture = Image.new("RGB", (_SIDE, _SIDE), "white")
         ImageDraw.Draw(picture).ellipse((32, 32, 192, 192), fill=colour)
         picture.save(folder / f"{colour}.png")
-    with (folder / "discs.csv").open("w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(["instruction", "correct", "wrong", "object"])
-        rows.writerow([instruction, *(f"{colour}.png" for colour in _COLOURS), instruction.split()[-1]])
+    correct, wrong = (f"{colour}.png" for colour in _COLOURS)
+    row = {"instruction": instruction, "correct": correct, "wrong": wrong, "object": instruction.split()[-1]}
+    (folder / "discs.csv").write_text(csv_of_rows(list(row), [row]), encoding="utf-8")
     terms = Terms("CC0-1.0", "drawn by probe-kit check-adapter")
     return suite_from_csv(folder / "discs.csv", folder / "suite", terms=terms).folder
 

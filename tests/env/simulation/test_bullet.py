@@ -7,6 +7,7 @@ import numpy as np
 import pybullet
 import pytest
 
+from probe_kit._system.installing import install_command
 from probe_kit.env.simulation.bullet import BulletClient
 
 
@@ -16,7 +17,7 @@ def test_this_pybullet_was_compiled_with_numpy():
 
 def test_a_pybullet_without_numpy_is_announced_with_its_remedy(monkeypatch):
     monkeypatch.setattr(pybullet, "isNumpyEnabled", lambda: 0)
-    with pytest.warns(UserWarning, match="--no-build-isolation"):
+    with pytest.warns(UserWarning, match=re.escape(install_command(rebuild="pybullet"))):
         BulletClient().close()
 
 

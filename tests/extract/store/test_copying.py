@@ -65,14 +65,14 @@ def test_nothing_can_be_added_to_it(copies: tuple[Run, Run], small_suite: Suite)
 def test_damage_is_still_damage(copies: tuple[Run, Run], tmp_path: Path) -> None:
     copy = Path(shutil.copytree(copies[1].path, tmp_path / "copy"))
     record = copy / "left-out.json"
-    content = record.read_text()
-    record.write_text(content.replace("backbone/pooled", "backbone/poolex"))
+    content = record.read_text(encoding="utf-8")
+    record.write_text(content.replace("backbone/pooled", "backbone/poolex"), encoding="utf-8")
     with pytest.raises(RunDamagedError, match="left-out"):
         open_run(copy)
     record.unlink()
     with pytest.raises(RunDamagedError, match="is missing"):
         open_run(copy)
-    record.write_text(content)
+    record.write_text(content, encoding="utf-8")
     trajectories = [file for file in copy.rglob("data.zarr/trajectory/c/*/*/*") if file.is_file()]
     trajectories[0].unlink()
     with pytest.raises(RunDamagedError, match="trajectory"):

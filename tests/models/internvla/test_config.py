@@ -59,7 +59,7 @@ def test_what_does_not_fit_is_refused(field: str, change: Any, said: str) -> Non
 
 
 def test_the_files_are_found_beside_the_weights_or_one_folder_up(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"config\.yaml is missing"):
+    with pytest.raises(CheckpointError, match=r"config\.yaml or config\.json of a run is missing"):
         find_config(tmp_path / "checkpoints")
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(run_values()), encoding="utf-8")
     (tmp_path / "dims.json").write_text(json.dumps(dims_values()), encoding="utf-8")

@@ -1,4 +1,5 @@
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from probe_kit._system.installing import install_command
 from probe_kit.errors import MissingExtraError, TooFewGroupsError, UsageError, WorkerDiedError
 from probe_kit.hooks import Site
 from probe_kit.statistics.label_permutations import flip_items
@@ -90,7 +92,7 @@ def test_columns_are_read_only_when_they_are_needed() -> None:
 
 def test_without_ray_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtraError, match=r"probe-kit\[ray\]"):
+    with pytest.raises(MissingExtraError, match=re.escape(install_command("ray"))):
         columns_of(ExecutionSettings(ray="auto"))
 
 

@@ -1,5 +1,6 @@
 """What every location of a run keeps, whether a folder or an object store."""
 
+import re
 import resource
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import zarr
 
+from probe_kit._system.installing import install_command
 from probe_kit.errors import DiskSpaceError, MissingExtraError, SettingsMismatchError, StoreError, UsageError
 from probe_kit.extract.store.locations.folder import Folder
 from probe_kit.extract.store.locations.locate import locate
@@ -166,7 +168,7 @@ def test_what_is_no_location_is_refused_and_says_why() -> None:
 
 def test_without_obstore_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "obstore", None)
-    with pytest.raises(MissingExtraError, match=r"probe-kit\[remote\]"):
+    with pytest.raises(MissingExtraError, match=re.escape(install_command("remote"))):
         locate("s3://bucket/run")
 
 

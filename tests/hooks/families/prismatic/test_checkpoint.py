@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from peft import LoraConfig, get_peft_model
 from safetensors.torch import load_file, save_file
 from torch import nn
 
+from probe_kit._system.installing import install_command
 from probe_kit.errors import CheckpointError, MissingExtraError, UsageError, WeightsError
 from probe_kit.hooks import load_policy
 from probe_kit.hooks.families.openvla.adapter import load_openvla
@@ -161,7 +163,7 @@ def test_heads_of_openvla_oft_are_noticed(base: Path, tmp_path: Path) -> None:
 
 def test_quantised_weights_need_the_extra(base: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "bitsandbytes", None)
-    with pytest.raises(MissingExtraError, match=r"probe-kit\[quantized\]"):
+    with pytest.raises(MissingExtraError, match=re.escape(install_command("quantized"))):
         load_openvla(str(base), bits=4)
 
 
