@@ -50,6 +50,7 @@ def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> No
     assert row.run.random_weights
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_with_shuffled_labels_nothing_is_significant(planted_run: Run) -> None:
     results = train_probes(planted_run, ["color"], permutations=20, target="shuffled", controls=(), jobs=1)

@@ -10,7 +10,7 @@ README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
 SHORT = {
-    "items=12)": "items=12, batch=12, scene=pk.SceneSpec(max_steps=4))",
+    "items=12)": "items=12, env_workers=0, scene=pk.SceneSpec(max_steps=4))",
     "permutations=50": "permutations=3",
 }
 

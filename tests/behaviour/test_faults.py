@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.faults import Stored, draw_fault
 
-FAST, SLOW, BLOCK = 25, 5000, 100
+FAST, SLOW, BLOCK = 15, 5000, 100
 
 
 @pytest.fixture(scope="module")

@@ -82,7 +82,8 @@ def command_lines(draw: st.DrawFn) -> list[str]:
         if not NEVER & set(one.opts) and not (optional_folder and one.name == "folder")
     ]
     required = [one for one in usable if one.required]
-    others = draw(st.lists(st.sampled_from([one for one in usable if not one.required] or usable), max_size=3))
+    optional = [one for one in usable if not one.required] or usable
+    others = draw(st.lists(st.sampled_from(optional), max_size=3)) if optional else []
     given_options = [word for one in [*required, *others] for word in draw(option(one))]
     if any("--model" in one.opts for one in COMMANDS[path].params):
         given_options += ["--model", draw(st.sampled_from(("expert", "pi0-tyni", "\x1b[31m", "[red]", "")))]

@@ -159,7 +159,7 @@ def test_probes_and_interventions_are_the_same_although_a_store_keeps_parts_and_
     assert verify_run(kept.location, deep=True).problems == ()
 
 
-@pytest.mark.parametrize("step", [4, pytest.param(1, marks=pytest.mark.slow)], ids=["a fourth", "all"])
+@pytest.mark.parametrize("step", [8, pytest.param(1, marks=pytest.mark.slow)], ids=["an eighth", "all"])
 def test_every_object_that_a_killed_process_left_torn_is_named_or_made_again(
     step: int, suite: Suite, whole: dict[str, bytes], bucket: str
 ) -> None:
