@@ -61,13 +61,6 @@ def retention(
         rule=rule, last_steps=last_steps, absent_below=absent_below, score=score, vlm_vla=vlm_vla,
         with_side_words=with_side_words, against=against,
     )  # fmt: skip
-    if style == "table":
-        out.print(table.to_rich("all" if "all" in details else cast("tuple[Section, ...]", details)))
-    else:
-        show = print_json_text if style == "json" else print_text
-        show(getattr(table, f"to_{style}")())
-        for note in table.notes:
-            say(marked("[yellow]note:[/] {}", note))
     shown = [scored(run, score, with_side_words) for run in listed]
     if figures is not None:
         _save_figures(shown, table, figures)
@@ -78,6 +71,13 @@ def retention(
         with err.status("drawing the report"):
             written = write_report(shown, html, table)
         say(f"report: {written} ({in_units(written.stat().st_size)})")
+    if style == "table":
+        out.print(table.to_rich("all" if "all" in details else cast("tuple[Section, ...]", details)))
+    else:
+        show = print_json_text if style == "json" else print_text
+        show(getattr(table, f"to_{style}")())
+        for note in table.notes:
+            say(marked("[yellow]note:[/] {}", note))
 
 
 def _check_places(html: Path | None, figures: Path | None) -> None:
