@@ -75,8 +75,8 @@ def test_every_wiring_has_a_truth() -> None:
 @pytest.mark.parametrize("name", WIRINGS)
 def test_the_verdict_is_true_of_the_wiring(name: str, verdicts: Verdicts) -> None:
     assert verdicts[name].verdict == VERDICTS[name]
-    is_whole = VERDICTS[name] in ("used", "against: used", "inconclusive")
-    assert ("in the first chunk" in verdicts[name].sentence) == (not is_whole)
+    assert "in the first chunk" in verdicts[name].sentence
+    assert "episode" not in verdicts[name].sentence.partition(":")[0]
 
 
 def test_the_reach_is_the_distance_between_what_the_policies_choose(effects: dict[str, ImageSwapEffect]) -> None:
@@ -94,12 +94,21 @@ def test_reasons_name_what_was_measured(verdicts: Verdicts) -> None:
 
 def test_what_is_decided_after_the_first_chunk_shows_in_the_episode(wired: WiredSession) -> None:
     """The first chunk approaches; *not used* of it was said of the policy."""
-    outcomes = outcomes_of(wired, ["late", "constant", "copied"], calls=3)
+    names = ["late", "constant", "copied"]
+    outcomes = outcomes_of(wired, names, calls=3)
     rows = {row.category: row for row in image_swap_effects(outcomes, SUITE, readout=PER_STEP)}
     found = classify_all(rows, {})
     assert {name: one.verdict for name, one in found.items()} == {
         "late": "used", "constant": "not used", "copied": "used",
     }  # fmt: skip
+    first = {row.category: row for row in image_swap_effects(outcomes_of(wired, names), SUITE)}
+    both = classify_all(first, {}, others=found)
+    assert {name: one.verdict for name, one in both.items()} == {
+        "late": "first chunk not used; episode used", "constant": "not used", "copied": "used",
+    }  # fmt: skip
+    assert both["copied"].sentence == "The answer is used in the first chunk and over the whole episode."
+    assert both["late"].sentence.startswith("The answer is not used in the first chunk: within")
+    assert both["late"].sentence.endswith("; it is used over the whole episode.")
 
 
 # -- place and copy ----------------------------------------------------------------------------------------------

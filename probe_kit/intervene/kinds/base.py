@@ -46,10 +46,6 @@ class CategoryVerdict(Protocol):
     def explanation(self) -> str:
         """What it rests on, or why there is none."""
 
-    @property
-    def is_of_first_chunk(self) -> bool:
-        """Whether later chunks may differ."""
-
 
 @dataclass(frozen=True)
 class Measurement:

@@ -17,6 +17,7 @@ from probe_kit.intervene.kinds.kind import Kind
 from probe_kit.intervene.kinds.reach import tiles_apart
 from probe_kit.intervene.kinds.registry import kind_of
 from probe_kit.intervene.results.places import stored_places
+from probe_kit.intervene.results.readouts import stored_other_readouts
 from probe_kit.intervene.results.ties import stored_ties
 from probe_kit.intervene.store.answers import ConditionOutcomes, StoredIntervention, find_stored
 from probe_kit.intervene.store.settings import PER_STEP
@@ -208,7 +209,8 @@ def verdicts_of(run: RunReader, shown: Sequence[ImageSwapEffect] = ()) -> dict[s
     except NoProbesError:
         results = None
     found = {**stored_image_swaps(run), **{row.category: row for row in shown}}
-    return classify_all(found, encoded_in(results), stored_places(run), stored_ties(run, results))
+    others = stored_other_readouts(run, found)
+    return classify_all(found, encoded_in(results), stored_places(run), stored_ties(run, results), others)
 
 
 def effects_csv(measurement: Measurement) -> str:

@@ -48,6 +48,11 @@ class StoredResult:
         ]
 
     @property
+    def readout(self) -> str:
+        """`first-chunk` or `per-step`."""
+        return str(self.stored.settings.get("readout", FIRST_CHUNK))
+
+    @property
     def rank(self) -> Rank:
         """The larger, the more it says: rightly read, then of more episodes."""
         return not self.wrong_readout, self.outcomes.episodes.size, self.own_readout
@@ -68,9 +73,13 @@ def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
     return sorted(every, key=lambda own: (order.get(own.category, len(order)), own.category, own.rank, own.made))
 
 
-def preferred_by_category(run: RunReader, kind: str) -> dict[str, StoredResult]:
-    """By category, of all that is stored of a kind the one that says most. Raises RunDamagedError."""
-    return {own.category: own for own in stored_results(run, kind)}
+def preferred_by_category(run: RunReader, kind: str, readout: str | None = None) -> dict[str, StoredResult]:
+    """By category, of all that is stored of a kind the one that says most. Raises RunDamagedError.
+
+    readout: of those alone; None for any.
+    """
+    found = stored_results(run, kind)
+    return {own.category: own for own in found if readout in (None, own.readout)}
 
 
 @dataclass(frozen=True)

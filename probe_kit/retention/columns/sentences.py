@@ -4,7 +4,6 @@ from typing import Literal
 
 from probe_kit.intervene.kinds.image_swap.verdict import UNTESTED, UseVerdict
 from probe_kit.intervene.kinds.image_swap.words import describe_swap
-from probe_kit.intervene.store.settings import FIRST_CHUNK
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.text import is_vlm, percent
 from probe_kit.retention.estimators.stream_scores import Limits
@@ -114,7 +113,7 @@ def conclusion(row: RetentionRow) -> str:
     if is_vlm(row):
         return "The VLM knows the answer." if knows(row) else "Not shown that the VLM knows the answer."
     use = row.image_swap.use
-    is_later = use is not None and use.is_bounded and use.readout == FIRST_CHUNK and knows(row)
+    is_later = use is not None and use.is_bounded and use.is_of_first_chunk and knows(row)
     parts = [_finding(row) if use is None else _used(row, use), _LATER * is_later]
     if not _is_probed(row):
         parts.append("The backbone was not probed: run `probe-kit train`.")

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from probe_kit.intervene.kinds.image_swap.verdict import OF_FIRST_CHUNK
+from probe_kit.intervene.kinds.image_swap.verdict import describe_readouts
 from probe_kit.retention.columns.sentences import describe_category, knows, verdict
 from probe_kit.retention.columns.text import (
     difference_interval,
@@ -133,8 +133,8 @@ def summary_table(
     shown = [at for at in range(len(headings)) if at == 0 or (at == 1 and (several or differences))]
     shown += [at for at in range(2, len(headings)) if any(line[at] not in ("–", "") for line in lines)]
     legend = [_LEGENDS[headings[at]] for at in shown if headings[at] in _LEGENDS]
-    uses = [one.row.image_swap.use for run in found for one in run.categories]
-    legend += [OF_FIRST_CHUNK.capitalize()] * any(use is not None and use.is_of_first_chunk for use in uses)
+    readouts = describe_readouts(one.row.image_swap.use for run in found for one in run.categories)
+    legend += [f"{readouts[0].upper()}{readouts[1:]}"] if readouts else []
     return TextTable(
         f"Summary: {' · '.join(dict.fromkeys(run.title for run in found))}",
         ". ".join([*legend, f"{MARK} above every control that was run"]),

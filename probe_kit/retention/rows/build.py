@@ -10,6 +10,7 @@ from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.kinds.image_swap.effects import stored_image_swaps
 from probe_kit.intervene.results.places import stored_places
+from probe_kit.intervene.results.readouts import stored_other_readouts
 from probe_kit.intervene.results.ties import stored_ties
 from probe_kit.retention.behaviour.success_rate import (
     SuccessRate,
@@ -87,6 +88,7 @@ def run_rows(
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
     judged, found = RunUnderRule.of(run, settings.rule, settings.last_steps), stored_image_swaps(run)
     places = stored_places(run) if found else {}
+    others = stored_other_readouts(run, found)
     ties = {view: stored_ties(run, results, view) if found else {} for view in shown}
     drawn = [
         _row(judged, results, settings, group, str(category), episodes, view)
@@ -94,7 +96,12 @@ def run_rows(
         for view in shown
     ]
     return [
-        replace(one, row=add_image_swap(one.row, found, places, ties[one.row.view].get(one.row.category, "")))
+        replace(
+            one,
+            row=add_image_swap(
+                one.row, found, places, ties[one.row.view].get(one.row.category, ""), others.get(one.row.category)
+            ),
+        )
         for one in drawn
     ]
 

@@ -8,25 +8,30 @@ from dataclasses import replace
 from math import isfinite
 
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
-from probe_kit.intervene.kinds.image_swap.verdict import Places, classify_use, control_for
+from probe_kit.intervene.kinds.image_swap.verdict import Places, UseVerdict, classify_use, control_for
 from probe_kit.retention.rows.parts import SwapEffect
 from probe_kit.retention.rows.row import RetentionRow
 
 
 def add_image_swap(
-    row: RetentionRow, found: Mapping[str, ImageSwapEffect], places: Mapping[str, Places], tie: str = ""
+    row: RetentionRow,
+    found: Mapping[str, ImageSwapEffect],
+    places: Mapping[str, Places],
+    tie: str = "",
+    other: UseVerdict | None = None,
 ) -> RetentionRow:
     """The row with the effect of the image swap on its category, judged by its own probes.
 
     found: by category; may be empty. places: by category, where it passes and is read. tie: of the row's category
-    and view, see `intervene.results.ties`.
+    and view, see `intervene.results.ties`. other: the behaviour by the other readout, see
+    `intervene.results.readouts`.
     """
     own = found.get(row.category)
     if own is None:
         return row
     encoded = row.backbone.has_signal if row.backbone.exceeds else None
     category, control = row.category, control_for(row.category, found)
-    use = classify_use(encoded, own, control, places.get(category), tie)
+    use = classify_use(encoded, own, control, places.get(category), tie, other)
     effect = SwapEffect(
         follow_rate=own.follow_rate,
         reversal_rate=own.reversal_rate,

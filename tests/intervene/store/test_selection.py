@@ -23,7 +23,7 @@ from probe_kit.intervene import (
 )
 from probe_kit.intervene.results.inventory import listed_interventions
 from probe_kit.intervene.results.places import stored_places
-from probe_kit.intervene.results.results import effects_of
+from probe_kit.intervene.results.results import effects_of, verdicts_of
 from probe_kit.intervene.results.site_maps import (
     stored_localised_sites,
     stored_site_effects,
@@ -250,8 +250,23 @@ def test_those_of_which_nothing_is_read_are_listed_so(run: ArrayRun) -> None:
     made_in(run, [*(name for name in POOL if name != "map"), "map"])
     names = {key_of(settings_of(run, name)): name for name in POOL}
     states = {names[one.key]: one.state for one in listed_interventions(run)}
-    others = {"follow, few", "follow, shadow", "map, few", "map, shadow", "steer, few", "attention, few"}
+    others = {"follow, few", "map, few", "map, shadow", "steer, few", "attention, few"}
     assert {name for name, state in states.items() if state == "other"} == {*others, "attention, a role"}
+
+
+def test_the_verdict_says_first_chunk_and_whole_episode_whichever_is_asked_for(run: ArrayRun) -> None:
+    """Color follows in the first chunk; the stored episodes along which each step was evaluated do not move."""
+    for name, readout in (("image-swap", "first-chunk"), ("follow, shadow", "per-step")):
+        key = key_of(settings_of(run, name))
+        shown = effects_of(run, StoredIntervention(read_bundles(run.location, INTERVENTIONS)[key]))
+        found = shown.verdicts["color"]
+        assert (found.readout, shown.effects[0].readout) == (readout, readout)
+        assert found.verdict == "first chunk used; episode inconclusive"
+        assert found.sentence.startswith(
+            "The answer is used in the first chunk; whether it is used over the whole episode remains open: "
+        )
+        assert f'"verdict": "{found.verdict}"' in shown.to_json()
+    assert verdicts_of(run)["shape"].sentence.startswith("The answer is not used in the first chunk: ")
 
 
 def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun) -> None:

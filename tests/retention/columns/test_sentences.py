@@ -155,7 +155,9 @@ def test_use_is_concluded_from_a_swap_and_knowledge_never_beside_an_interval_tha
     for rate_, backbone, _, swapped, row in ALL:
         text = conclusion(row)
         assert ("The answer is used" in text) == (swapped in ("follows", "reverses")), text
-        assert ("The answer is used, against the correct picture" in text) == (swapped == "reverses"), text
+        assert ("The answer is used in the first chunk, against the correct picture" in text) == (
+            swapped == "reverses"
+        ), text
         if "The policy acts on the answer" in text:
             assert (rate_, swapped) == ("knowledge", "no swap"), text
         assert "probes did not find it" not in text or backbone != "not probed", text
@@ -196,8 +198,8 @@ def test_absence_is_said_of_a_bounded_backbone_only_and_more_items_are_asked_for
             ("knowledge", "shown", "shown", "follows"),
             "(24 items): the backbone holds the answer (98 %, 88 to 100); so does the action expert (98 %, 88 to "
             "100); the action follows a swap of the pictures in 92 % of episodes (net of reversals 60 to 100 %), "
-            "and the cube ends on the correct picture in 94 %, 84 to 100. The answer is used; whether the "
-            "readable copy is the one used was not tested.",
+            "and the cube ends on the correct picture in 94 %, 84 to 100. The answer is used in the first chunk; "
+            "whether the readable copy is the one used was not tested.",
         ),
         (
             ("guessing", "shown", "absent", "does not follow"),
@@ -272,22 +274,24 @@ none | not probed | no swap | not shown
 The backbone was not probed: run `probe-kit train`.
 
 guessing | shown | follows | used
-The answer is used; whether the readable copy is the one used was not tested.
+The answer is used in the first chunk; whether the readable copy is the one used was not tested.
 
 knowledge | absent | follows | used
-The answer is used; no readable copy found.
+The answer is used in the first chunk; no readable copy found.
 
 knowledge | not probed | follows | used
-The answer is used. The backbone was not probed: run `probe-kit train`.
+The answer is used in the first chunk. The backbone was not probed: run `probe-kit train`.
 
 wrong | shown | reverses | against: used
-The answer is used, against the correct picture; whether the readable copy is the one used was not tested.
+The answer is used in the first chunk, against the correct picture; whether the readable copy is the one
+used was not tested.
 
 wrong | at chance | reverses | against: used
-The answer is used, against the correct picture; no readable copy found.
+The answer is used in the first chunk, against the correct picture; no readable copy found.
 
 wrong | not probed | reverses | against: used
-The answer is used, against the correct picture. The backbone was not probed: run `probe-kit train`.
+The answer is used in the first chunk, against the correct picture. The backbone was not probed: run
+`probe-kit train`.
 
 guessing | shown | does not follow | not used
 The answer is not used in the first chunk: within 0.1 of its reach and 0.25 of the episodes (moved by 0.02
@@ -314,8 +318,8 @@ The answer is not used in the first chunk: within 0.1 of its reach and 0.25 of t
 probed: run `probe-kit train`.
 
 guessing | shown | open | inconclusive
-Whether the answer is used remains open: moved by 0.10 [-0.10, 0.30] of its reach, net follow rate 0.10 [-0.10,
-0.42].
+Whether the answer is used in the first chunk remains open: moved by 0.10 [-0.10, 0.30] of its reach, net follow
+rate 0.10 [-0.10, 0.42].
 
 guessing | shown | one side | partly used, one-sided (left)
 The answer is partly used, one-sided (left) in the first chunk; whether the readable copy is the one used was
@@ -343,16 +347,19 @@ def test_each_verdict_has_its_conclusion(rate_: str, backbone: str, swapped: str
 
 def test_an_open_verdict_says_what_is_missing_where_items_are_not() -> None:
     alone = conclusion(combination("guessing", "shown", "shown", "does not follow", control=False))
-    assert alone.startswith("Whether the answer is used remains open: within 0.1 of its reach")
+    assert alone.startswith("Whether the answer is used in the first chunk remains open: within 0.1 of its reach")
     assert alone.endswith("no other category of the run is used, so that use is not known to show.")
 
 
 def test_the_place_is_named_behind_the_behaviour() -> None:
     tie = "whether the readable copy is the one used was not tested."
     nowhere = combination("knowledge", "shown", "shown", "follows", located=())
-    assert conclusion(nowhere) == f"The answer is used; no place that was tried carries half of it; {tie}"
+    assert (
+        conclusion(nowhere)
+        == f"The answer is used in the first chunk; no place that was tried carries half of it; {tie}"
+    )
     somewhere = combination("knowledge", "shown", "shown", "follows", located=("backbone.02",))
-    assert conclusion(somewhere) == f"The answer is used; passes at backbone.02; {tie}"
+    assert conclusion(somewhere) == f"The answer is used in the first chunk; passes at backbone.02; {tie}"
 
 
 def test_without_trajectories_nothing_is_said_of_acting_and_a_stored_swap_is() -> None:

@@ -1,5 +1,6 @@
 """The summary: one table, and a sentence per category, from one definition for every format."""
 
+import json
 from dataclasses import replace
 from typing import Any
 
@@ -120,6 +121,45 @@ def test_the_terminal_shows_one_table_at_any_width_and_ends_on_the_sentences(wid
     assert text.count("category") == 1, "one header: one table, and it is not split"
     assert ("[40, 100]" in text.split("Color (24")[0]) == (width >= 120)
     assert " ".join(text.split()).endswith("The answer is not used in the first chunk: by the swap.")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "readouts", "said", "legend"),
+    [
+        ("used", None, "first-chunk", "used in the first chunk", "of the first chunk; --readout per-step gives"),
+        ("used", None, "per-step", "used over the whole episode", "of the whole episode"),
+        (
+            "not used",
+            "used",
+            "first-chunk",
+            "chunk: by the swap; it is used over the whole episode",
+            "of the first",
+        ),
+        ("used", "not used", "per-step", "chunk: by the swap; it is used over the whole episode", "of the first"),
+        ("used", "used", "first-chunk", "used in the first chunk and over the whole episode", "and of the whole"),
+    ],
+)
+def test_terminal_markdown_and_json_say_the_same_of_first_chunk_and_whole_episode(
+    first: Behaviour, second: Behaviour | None, readouts: str, said: str, legend: str
+) -> None:
+    """first: of the verdict's own readout, second: of the other one."""
+    other = {"first-chunk": "per-step", "per-step": "first-chunk"}[readouts]
+    further = None if second is None else UseVerdict(behaviour=second, reason="by the swap", readout=other)
+    use = UseVerdict(behaviour=first, reason="by the swap", readout=readouts, other=further)
+    color = acts("color", 1.0, "used")
+    rows = [replace(color, image_swap=replace(color.image_swap, use=use))]
+    table = RetentionTable(rows, [acts(MEAN, 1.0, None)])
+    differ = second not in (None, first)
+    verdict = "first chunk not used; episode used" if differ else "used"
+    with (console := Console(width=200)).capture() as printed:
+        console.print(table.to_rich())
+    text, (stored, _) = " ".join(printed.get().split()), json.loads(table.to_json())
+    assert stored["verdict"] == verdict
+    assert said in stored["conclusion"]
+    for shown in (text, " ".join(table.to_markdown().split())):
+        assert verdict in shown
+        assert stored["conclusion"] in shown
+        assert legend in shown
 
 
 def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:

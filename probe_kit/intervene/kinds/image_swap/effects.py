@@ -1,11 +1,12 @@
 """What image swaps did, per category. Reads stored outcomes; needs no model."""
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.intervene.kinds.base import Measurement
 from probe_kit.intervene.kinds.reach import REACHED, TILES_APART, Reach, tiles_apart
 from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, ConditionOutcomes
@@ -144,21 +145,21 @@ def net_interval(net: NDArray[np.float64], outcomes: ConditionOutcomes, suite: s
     return float(low[0]), float(high[0])
 
 
-def stored_image_swaps(run: RunReader) -> dict[str, ImageSwapEffect]:
+def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, ImageSwapEffect]:
     """By category, what the image swaps did that are stored for the episodes the run has now.
 
-    Of several the preferred one, see `store.selection`; empty if there is none. Raises RunDamagedError if any
-    stored intervention was changed.
+    readout: of those alone; None for any. Of several the preferred one, see `store.selection`; empty if there is
+    none. Raises RunDamagedError if any stored intervention was changed.
     """
-    preferred = preferred_by_category(run, NAME)
+    preferred = preferred_by_category(run, NAME, readout)
     apart, rows = tiles_apart(run), dict[str, dict[str, ImageSwapEffect]]()
     for stored in {result.stored.key: result.stored for result in preferred.values()}.values():
-        readout = str(stored.settings.get("readout", FIRST_CHUNK))
-        found = image_swap_effects(stored.outcomes(), run.suite, stored.key, readout, apart)
+        own = str(stored.settings.get("readout", FIRST_CHUNK))
+        found = image_swap_effects(stored.outcomes(), run.suite, stored.key, own, apart)
         rows[stored.key] = {row.category: row for row in found}
     return {category: rows[result.stored.key][category] for category, result in preferred.items()}
 
 
 def image_swaps_in_use(run: RunReader) -> set[str]:
-    """Keys of the stored image swaps that verdicts and tables read. Raises RunDamagedError."""
-    return {row.key for row in stored_image_swaps(run).values()}
+    """Keys of the stored image swaps that verdicts and tables read, of either readout. Raises RunDamagedError."""
+    return {row.key for readout in get_args(Readout) for row in stored_image_swaps(run, readout).values()}

@@ -5,7 +5,11 @@ from typing import TYPE_CHECKING
 
 from probe_kit.intervene.kinds.base import TableContext
 from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST, ImageSwapEffect
-from probe_kit.intervene.kinds.image_swap.verdict import OF_FIRST_CHUNK, SMALLEST_SHARE_OF_INTEREST
+from probe_kit.intervene.kinds.image_swap.verdict import (
+    SMALLEST_SHARE_OF_INTEREST,
+    UseVerdict,
+    describe_readouts,
+)
 
 if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
@@ -30,11 +34,12 @@ def image_swap_table(rows: Sequence[ImageSwapEffect], context: TableContext) -> 
     verdicts = context.verdicts
     reasons = dict.fromkeys(f"{name}: {one.explanation}" for name, one in verdicts.items() if one.explanation)
     reaches = dict.fromkeys(_REACH[row.reach_source].format(100 * row.reach) for row in rows)
-    partial = [OF_FIRST_CHUNK] * any(verdicts[name].is_of_first_chunk for name in verdicts)
+    shown = (verdicts.get(row.category) for row in rows)
+    readouts = describe_readouts(use for use in shown if isinstance(use, UseVerdict))
     said = [verdicts[row.category].verdict if row.category in verdicts else "–" for row in rows]
     return ResponsiveTable(
         title=f"Is it used? {context.subject}, images swapped",
-        caption="; ".join([_LEGEND, *partial, *reaches, *(reasons if context.explains else ())]),
+        caption="; ".join(filter(None, [_LEGEND, readouts, *reaches, *(reasons if context.explains else ())])),
         name="category",
         names=tuple(row.category for row in rows),
         styles=("",) * len(rows),

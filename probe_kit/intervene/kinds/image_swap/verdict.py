@@ -4,7 +4,7 @@
 the place (of interchanges) and the tie (is what probes read the thing that is used?).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from math import inf
@@ -15,7 +15,7 @@ import numpy as np
 
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST, ImageSwapEffect
-from probe_kit.intervene.store.settings import FIRST_CHUNK
+from probe_kit.intervene.store.settings import FIRST_CHUNK, PER_STEP
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite.items import Side
@@ -43,7 +43,9 @@ TRACE = 0.01
 """Of the reach. A displacement below it is not worth a sentence."""
 NO_COPY, NOT_TESTED = "no readable copy found", "whether the readable copy is the one used was not tested"
 NOT_LOCATED = "no place that was tried carries half of it"
-OF_FIRST_CHUNK = "verdicts other than used are of the first chunk; --readout per-step gives those of the episode"
+_READOUTS: Mapping[str, str] = MappingProxyType(
+    {FIRST_CHUNK: "in the first chunk", PER_STEP: "over the whole episode"}
+)
 UNTESTED = "whether it is used was not tested"
 """What is said without an image swap."""
 
@@ -55,8 +57,9 @@ class UseVerdict:
     behaviour: of the image swap. reason: the numbers it rests on, or why there is none. reversed: the same, away
     from the correct picture. side: of a behaviour that is one-sided. place: where interchanges found that the
     answer passes or is read; empty if none was stored. tie: between the readable copy and the behaviour; empty
-    without probes. readout: `first-chunk` or `per-step`. lacks_control: whether *not used* is missing nothing but
-    another category of the run that is used.
+    without probes. readout: `first-chunk` or `per-step`, of all of these. lacks_control: whether *not used* is
+    missing nothing but another category of the run that is used. other: the behaviour by the other readout; None
+    if that is not stored.
     """
 
     behaviour: Behaviour
@@ -67,44 +70,97 @@ class UseVerdict:
     tie: str = ""
     readout: str = FIRST_CHUNK
     lacks_control: bool = False
+    other: "UseVerdict | None" = None
 
     @property
     def is_used(self) -> bool:
-        """Whether it decides something, wholly or in part, toward the correct picture or away from it."""
-        return self.behaviour in USES
+        """Whether it decides something, wholly or in part, toward the correct picture or away from it.
+
+        By either readout: what is used in the first chunk is used, and so is what is used later.
+        """
+        return any(one.behaviour in USES for one in self.by_readout)
+
+    @property
+    def by_readout(self) -> "tuple[UseVerdict, ...]":
+        """This one, and the one of the other readout if that is stored; the first chunk comes first."""
+        found = (self,) if self.other is None else (self, self.other)
+        return tuple(sorted(found, key=lambda one: one.readout != FIRST_CHUNK))
 
     @property
     def verdict(self) -> str:
-        """The behaviour, its direction and its side."""
+        """The behaviour, its direction and its side; of both readouts where they differ."""
+        first, *second = self.by_readout
+        if not second or first.own_verdict == second[0].own_verdict:
+            return first.own_verdict
+        return f"first chunk {first.own_verdict}; episode {second[0].own_verdict}"
+
+    @property
+    def own_verdict(self) -> str:
+        """The same of its own readout alone."""
         return f"{'against: ' * self.reversed}{self.behaviour}{f' ({self.side})' if self.side else ''}"
 
     @property
     def is_of_first_chunk(self) -> bool:
-        """Whether later chunks may differ: what is used in the first one is used, anything less may be more."""
-        return self.readout == FIRST_CHUNK and self.behaviour not in ("used", "inconclusive")
+        """Whether nothing is known of later chunks."""
+        return self.readout == FIRST_CHUNK and self.other is None
 
     @property
     def is_bounded(self) -> bool:
-        """Whether both intervals exclude a use that would matter."""
-        return self.behaviour == "not used" or self.lacks_control
+        """Whether the intervals of every stored readout exclude a use that would matter."""
+        return all(one.behaviour == "not used" or one.lacks_control for one in self.by_readout)
 
     @property
     def explanation(self) -> str:
         """Reason, place and tie."""
-        return "; ".join(filter(None, (self.reason, self.place, self.tie)))
+        first, *second = self.by_readout
+        reasons = [first.reason, *(f"over the whole episode: {one.reason}" for one in second)]
+        return "; ".join(filter(None, (*reasons, self.place, self.tie)))
 
     @property
     def sentence(self) -> str:
-        """Behaviour, place and tie; with the reason where it is not used."""
-        readout = " in the first chunk" * self.is_of_first_chunk
+        """Behaviour by every stored readout, place and tie; with the reason where it is not used."""
+        first, *second = self.by_readout
+        if second and first.own_verdict == second[0].own_verdict:
+            both = " and ".join(_READOUTS[one.readout] for one in (first, *second))
+            said = [
+                first.clause("the answer", both),
+                *(f"episode: {one.reason}" for one in second if one.needs_reason),
+            ]
+        else:
+            said = [first.clause("the answer"), *(one.clause("it") for one in second)]
+        found = "; ".join(filter(None, (*said, self.place, self.tie)))
+        return f"{found[0].upper()}{found[1:]}."
+
+    @property
+    def needs_reason(self) -> bool:
+        """Whether a reader asks for its numbers: of what is not used by its own readout."""
+        return self.behaviour not in USES
+
+    def clause(self, answer: str, readout: str = "") -> str:
+        """The behaviour by its own readout, with the reason where it is not used.
+
+        answer: how the answer is called. readout: in words; empty for its own.
+        """
+        when = readout or _READOUTS[self.readout]
         against = ", against the correct picture" * self.reversed
         side = f" ({self.side})" if self.side else ""
         words = {
-            "inconclusive": "Whether the answer is used remains open",
-            "moves with it, does not decide": f"The answer moves the action{readout}{against}, does not decide",
-        }.get(self.behaviour, f"The answer is {self.behaviour}{side}{readout}{against}")
-        reason = "" if self.is_used else f": {self.reason}"
-        return "; ".join(filter(None, (f"{words}{reason}", self.place, self.tie))) + "."
+            "inconclusive": f"whether {answer} is used {when} remains open",
+            "moves with it, does not decide": f"{answer} moves the action {when}{against}, does not decide",
+        }.get(self.behaviour, f"{answer} is {self.behaviour}{side} {when}{against}")
+        return f"{words}: {self.reason}" if self.needs_reason else words
+
+
+def describe_readouts(uses: Iterable[UseVerdict | None]) -> str:
+    """Of which readouts verdicts are, for a legend; empty without a verdict."""
+    stored = {one.readout for use in uses if use is not None for one in use.by_readout}
+    if not stored:
+        return ""
+    if len(stored) == 2:
+        return "verdicts are of the first chunk and of the whole episode, and the sentence says of which"
+    if PER_STEP in stored:
+        return "verdicts are of the whole episode"
+    return "verdicts are of the first chunk; --readout per-step gives those of the whole episode"
 
 
 # -- behaviour -------------------------------------------------------------------------------------------------
@@ -269,15 +325,17 @@ def classify_use(
     control: str | None,
     places: Places | None = None,
     tie: str = "",
+    other: UseVerdict | None = None,
 ) -> UseVerdict:
     """The verdict of the image swap, with what probes and interventions inside the network say of it.
 
     encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
     without probes. control: see `classify_behaviour`. places: None if nothing was tried inside. tie: see
-    `results.ties.describe_tie`; empty if it was not tested.
+    `results.ties.describe_tie`; empty if it was not tested. other: the behaviour by the other readout, see
+    `results.readouts`; None if that is not stored.
     """
-    own = classify_behaviour(found, control)
-    if own.behaviour in ("not used", "inconclusive"):
+    own = replace(classify_behaviour(found, control), other=other)
+    if all(one.behaviour in ("not used", "inconclusive") for one in own.by_readout):
         return own
     said = "" if encoded is None else (tie or NOT_TESTED) if encoded else NO_COPY
     return replace(own, place=str(places or ""), tie=said)
@@ -307,13 +365,22 @@ def classify_all(
     encoded: Mapping[str, bool | None],
     places: Mapping[str, Places] = MappingProxyType({}),
     ties: Mapping[str, str] = MappingProxyType({}),
+    others: Mapping[str, UseVerdict] = MappingProxyType({}),
 ) -> dict[str, UseVerdict]:
     """Of every category that was intervened on.
 
-    encoded, places, ties: by category; one that is not there was not probed, or not looked for inside.
+    encoded, places, ties, others: by category; one that is not there was not probed, not looked for inside, or
+    measured by one readout alone.
     """
     return {
-        name: classify_use(encoded.get(name), one, control_for(name, found), places.get(name), ties.get(name, ""))
+        name: classify_use(
+            encoded.get(name),
+            one,
+            control_for(name, found),
+            places.get(name),
+            ties.get(name, ""),
+            others.get(name),
+        )
         for name, one in found.items()
     }
 

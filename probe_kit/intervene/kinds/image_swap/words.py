@@ -1,6 +1,7 @@
 """What a swap of the images or of the instruction showed, in sentences."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 from probe_kit.intervene.kinds.base import TableContext
@@ -30,7 +31,11 @@ class Swapped(Protocol):
 
 
 def describe_swap(swap: Swapped, use: UseVerdict) -> str:
-    """What a swap of the pictures does to the action, with the numbers that the verdict's sentence lacks."""
+    """What a swap of the pictures does to the action, with the numbers that the verdict's sentence lacks.
+
+    Numbers and words are of the verdict's own readout.
+    """
+    use = replace(use, other=None)
     low, high = (_percent(limit) for limit in swap.net_follow_rate_ci or (None, None))
     followed, net = f"in {_percent(swap.follow_rate)} % of episodes", f"net of reversals {low} to {high} %"
     moved = "" if swap.reach_share is None else f", moved by {swap.reach_share:.2f} of its reach"
