@@ -112,7 +112,8 @@ class StoredStream:
     @classmethod
     def of(cls, stream: Stream, tokens: int, views: tuple[str, ...]) -> "StoredStream":
         """A declared stream, stored."""
-        return cls(**{**asdict(stream), "tokens": tokens, "views": views})
+        stored = {name: value for name, value in asdict(stream).items() if name in _STREAM_PARTS}
+        return cls(**{**stored, "tokens": tokens, "views": views})
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "StoredStream":

@@ -15,11 +15,15 @@ from probe_kit.hooks.registry import known_families, load_model, load_policy
 if TYPE_CHECKING:
     from probe_kit.hooks.capturing.activation_cache import ActivationCache
     from probe_kit.hooks.capturing.attention import AttentionMass, capture_attention
+    from probe_kit.hooks.capturing.attention_patterns import attended_roles, capture_patterns
     from probe_kit.hooks.capturing.capture_context import capture, edit
     from probe_kit.hooks.capturing.edit_engine import apply_edits
+    from probe_kit.hooks.capturing.head_outputs import project_heads
+    from probe_kit.hooks.capturing.logit_lens import LogitLens, logit_lens
     from probe_kit.hooks.checkpoints.weights import load_weights, read_weights
     from probe_kit.hooks.contract.model import AnswerModel, Model, Policy, Prompt, Reading, Rows, Tap
     from probe_kit.hooks.contract.roles import Roles, pool
+    from probe_kit.hooks.contract.unembedding import Unembedding
 
 __all__ = [
     "ActivationCache",
@@ -28,6 +32,7 @@ __all__ = [
     "Edit",
     "Family",
     "Interventions",
+    "LogitLens",
     "Model",
     "ModelCard",
     "Observation",
@@ -40,15 +45,20 @@ __all__ = [
     "Site",
     "Stream",
     "Tap",
+    "Unembedding",
     "apply_edits",
+    "attended_roles",
     "capture",
     "capture_attention",
+    "capture_patterns",
     "edit",
     "known_families",
     "load_model",
     "load_policy",
     "load_weights",
+    "logit_lens",
     "pool",
+    "project_heads",
     "read_weights",
 ]
 
@@ -60,6 +70,12 @@ __getattr__, __dir__ = lazy_names(
         "load_weights": "checkpoints.weights",
         "capture_attention": "capturing.attention",
         "AttentionMass": "capturing.attention",
+        "capture_patterns": "capturing.attention_patterns",
+        "attended_roles": "capturing.attention_patterns",
+        "project_heads": "capturing.head_outputs",
+        "logit_lens": "capturing.logit_lens",
+        "LogitLens": "capturing.logit_lens",
+        "Unembedding": "contract.unembedding",
         "Model": "contract.model",
         "Policy": "contract.model",
         "Prompt": "contract.model",

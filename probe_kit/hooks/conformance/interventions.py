@@ -55,7 +55,7 @@ def policy_and_family_declare_the_same(subject: PolicySubject) -> None:
 def rewriting_every_site_with_itself_changes_no_action_bit_for_bit(subject: PolicySubject) -> None:
     policy = subject.policy
     streams = [*policy.streams.values(), *([] if policy.prompt_kv is None else [policy.prompt_kv])]
-    sites = [site for own in streams for quantity in own.quantities for site in own.sites(quantity)]
+    sites = [site for own in streams for quantity in own.captured for site in own.sites(quantity)]
     plain = subject.run(subject.one)
     with edit(policy, {site: lambda activation: activation for site in sites}):
         same = subject.run(subject.one)
@@ -71,7 +71,7 @@ def what_is_rewritten_in_a_block_is_read_behind_it(subject: PolicySubject) -> No
     for stream in policy.streams.values():
         behind = [site for site in stream.sites() if site.layer == 1]
         plain = _captured(subject, subject.one, behind)
-        for quantity in set(stream.quantities) - {"final_norm"}:
+        for quantity in set(stream.captured) - {"final_norm"}:
             written = [site for site in stream.sites(quantity) if site.layer == 0]
             with edit(policy, dict.fromkeys(written, torch.zeros_like)):
                 changed = _captured(subject, subject.one, behind)

@@ -54,7 +54,7 @@ def sites_are_complete_ordered_and_without_doubles(subject: Subject) -> None:
 )
 def every_site_of_every_quantity_fires_as_often_as_promised(subject: Subject) -> None:
     for stream in subject.model.every_stream().values():
-        for quantity in stream.quantities:
+        for quantity in stream.captured:
             sites = stream.sites(quantity)
             with capture(subject.model, sites) as tape:
                 subject.run(subject.seen)

@@ -18,6 +18,7 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream, first_of
 from probe_kit.hooks.contract.summary import model_html, model_text
+from probe_kit.hooks.contract.unembedding import Unembedding
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,11 @@ class Model(ABC):
     def tap(self, site: Site) -> Tap:
         """Where `site` is read and written. Raises UnknownSiteError."""
 
+    @property
+    def unembedding(self) -> Unembedding | None:
+        """How its last residuals become tokens, for a logit lens; None for a model that puts out no tokens."""
+        return None
+
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]] | None:
         """Per instruction, the ids that reach the network as its prompt; None if the model cannot say."""
         del instructions
@@ -136,7 +142,7 @@ class Model(ABC):
 
     def sites(self, quantity: str = "residual") -> list[Site]:
         """All sites of one quantity in the stored streams that have it, stream by stream."""
-        having = [stream for stream in self.streams.values() if quantity in stream.quantities]
+        having = [stream for stream in self.streams.values() if quantity in stream.captured]
         if not having:
             raise UnknownSiteError(f"no stream of {self.card.family} has a quantity {quantity!r}")
         return [site for stream in having for site in stream.sites(quantity)]
@@ -176,7 +182,7 @@ class Model(ABC):
             there = "; ".join(
                 f"{own.name}: {own.layers} layers"
                 + (f" x {own.iterations} iterations" if own.iterations else "")
-                + f" of {', '.join(own.quantities)}"
+                + f" of {', '.join(own.captured)}"
                 for own in self.every_stream().values()
             )
             raise UnknownSiteError(f"{self.card.family} has no site {site}; it has {there}")

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 from probe_kit.errors import UnknownSiteError, UsageError
@@ -17,6 +17,11 @@ KV = ("keys", "values")
 Keys are those after rotation.
 """
 KV_STREAM = "kv"
+HEADS = "heads"
+"""What every attention head of a block read, heads side by side: the input of the block's output projection.
+
+(B, T, heads times size of a head), of streams that declare `Stream.heads`. No run stores it.
+"""
 
 _PATTERN = re.compile(
     r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\d{2,})\.(?P<quantity>[a-z_]+)(@(?P<iteration>\d+))?"
@@ -40,7 +45,8 @@ class Site:
     stream: a stream of the model, such as `backbone` (VLM) or `expert` (action part); see `Stream.part`.
     layer, quantity: `residual` is the stream *entering* block `layer`; 0 is the embeddings, the last one enters
     the final norm. `attention` and `mlp` are what block `layer` adds to it, as it is added: behind a norm, gate or
-    scale, where the family has one. `final_norm` is its normed end. A family may declare further quantities.
+    scale, where the family has one. `final_norm` is its normed end. `heads` is what the block's attention heads
+    read, see `HEADS`. A family may declare further quantities.
     iteration: flow-matching step, counted from 0 (pure noise); for action tokens, the token; the camera, for
     `vision` with several of them; None where the stream runs once.
     """
@@ -83,6 +89,7 @@ class Stream:
     probed: whether peaks, retention and default probes use it; False for the unconditional half of guidance.
     sums: whether residual + attention + mlp make the next residual; False where something else enters between
     blocks, such as DeepStack's pictures.
+    heads: attention heads of every block, where the family taps the quantity `heads`; 0 where it does not.
     Raises UsageError for an unknown part, or none where the name does not tell it.
     """
 
@@ -95,6 +102,7 @@ class Stream:
     quantities: tuple[str, ...] = QUANTITIES
     probed: bool = True
     sums: bool = True
+    heads: int = field(default=0, compare=False)  # stored and declared streams do not say it
 
     def __post_init__(self) -> None:
         part = self.part or _KNOWN_PARTS.get(self.name)
@@ -106,15 +114,20 @@ class Stream:
         object.__setattr__(self, "part", part)
         object.__setattr__(self, "label", self.label or label_of(self.name))
 
+    @property
+    def captured(self) -> tuple[str, ...]:
+        """Every quantity that can be captured: `quantities`, and `heads` where heads are declared."""
+        return (*self.quantities, HEADS) if self.heads else self.quantities
+
     def sites(self, quantity: str = "residual") -> list[Site]:
         """All sites of one quantity, ordered by iteration, then layer.
 
         `final_norm` exists once, behind the last block; `residual` per layer; every other quantity per block.
         Raises UnknownSiteError for a quantity that this stream does not have.
         """
-        if quantity not in self.quantities:
+        if quantity not in self.captured:
             raise UnknownSiteError(
-                f"the stream {self.name} has no quantity {quantity!r}; it has {', '.join(self.quantities)}"
+                f"the stream {self.name} has no quantity {quantity!r}; it has {', '.join(self.captured)}"
             )
         return [
             Site(self.name, layer, quantity, step) for step in self._steps for layer in self._layers_of(quantity)
@@ -122,7 +135,7 @@ class Stream:
 
     def holds(self, site: Site) -> bool:
         """Whether `site` is one of its `sites`; none are listed for it, as it is asked at every edit."""
-        named = site.stream == self.name and site.quantity in self.quantities
+        named = site.stream == self.name and site.quantity in self.captured
         return named and site.iteration in self._steps and site.layer in self._layers_of(site.quantity)
 
     @property

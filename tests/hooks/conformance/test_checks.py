@@ -24,6 +24,7 @@ from probe_kit.hooks.conformance.check import CheckFailedError, SkipTest, check,
 from probe_kit.hooks.conformance.contract import ANSWER_CHECKS, POLICY_CHECKS
 from probe_kit.hooks.conformance.examples import examples_for
 from probe_kit.hooks.conformance.subject import AnswerSubject, ContractSettings, PolicySubject, Subject
+from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.testing import AdapterContract, AnswerModelContract
 from tests.support.encoder_vla.policy import STEPS, WIDTH, EncoderPolicy, EncoderVLA, load, write_checkpoint
 from tests.support.position_models import PositionModel, always, likes
@@ -195,6 +196,64 @@ def test_a_policy_that_breaks_a_promise_fails_its_check(
     with pytest.raises((CheckFailedError, probe_kit.ProbeKitError), match=re.escape(said)) as failed:
         CHECKS[name](bad)
     assert isinstance(failed.value, probe_kit.ProbeKitError) or "; change: " in str(failed.value)
+
+
+class Tapping(Pi0):
+    """Taps heads where the MLP begins."""
+
+    def tap(self, site: Site) -> Tap:
+        tap = super().tap(site)
+        if site.quantity != "heads":
+            return tap
+        return dataclasses.replace(tap, module=super().tap(dataclasses.replace(site, quantity="mlp")).module)
+
+
+class Taking(EncoderPolicy):
+    """Takes heads that it does not declare for what attention adds."""
+
+    def tap(self, site: Site) -> Tap:
+        return super().tap(dataclasses.replace(site, quantity=site.quantity.replace("heads", "attention")))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("heads_make_what_the_output_projection_adds", "are off by"),
+        ("attention_patterns_are_the_models_own", "does not give what its heads read"),
+    ],
+)
+def test_a_policy_that_taps_other_heads_fails_its_checks(
+    name: str, said: str, pi0_tiny: Pi0, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    subject = PolicySubject(ContractSettings(), Given(pi0_tiny, tmp_path, tmp_path))
+    CHECKS[name](subject)
+    monkeypatch.setattr(pi0_tiny, "__class__", Tapping)
+    with pytest.raises((CheckFailedError, probe_kit.ProbeKitError), match=said):
+        CHECKS[name](subject)
+
+
+def test_heads_that_are_not_declared_and_not_refused_fail_their_check(
+    sound: EncoderPolicy, checkpoint: Path, tmp_path: Path
+) -> None:
+    own = CHECKS["heads_that_are_not_declared_are_refused_by_name"]
+    own(PolicySubject(ContractSettings(), Given(sound, checkpoint, tmp_path)))
+    bad = PolicySubject(ContractSettings(), Given(Taking(sound.network, sound.card), checkpoint, tmp_path))
+    with pytest.raises(CheckFailedError, match=r"tap\(backbone\.00\.heads\): no error"):
+        own(bad)
+
+
+def test_a_model_whose_lens_leaves_the_norm_out_fails_its_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, vlm = CHECKS["the_last_row_of_the_logit_lens_is_the_output"], registry.load_model("vlm-tiny")
+    subject = AnswerSubject(ContractSettings(), Given(vlm, tmp_path, tmp_path))
+    own(subject)
+    right = vlm.unembedding
+    assert right is not None
+    broken = dataclasses.replace(right, norm=torch.nn.Identity())
+    monkeypatch.setattr(type(vlm), "unembedding", property(lambda _: broken))
+    with pytest.raises(CheckFailedError, match=r"logits of the last layer of answer differ .*; change: Correct"):
+        own(subject)
 
 
 # -- loading ---------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 import pytest
 
 from probe_kit.errors import UnknownSiteError
+from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hooks.contract.sites import Site, Stream
 
 
@@ -40,3 +41,15 @@ def test_a_stream_lists_its_sites_by_iteration_then_layer() -> None:
         "backbone.00.residual",
         "backbone.01.residual",
     ]
+
+
+def test_heads_are_a_quantity_of_every_block_that_is_captured_and_stored_nowhere() -> None:
+    plain = Stream("backbone", layers=3, width=8)
+    stream = Stream("backbone", layers=3, width=8, heads=2)
+    assert [str(site) for site in stream.sites("heads")] == ["backbone.00.heads", "backbone.01.heads"]
+    assert stream.captured == (*plain.captured, "heads")
+    assert stream == plain
+    assert StoredStream.of(stream, 5, ("mean",)) == StoredStream.of(plain, 5, ("mean",))
+    assert "heads" not in str(StoredStream.of(stream, 5, ("mean",)).to_json())
+    with pytest.raises(UnknownSiteError, match="the stream backbone has no quantity 'heads'"):
+        plain.sites("heads")

@@ -23,7 +23,7 @@ from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Rows, Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.families.internvla import INTERVENTIONS
 from probe_kit.hooks.families.internvla.checkpoint import Parts, find_parts
 from probe_kit.hooks.families.internvla.units import ActionUnits
@@ -90,13 +90,20 @@ class InternVLA(QwenVLA):
         streams = [
             self.backbone_stream(),
             Stream("bridge", query.last - query.first + 1, query.width, part="bridge", quantities=_BLOCK),
-            Stream("expert", head.blocks + 1, head.width, steps, part="action"),
+            Stream("expert", head.blocks + 1, head.width, steps, part="action", heads=head.heads),
         ]
         if guided(self.guidance):
             label = "action expert without condition"
             streams.append(
                 Stream(
-                    _UNCONDITIONAL, head.blocks + 1, head.width, steps, part="action", label=label, probed=False
+                    _UNCONDITIONAL,
+                    head.blocks + 1,
+                    head.width,
+                    steps,
+                    part="action",
+                    label=label,
+                    probed=False,
+                    heads=head.heads,
                 )
             )
         return {stream.name: stream for stream in streams}
@@ -252,6 +259,8 @@ class InternVLA(QwenVLA):
         block: Any = head.blocks[site.layer]
         if site.quantity == "residual":
             return Tap(block.norm1, steps, rows=rows)
+        if site.quantity == HEADS:
+            return Tap(block.attn.proj, steps, rows=rows)
         return Tap(block.attn if site.quantity == "attention" else block.mlp, steps, "output", rows=rows)
 
 

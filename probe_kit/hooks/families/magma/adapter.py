@@ -22,7 +22,8 @@ from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Policy, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.magma.answer import Answer
 from probe_kit.hooks.families.magma.checkpoint import LoadedMagma, load_checkpoint
@@ -80,9 +81,10 @@ class Magma(Policy, AnswerModel):
         self._text_folder = loaded.folder if tokenizer is None else Path(tokenizer).expanduser()
         self.decoder: Any = self.network.language_model.model
         layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
+        heads = int(self.config.text.num_attention_heads)
         self.streams = {
-            "backbone": Stream("backbone", layers, width),
-            "action": Stream("action", layers, width, steps, part="action"),
+            "backbone": Stream("backbone", layers, width, heads=heads),
+            "action": Stream("action", layers, width, steps, part="action", heads=heads),
         }
         self.further_streams = {
             name: Stream(name, len(stage.blocks) + 1, _width(stage), part="vision", quantities=("residual",))
@@ -300,6 +302,11 @@ class Magma(Policy, AnswerModel):
         """The ids of each whole prompt, the picture as one placeholder."""
         return [self.prompt(instruction).ids for instruction in instructions]
 
+    @property
+    def unembedding(self) -> Unembedding:
+        """The language model's final norm and head."""
+        return Unembedding.of_decoder(("backbone", "action"), self.network.language_model, self.decoder.norm)
+
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the final norm, or a block's output.
 
@@ -325,6 +332,8 @@ class Magma(Policy, AnswerModel):
             return Tap(block.mlp, self.steps, "output", tokens)
         if site.quantity == "attention":
             return Tap(block.self_attn.o_proj, self.steps, "output", tokens)
+        if site.quantity == HEADS:
+            return Tap(block.self_attn.o_proj, self.steps, tokens=tokens)
         return Tap(block.input_layernorm, self.steps, tokens=tokens)
 
     @property

@@ -49,6 +49,11 @@ class Ovis25(RecipeVLM):
         return self.network.llm.model
 
     @property
+    def causal(self) -> Any:
+        """The language model with its head."""
+        return self.network.llm
+
+    @property
     def text_config(self) -> Any:
         """The language model's configuration."""
         return self.network.config.text

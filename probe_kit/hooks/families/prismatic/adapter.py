@@ -23,7 +23,8 @@ from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Model, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
@@ -52,9 +53,10 @@ class PrismaticModel(Model):
         self.steps, self._chosen_tokenizer = steps, tokenizer
         self.decoder: Any = self.network.language_model.model
         layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
+        heads = int(self.config.text.num_attention_heads)
         self.streams = {
-            "backbone": Stream("backbone", layers, width),
-            self.output: Stream(self.output, layers, width, steps, part="action"),
+            "backbone": Stream("backbone", layers, width, heads=heads),
+            self.output: Stream(self.output, layers, width, steps, part="action", heads=heads),
         }
         self.further_streams = {
             name: Stream(name, len(tower.blocks), int(tower.embed_dim), part="vision", quantities=("residual",))
@@ -183,9 +185,18 @@ class PrismaticModel(Model):
             return Tap(self._towers[site.stream].blocks[site.layer].norm1, 1)
         return self._language_tap(site)
 
-    def _language_tap(self, site: Site) -> Tap:
-        tokens = _PROMPT if site.stream == "backbone" else _LAST
+    @property
+    def unembedding(self) -> Unembedding:
+        """The language model's final norm and head."""
+        return Unembedding.of_decoder(("backbone", self.output), self.network.language_model, self._final_norm)
+
+    @property
+    def _final_norm(self) -> nn.Module:
         norm: nn.Module = getattr(self.decoder, "norm", None) or self.decoder.final_layernorm
+        return norm
+
+    def _language_tap(self, site: Site) -> Tap:
+        tokens, norm = _PROMPT if site.stream == "backbone" else _LAST, self._final_norm
         if site.quantity == "final_norm":
             return Tap(norm, self.steps, "output", tokens)
         if site.layer == len(self.decoder.layers):
@@ -193,9 +204,9 @@ class PrismaticModel(Model):
         block = self.decoder.layers[site.layer]
         if site.quantity == "mlp":
             return Tap(block.mlp, self.steps, "output", tokens)
-        if site.quantity == "attention":
+        if site.quantity in ("attention", HEADS):
             projection = getattr(block.self_attn, "o_proj", None) or block.self_attn.dense
-            return Tap(projection, self.steps, "output", tokens)
+            return Tap(projection, self.steps, "output" if site.quantity == "attention" else "input", tokens)
         return Tap(block.input_layernorm, self.steps, tokens=tokens)
 
     @property

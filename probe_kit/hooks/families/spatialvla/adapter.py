@@ -24,7 +24,8 @@ from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.openvla.actions import ActionStatistics
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
@@ -88,13 +89,20 @@ class SpatialVLA(Policy):
         self.decoder: Any = self.network.language_model.model
         self.tower: Any = self.network.vision_tower.vision_model
         layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
+        heads = int(self.config.text.num_attention_heads)
         self.streams = {
-            "backbone": Stream("backbone", layers, width),
-            "action": Stream("action", layers, width, captured, part="action"),
+            "backbone": Stream("backbone", layers, width, heads=heads),
+            "action": Stream("action", layers, width, captured, part="action", heads=heads),
         }
         seeing = len(self.tower.encoder.layers) + 1
         self.further_streams = {
-            "vision": Stream("vision", seeing, int(self.config.vision.hidden_size), part="vision")
+            "vision": Stream(
+                "vision",
+                seeing,
+                int(self.config.vision.hidden_size),
+                part="vision",
+                heads=int(self.config.vision.num_attention_heads),
+            )
         }
         self.prompt_kv = kept_prompt(self.config.text)
         self.role_names = {
@@ -263,6 +271,11 @@ class SpatialVLA(Policy):
         """A token per patch, row by row; where a token lies in space is added to it behind the tower."""
         return np.arange(self.config.patches)
 
+    @property
+    def unembedding(self) -> Unembedding:
+        """The language model's final norm and head."""
+        return Unembedding.of_decoder(("backbone", "action"), self.network.language_model, self.decoder.norm)
+
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the final norm, or what a block adds.
 
@@ -281,6 +294,8 @@ class SpatialVLA(Policy):
         block = self.decoder.layers[site.layer]
         if site.quantity == "residual":
             return Tap(block.input_layernorm, self.steps, tokens=tokens)
+        if site.quantity == HEADS:
+            return Tap(block.self_attn.o_proj, self.steps, tokens=tokens)
         added = (
             block.post_attention_layernorm if site.quantity == "attention" else block.post_feedforward_layernorm
         )
@@ -304,6 +319,8 @@ def _vision_tap(tower: Any, site: Site) -> Tap:
     block = tower.encoder.layers[site.layer]
     if site.quantity == "residual":
         return Tap(block.layer_norm1, 1)
+    if site.quantity == HEADS:
+        return Tap(block.self_attn.out_proj, 1)
     return Tap(block.self_attn.out_proj if site.quantity == "attention" else block.mlp, 1, "output")
 
 

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS, laid_out
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights
 from probe_kit.hooks.families.shared.network_loading import DTYPES, Filled, fill, twin
@@ -78,7 +78,7 @@ class Xiaomi(QwenVLA):
         self.openness = openness
         self.network, self.config, self.steps = filled.network, config, steps
         self._robot = robot
-        layers = len(self.network.dit.layers)
+        layers, first = len(self.network.dit.layers), cast(Any, self.network.dit.layers[0])
         self.streams = {
             # DeepStack adds pictures between its first blocks.
             "backbone": replace(self.backbone_stream(), sums=False),
@@ -90,6 +90,7 @@ class Xiaomi(QwenVLA):
                 part="action",
                 quantities=("residual", "attention", "middle", "mlp"),
                 sums=False,
+                heads=int(first.attn.heads),
             ),
         }
         self.further_streams = {"vision": self.vision_stream()}
@@ -246,6 +247,8 @@ class Xiaomi(QwenVLA):
         parts = {"attention": layer.attn_gate, "middle": layer.middle_layernorm, "mlp": layer.mlp_gate}
         if site.quantity == "residual":
             return Tap(layer.input_layernorm, self.steps)
+        if site.quantity == HEADS:
+            return Tap(layer.attn.o_proj, self.steps)
         return Tap(parts[site.quantity], self.steps, "output")
 
 

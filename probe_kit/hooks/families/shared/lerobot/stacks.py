@@ -7,7 +7,7 @@ from typing import Any
 from torch import nn
 
 from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 
 
 @dataclass(frozen=True)
@@ -30,14 +30,20 @@ class Stack:
         block: Any = self.layers[site.layer]
         if site.quantity == "mlp":
             return Tap(block.mlp, fires, "output")
-        if site.quantity == "attention":
-            projection = getattr(block.self_attn, "o_proj", None) or block.self_attn.out_proj
-            return Tap(projection, fires, "output")
+        if site.quantity in ("attention", HEADS):
+            return Tap(_projection(block.self_attn), fires, "output" if site.quantity == "attention" else "input")
         return Tap(getattr(block, self.entry), fires)
 
     def stream(self, name: str) -> Stream:
         """What is stored of it: the input of every block, and of the final norm."""
-        return Stream(name, len(self.layers) + 1, self.width, self.iterations)
+        attention: Any = self.layers[0].self_attn
+        heads = int(_projection(attention).in_features) // int(attention.head_dim)
+        return Stream(name, len(self.layers) + 1, self.width, self.iterations, heads=heads)
+
+
+def _projection(attention: Any) -> Any:
+    """The output projection of an attention of a language model or a vision tower."""
+    return getattr(attention, "o_proj", None) or attention.out_proj
 
 
 def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int) -> dict[str, Stack]:

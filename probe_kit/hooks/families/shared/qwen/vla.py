@@ -13,7 +13,7 @@ from probe_kit.errors import InstructionError
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.qwen.text import QwenTokenizer
@@ -53,7 +53,9 @@ class QwenVLA(Policy):
 
     def backbone_stream(self) -> Stream:
         """The decoder's stream."""
-        return Stream("backbone", len(self.language.layers) + 1, int(self.vlm.config.text_config.hidden_size))
+        text = self.vlm.config.text_config
+        heads = int(text.num_attention_heads)
+        return Stream("backbone", len(self.language.layers) + 1, int(text.hidden_size), heads=heads)
 
     def backbone_kv(self) -> Stream:
         """The decoder's keys and values."""
@@ -154,8 +156,8 @@ class QwenVLA(Policy):
         block = self.language.layers[site.layer]
         if site.quantity == "mlp":
             return Tap(block.mlp, 1, "output")
-        if site.quantity == "attention":
-            return Tap(block.self_attn.o_proj, 1, "output")
+        if site.quantity in ("attention", HEADS):
+            return Tap(block.self_attn.o_proj, 1, "output" if site.quantity == "attention" else "input")
         return Tap(block.input_layernorm, 1)
 
     def vision_tap(self, site: Site) -> Tap:

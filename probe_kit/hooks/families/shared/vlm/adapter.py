@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -22,7 +22,8 @@ from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.network_loading import Filled
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill
@@ -68,9 +69,10 @@ class VisionLanguageModel(AnswerModel):
         self.loaded, self.network = loaded, loaded.network
         self._text_folder = loaded.folder if tokenizer is None else Path(tokenizer).expanduser()
         layers, width = len(self.language.layers) + 1, int(self.text_config.hidden_size)
+        heads = int(self.text_config.num_attention_heads)
         self.streams = {
-            "backbone": Stream("backbone", layers, width, sums=self.sums),
-            ANSWER: Stream(ANSWER, layers, width, 1, part="action", sums=self.sums),
+            "backbone": Stream("backbone", layers, width, sums=self.sums, heads=heads),
+            ANSWER: Stream(ANSWER, layers, width, 1, part="action", sums=self.sums, heads=heads),
         }
         blocks, seen = self.vision_size
         self.further_streams = {
@@ -139,6 +141,16 @@ class VisionLanguageModel(AnswerModel):
     def text_config(self) -> Any:
         """The language model's configuration."""
         return self.network.config.text_config
+
+    @property
+    def causal(self) -> Any:
+        """The network with the head that puts out tokens."""
+        return self.network
+
+    @property
+    def unembedding(self) -> Unembedding:
+        """The decoder's final norm and head."""
+        return Unembedding.of_decoder(("backbone", ANSWER), self.causal, self.language.norm)
 
     # -- inputs ------------------------------------------------------------------------------------------
 
@@ -235,8 +247,9 @@ class VisionLanguageModel(AnswerModel):
         block = self.language.layers[site.layer]
         if site.quantity == "mlp":
             return Tap(block.mlp, 1, "output", tokens)
-        if site.quantity == "attention":
-            return Tap(block.self_attn.o_proj, 1, "output", tokens)
+        if site.quantity in ("attention", HEADS):
+            end: Literal["input", "output"] = "output" if site.quantity == "attention" else "input"
+            return Tap(block.self_attn.o_proj, 1, end, tokens)
         return Tap(block.input_layernorm, 1, tokens=tokens)
 
 

@@ -1,0 +1,87 @@
+"""Logit lens: which tokens each layer would put out, by the model's own final norm and head.
+
+It says what a layer would put out, not what later layers read there (nostalgebraist, 2020).
+
+    with capture(model, model.streams["answer"].sites()) as cache:
+        model.read([question])
+    logit_lens(model, cache).ids  # the five likeliest tokens of every layer
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UnknownSiteError, UnsupportedInterventionError, UsageError
+from probe_kit.hooks.capturing.activation_cache import ActivationCache
+from probe_kit.hooks.contract.model import Model
+from probe_kit.hooks.contract.sites import Site
+
+
+@dataclass(frozen=True)
+class LogitLens:
+    """What the layers of one stream would put out.
+
+    layers: (L,) of the residuals; the last one is the output of the model, if its last residual was captured.
+    ids, logits: (L, B, K) of tokens; the same tokens in every layer if they were given, else the likeliest first.
+    """
+
+    layers: tuple[int, ...]
+    ids: NDArray[np.int64]
+    logits: NDArray[np.float32]
+
+
+def logit_lens(
+    model: Model,
+    cache: ActivationCache,
+    ids: Sequence[int] | None = None,
+    k: int = 5,
+    at: int = -1,
+    stream: str = "",
+    iteration: int | None = None,
+) -> LogitLens:
+    """Final norm and head of the model, applied to every captured residual of one stream.
+
+    ids: tokens whose logits are wanted; without, the k likeliest of every layer. at: position in the stream.
+    stream: default the one whose last residual chooses tokens. iteration: of the stream; default the first.
+    Raises UnsupportedInterventionError for a model that puts out no tokens, UnknownSiteError if no residual of the
+    stream was captured, UsageError for ids that the model does not have.
+    """
+    unembedding = model.unembedding
+    if unembedding is None:
+        raise UnsupportedInterventionError(
+            f"{model.card.family} has no logit lens: it puts out no tokens, so that no head turns its residuals "
+            "into logits. Probe its residuals instead, with `probe-kit train`"
+        )
+    name = stream or unembedding.streams[-1]
+    if name not in unembedding.streams:
+        raise UnknownSiteError(
+            f"the head of {model.card.family} does not read the stream {name!r}; expected one of "
+            f"{', '.join(unembedding.streams)}"
+        )
+    sites = _residuals(cache, name, iteration)
+    # One position at a time and one layer at a time, as the model does: other shapes are rounded differently.
+    rows = [unembedding.logits(cache[site][:, [at]])[:, 0].float().cpu().numpy() for site in sites]
+    every = np.stack(rows)
+    if ids is None:
+        chosen = np.argsort(-every, axis=-1, kind="stable")[..., :k]
+    elif ids and min(ids) >= 0 and max(ids) < every.shape[-1]:
+        chosen = np.broadcast_to(np.array(ids, np.int64), (*every.shape[:2], len(ids)))
+    else:
+        raise UsageError(f"ids are {list(ids)}; expected one or more from 0 to {every.shape[-1] - 1}")
+    return LogitLens(tuple(site.layer for site in sites), chosen, np.take_along_axis(every, chosen, axis=-1))
+
+
+def _residuals(cache: ActivationCache, stream: str, iteration: int | None) -> list[Site]:
+    """The captured residuals of one iteration, shallow before deep."""
+    there = [site for site in cache if (site.stream, site.quantity) == (stream, "residual")]
+    steps = sorted({site.iteration for site in there if site.iteration is not None})
+    wanted = steps[0] if iteration is None and steps else iteration
+    found = sorted(site for site in there if site.iteration == wanted)
+    if not found:
+        raise UnknownSiteError(
+            f"no residual of {stream}{'' if wanted is None else f' at iteration {wanted}'} was captured; capture "
+            f"model.streams[{stream!r}].sites() first"
+        )
+    return found

@@ -1,0 +1,235 @@
+"""Patterns are the model's own: what eager attention returns, and what transformers' eager computes for fused."""
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import CaptureError, RolesMismatchError, UnknownSiteError, UsageError
+from probe_kit.hooks import (
+    AnswerModel,
+    Model,
+    Observation,
+    Policy,
+    Prompt,
+    Roles,
+    Site,
+    Tap,
+    attended_roles,
+    capture,
+    capture_attention,
+    capture_patterns,
+    load_model,
+)
+from probe_kit.hooks.conformance.examples import examples_for
+from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.hooks.families.shared.module_outputs import outputs_of
+from tests.support.every_checkpoint import WRITERS
+
+pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens that name no action")
+FUSED = (
+    "openvla",
+    "magma",
+    "prismatic",
+    "qwen2.5-vl",
+    "qwen3-vl",
+    "internvl",
+    "ovis2.5",
+    "paligemma",
+    "xiaomi-r0",
+)
+"""Families whose decoder transformers runs with torch's fused attention."""
+
+
+def infer(model: Model, seen: Observation) -> NDArray[np.float32]:
+    if isinstance(model, Policy):
+        return (
+            model.act([seen], [3])
+            if model.embodiment_mismatch() is None
+            else model.infer_without_acting([seen], [3])
+        )
+    assert isinstance(model, AnswerModel)
+    return model.read([Prompt(seen, seen.instruction, tuple(f"{model.lead}{own}" for own in "AB"))]).option_logits
+
+
+def attentions_of(model: Any, sites: list[Site]) -> Mapping[Site, Any]:
+    """The modules whose output projection is tapped."""
+    network = getattr(model, "network", model)
+    owner = {child: module for module in network.modules() for child in module.children()}
+    return {site: owner[model.tap(site).module] for site in sites}
+
+
+def returned_weights(model: Model, sites: list[Site], seen: Observation) -> dict[Site, Tensor]:
+    """By site, what plain torch hooks find that eager attention returns beside what it read."""
+    with ExitStack() as stack:
+        found = {site: outputs_of(own, stack) for site, own in attentions_of(model, sites).items()}
+        infer(model, seen)
+    taps = {site: model.tap(site) for site in sites}
+    return {
+        site: tap.rows.of(found[site][tap.first + (site.iteration or 0)][1])[:, :, tap.tokens]
+        for site, tap in taps.items()
+    }
+
+
+@pytest.mark.parametrize("stream", ["backbone", "expert"])
+def test_patterns_of_eager_attention_are_what_it_returns_bit_for_bit(
+    pi0_tiny: Pi0, observation: Observation, stream: str
+) -> None:
+    sites = pi0_tiny.streams[stream].sites("heads")
+    expected = returned_weights(pi0_tiny, sites, observation)
+    plain = infer(pi0_tiny, observation)
+    with capture_patterns(pi0_tiny, sites) as patterns:
+        np.testing.assert_array_equal(infer(pi0_tiny, observation), plain)
+    assert list(patterns) == sorted(sites, key=lambda site: (site.iteration or 0, site.layer))
+    for site in sites:
+        assert torch.equal(patterns[site], expected[site].float())
+
+
+@pytest.mark.parametrize("family", FUSED)
+def test_patterns_of_fused_attention_are_those_of_transformers_eager_attention(
+    family: str, tmp_path: Path
+) -> None:
+    write, options = WRITERS[family]
+    model = load_model(family, str(write(tmp_path / "checkpoint")), **options)
+    (seen,) = examples_for(model, "Put the cube on the star")
+    streams = [own for own in model.streams.values() if own.name != "expert"]
+    sites = [site for own in streams for site in own.sites("heads")]
+    with capture_patterns(model, sites) as patterns:
+        infer(model, seen)
+    for attention in attentions_of(model, sites).values():
+        attention.config._attn_implementation = "eager"
+    for site, expected in returned_weights(model, sites, seen).items():
+        torch.testing.assert_close(patterns[site], expected.float(), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("family", ["pi0", "smolvla", "openvla", "spatialvla", "magma", "xiaomi-r0"])
+def test_the_acting_streams_patterns_on_the_prompt_are_its_recorded_attention(family: str, tmp_path: Path) -> None:
+    """Each family records that in code of its own."""
+    write, options = WRITERS[family]
+    model = load_model(family, str(write(tmp_path / "checkpoint")), **options)
+    assert isinstance(model, Policy)
+    (seen,) = examples_for(model, "Put the cube on the star")
+    (stream,) = (own for own in model.streams.values() if own.part == "action")
+    with capture_patterns(model, stream.sites("heads")) as patterns:
+        infer(model, seen)
+    with capture_attention(model) as mass:
+        infer(model, seen)
+    roles = model.roles([seen])
+    acting = torch.from_numpy(roles[stream.name][0].mask("action"))
+    tokens = len(roles["backbone"][0])
+    blocks = sorted({block for block, _ in mass.by_head})
+    for site, pattern in patterns.items():
+        share = mass.by_head[blocks[site.layer], site.iteration or 0]
+        np.testing.assert_allclose(pattern[:, :, acting, :tokens].mean(dim=2), share, rtol=1e-4, atol=1e-6)
+
+
+def test_the_roles_of_what_is_attended_to_are_the_prompts_then_the_acting_streams(
+    pi0_tiny: Pi0, observation: Observation
+) -> None:
+    site, roles = Site("expert", 1, "heads", 9), pi0_tiny.token_roles([observation])
+    with capture_patterns(pi0_tiny, [site, Site("backbone", 0, "heads")]) as patterns:
+        infer(pi0_tiny, observation)
+    (keys,) = attended_roles(pi0_tiny, roles, site, patterns[site].shape[-1])
+    prompt, suffix = roles["backbone"][0], roles["expert"][0]
+    assert len(keys) == len(prompt) + len(suffix) == patterns[site].shape[-1]
+    assert (keys.mask("image") == np.append(prompt.mask("image"), np.zeros(len(suffix), bool))).all()
+    assert keys.mask("action").sum() == suffix.mask("action").sum()
+    (own,) = attended_roles(pi0_tiny, roles, Site("backbone", 0, "heads"), len(prompt))
+    assert own == prompt
+    with pytest.raises(RolesMismatchError, match=r"attends to 60 positions; backbone has 52 and expert 17"):
+        attended_roles(pi0_tiny, roles, site, 60)
+    with pytest.raises(RolesMismatchError, match="tokens of vision have no roles"):
+        attended_roles(pi0_tiny, roles, Site("vision", 0, "heads", 0), 36)
+
+
+def test_a_decoders_positions_attend_to_the_tokens_that_were_put_out_before() -> None:
+    vlm = load_model("vlm-tiny")
+    roles = {
+        "backbone": [Roles.from_labels(["image.primary", "language"])],
+        "answer": [Roles.from_labels(["answer"])],
+    }
+    for site in (Site("answer", 0, "heads", 0), Site("backbone", 0, "heads")):
+        (keys,) = attended_roles(vlm, roles, site, 3)
+        assert [span.role for span in keys.spans] == ["image.primary", "language", "answer"]
+
+
+def test_another_quantity_has_no_pattern(pi0_tiny: Pi0) -> None:
+    expected = r"backbone\.01\.residual has no attention pattern; expected .* such as backbone\.01\.heads"
+    with pytest.raises(UnknownSiteError, match=expected), capture_patterns(pi0_tiny, [Site("backbone", 1)]):
+        pass
+
+
+def test_more_than_the_limit_is_refused_with_the_number(pi0_tiny: Pi0, observation: Observation) -> None:
+    sites = pi0_tiny.streams["backbone"].sites("heads")
+    with pytest.raises(UsageError, match=r"of 3 sites take more than 0\.00 GB, with 0\.\d MB at backbone"):
+        capture_into(pi0_tiny, sites, observation, most_bytes=100_000)
+
+
+def capture_into(model: Model, sites: list[Site], seen: Observation, most_bytes: int = 10**9) -> None:
+    with capture_patterns(model, sites, most_bytes):
+        infer(model, seen)
+
+
+def test_a_tap_that_is_not_directly_behind_the_attention_is_an_error(
+    pi0_tiny: Pi0, observation: Observation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site, right = Site("backbone", 1, "heads"), pi0_tiny.tap
+    monkeypatch.setattr(pi0_tiny, "tap", lambda own: right(replace(own, quantity="residual")))
+    with pytest.raises(CaptureError, match=r"in front of backbone\.01\.heads does not give what its heads read"):
+        capture_into(pi0_tiny, [site], observation)
+
+
+def test_a_wrong_number_of_heads_is_an_error(
+    pi0_tiny: Pi0, observation: Observation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    streams = {name: replace(own, heads=2 * own.heads) for name, own in pi0_tiny.streams.items()}
+    heads = pi0_tiny.streams["backbone"].heads
+    monkeypatch.setattr(pi0_tiny, "streams", streams)
+    with pytest.raises(CaptureError, match=rf"has {heads} heads .*; expected {2 * heads} and"):
+        capture_into(pi0_tiny, [Site("backbone", 1, "heads")], observation)
+
+
+class _Attending(nn.Module):
+    """An attention that torch's functions do not show, as a kernel of another library."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.projection = nn.Linear(4, 4)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        shares = (tokens @ tokens.mT).exp()
+        read: Tensor = self.projection(shares / shares.sum(dim=-1, keepdim=True) @ tokens)
+        return read
+
+
+def test_attention_of_another_library_is_an_error_that_says_what_to_load(
+    pi0_tiny: Pi0, observation: Observation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attending = _Attending()
+    monkeypatch.setattr(pi0_tiny, "tap", lambda _: Tap(attending.projection, 1))
+    monkeypatch.setattr(pi0_tiny, "act", lambda *_: attending(torch.ones(1, 3, 4)))
+    with pytest.raises(CaptureError, match="Load the model with the attention sdpa or eager"):
+        capture_into(pi0_tiny, [Site("backbone", 1, "heads")], observation)
+
+
+def test_rows_that_attend_to_nothing_are_zero_and_a_capture_inside_is_refused(tmp_path: Path) -> None:
+    model = load_model("qwen3-vl", str(WRITERS["qwen3-vl"][0](tmp_path / "checkpoint")))
+    assert isinstance(model, AnswerModel)
+    short, long = examples_for(model, "Put", "Put the cube on the red shape")
+    questions = [Prompt(own, own.instruction, ("A", "B")) for own in (short, long)]
+    site = Site("backbone", 1, "heads")
+    with capture_patterns(model, [site]) as patterns:
+        with pytest.raises(CaptureError, match="captured already"), capture(model, [site]):
+            pass
+        model.read(questions)
+    valid = torch.from_numpy(model.asked_roles(questions)["backbone"][0].valid)
+    sums = patterns[site][0].sum(dim=-1)
+    torch.testing.assert_close(sums[:, valid], torch.ones_like(sums[:, valid]))
+    assert (sums[:, ~valid] == 0).all()
