@@ -37,7 +37,9 @@ KindName = Annotated[
 Sites = Annotated[
     Names | None,
     _inside_option(
-        "--sites", **LISTED, help="Sites, comma-separated, such as backbone.*, backbone.02, expert.03@0-4 or kv.*."
+        "--sites",
+        **LISTED,
+        help="Sites, comma-separated, such as backbone.*, backbone.02, expert.03@0-4, backbone.02.heads.* or kv.*.",
     ),
 ]
 Roles = Annotated[

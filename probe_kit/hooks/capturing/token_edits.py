@@ -91,6 +91,23 @@ class ReplaceInSubspace:
 
 
 @dataclass(frozen=True)
+class OfOneHead:
+    """Another edit, of the features of one head; those of the other heads stay. heads: side by side in a token."""
+
+    change: TokenEdit
+    head: int
+    heads: int
+
+    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
+        """own, with the edit's result in the columns of the head."""
+        size = own.shape[-1] // self.heads
+        columns = slice(self.head * size, (self.head + 1) * size)
+        found = own.clone()
+        found[..., columns] = self.change(site, own, where)[..., columns]
+        return found
+
+
+@dataclass(frozen=True)
 class AddVector:
     """Add a vector (D,), the same for every token."""
 

@@ -9,34 +9,93 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import EmptyRoleError, UnknownSiteError, UsageError
+from probe_kit.hooks.capturing.token_edits import OfOneHead, TokenEdit
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.sites import KV, KV_STREAM, Site
+from probe_kit.hooks.contract.sites import HEADS, KV, KV_STREAM, Site
 from probe_kit.hooks.contract.views import plays
 
 if TYPE_CHECKING:
-    from probe_kit.hooks import Policy, Stream
+    from probe_kit.hooks import Model, Policy, Stream
 
 TILE_ROLES = ("image.left", "image.right")
 """Roles of the patches that see one of the two pictures; see `tiles`."""
 ALL = "all"
 """The role of every token but padding."""
-_PATTERN = re.compile(r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d+)(@(?P<first>\d+)(-(?P<last>\d+))?)?")
+RESIDUAL = "residual"
+_PATTERN = re.compile(
+    r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d+)(\.(?P<quantity>[a-z_]+)(\.(?P<head>\*|\d+))?)?"
+    r"(@(?P<first>\d+)(-(?P<last>\d+))?)?"
+)
+
+
+@dataclass(frozen=True)
+class PlaceName:
+    """The parts of a place's name: `backbone.02`, `kv.01.values`, `backbone.02.heads.3`, `expert.03@0-4`.
+
+    quantity: empty where it is not named: the residual stream, of `kv` keys and values. head: of the quantity
+    `heads`. iterations: first and last one; None for all.
+    """
+
+    stream: str
+    layer: int
+    quantity: str = ""
+    head: int | None = None
+    iterations: tuple[int, int] | None = None
+
+    @classmethod
+    def parse(cls, name: str) -> "PlaceName":
+        """Take the name of one place apart. Raises UnknownSiteError for another form."""
+        match = _PATTERN.fullmatch(name)
+        if match is None or "*" in name:
+            raise UnknownSiteError(f"{name!r} is not the name of a place, such as backbone.02 or expert.03@0-4")
+        first, last = match["first"], match["last"]
+        return cls(
+            match["stream"],
+            int(match["layer"]),
+            match["quantity"] or "",
+            None if match["head"] is None else int(match["head"]),
+            None if first is None else (int(first), int(last or first)),
+        )
+
+    def __str__(self) -> str:
+        parts = [self.stream, f"{self.layer:02d}", self.quantity, "" if self.head is None else str(self.head)]
+        name = ".".join(filter(None, parts))
+        if self.iterations is None:
+            return name
+        first, last = self.iterations
+        return f"{name}@{first}" if first == last else f"{name}@{first}-{last}"
+
+    @property
+    def is_whole_layer(self) -> bool:
+        """Whether it is the stream itself in one layer, over all iterations."""
+        return self.quantity in ("", RESIDUAL) and self.iterations is None
+
+    @property
+    def depth(self) -> tuple[object, ...]:
+        """For sorting places of one stream: shallow before deep, a layer before its parts."""
+        return self.layer, self.iterations or (0, 0), self.quantity, -1 if self.head is None else self.head
 
 
 @dataclass(frozen=True)
 class SiteGroup:
-    """One layer of a stream, over some of its iterations; of `kv` its keys and values together."""
+    """One quantity of a layer of a stream, over some of its iterations; of `kv` keys and values together.
+
+    head: which of the `heads` heads is meant, of sites of that quantity; None for all of them.
+    """
 
     name: str
     sites: tuple[Site, ...]
+    head: int | None = None
+    heads: int = 0
 
     @property
     def only_site(self) -> Site:
-        """Its one site, where a direction can be found. Raises UnknownSiteError if it has several."""
-        if self.stream == KV_STREAM:
+        """Its one site, where a direction can be found. Raises UnknownSiteError if it has several, or no mean."""
+        if self.stream == KV_STREAM or self.sites[0].quantity != RESIDUAL:
+            what = "keys and values" if self.stream == KV_STREAM else f"of the quantity {self.sites[0].quantity}"
             raise UnknownSiteError(
-                f"{self.name} is keys and values, of which a run stores no means, so that no direction is found; "
-                "name a place of another stream, such as backbone.02"
+                f"{self.name} is {what}, of which a run stores no means, so that no direction is found; "
+                "name a place of a residual stream, such as backbone.02"
             )
         if len(self.sites) != 1:
             raise UnknownSiteError(
@@ -50,47 +109,74 @@ class SiteGroup:
         """Of all its sites."""
         return self.sites[0].stream
 
+    @property
+    def layer(self) -> tuple[str, int, str]:
+        """Stream, layer and quantity: heads of one block are parallel, layers come one after the other."""
+        return self.stream, self.sites[0].layer, self.sites[0].quantity
 
-def resolve_sites(pattern: str, policy: "Policy") -> list[SiteGroup]:
+    def limit(self, change: TokenEdit) -> TokenEdit:
+        """The change within this place: of one head, if it is one."""
+        return change if self.head is None else OfOneHead(change, self.head, self.heads)
+
+
+def resolve_sites(pattern: str, policy: "Model") -> list[SiteGroup]:
     """The places that a pattern names.
 
     `backbone.*` every layer, each a place; `backbone.02` one; `expert.03@0-4` a layer over iterations 0 to 4,
     changed at each of them; `expert.03` over all; `kv.02` what block 2 hands over to the acting stream, keys and
-    values together. Raises UnknownSiteError, and UnsupportedInterventionError for `kv` of a family that has
-    none.
+    values together. A quantity may follow the layer: `kv.02.values`, `backbone.02.mlp`, `backbone.02.heads` for
+    all heads of a block, `backbone.02.heads.3` for one, `backbone.*.heads.*` for each. Raises UnknownSiteError,
+    and UnsupportedInterventionError for `kv` of a family that has none.
     """
     match, streams = _PATTERN.fullmatch(pattern), policy.every_stream()
     if match is not None and match["stream"] == KV_STREAM:
-        policy.interventions.check("kv", policy.card.family)
+        _check_kv(policy)
     if match is None or match["stream"] not in streams:
         raise UnknownSiteError(
-            f"{pattern!r} names no place; expected STREAM.LAYER such as backbone.*, backbone.02 or expert.03@0-4, "
-            f"of the streams {', '.join(streams)}"
+            f"{pattern!r} names no place; expected STREAM.LAYER such as backbone.*, backbone.02, expert.03@0-4 or "
+            f"backbone.02.heads.3, of the streams {', '.join(streams)}"
         )
-    stream = streams[match["stream"]]
-    every = range(stream.layers if stream is not policy.prompt_kv else stream.layers - 1)
+    stream, quantity, head = streams[match["stream"]], match["quantity"] or "", match["head"]
+    if head is not None and quantity != HEADS:
+        raise UnknownSiteError(
+            f"{pattern!r} names a head of the quantity {quantity}; expected {HEADS}, such as backbone.02.heads.3"
+        )
+    every = range(stream.layers - (stream is policy.prompt_kv or quantity not in ("", RESIDUAL)))
     layers = every if match["layer"] == "*" else [int(match["layer"])]
-    return [_place(stream, layer, match["first"], match["last"]) for layer in layers]
+    heads = [None] if head is None else range(stream.heads) if head == "*" else [int(head)]
+    first, last = match["first"], match["last"]
+    iterations = None if first is None else (int(first), int(last or first))
+    return [
+        _place(stream, PlaceName(stream.name, layer, quantity, one, iterations))
+        for layer in layers
+        for one in heads
+    ]
 
 
-def _place(stream: "Stream", layer: int, first: str | None, last: str | None) -> SiteGroup:
-    name = f"{stream.name}.{layer:02d}"
-    if first is not None:
-        name += f"@{first}" if last is None else f"@{first}-{last}"
-    quantities = KV if stream.name == KV_STREAM else ("residual",)
-    low, high = int(first or 0), int(last or first or 0)
+def _check_kv(model: "Model") -> None:
+    """Raise UnsupportedInterventionError for a policy without keys and values of the prompt."""
+    interventions = getattr(model, "interventions", None)
+    if interventions is not None:
+        interventions.check("kv", model.card.family)
+
+
+def _place(stream: "Stream", name: PlaceName) -> SiteGroup:
+    quantities = (name.quantity,) if name.quantity else KV if stream.name == KV_STREAM else (RESIDUAL,)
+    low, high = name.iterations or (0, 0)
     sites = tuple(
         site
         for quantity in quantities
         for site in stream.sites(quantity)
-        if site.layer == layer and (first is None or low <= (site.iteration or 0) <= high)
+        if site.layer == name.layer and (name.iterations is None or low <= (site.iteration or 0) <= high)
     )
-    expected = 1 if stream.iterations is None else stream.iterations if first is None else high - low + 1
+    expected = 1 if stream.iterations is None else high - low + 1 if name.iterations else stream.iterations
     expected *= len(quantities)
-    if len(sites) != expected or (stream.iterations is None and first is not None):
+    if len(sites) != expected or (stream.iterations is None and name.iterations is not None):
         there = f"{stream.layers} layers" + (f" and {stream.iterations} iterations" if stream.iterations else "")
         raise UnknownSiteError(f"{name} is no place; the stream {stream.name} has {there}, counted from 0")
-    return SiteGroup(name, sites)
+    if name.head is not None and name.head >= stream.heads:
+        raise UnknownSiteError(f"{name} is no place; a block of {stream.name} has {stream.heads} heads, from 0 on")
+    return SiteGroup(str(name), sites, name.head, stream.heads if name.quantity == HEADS else 0)
 
 
 def token_mask(policy: "Policy", seen: Observation, stream: str, role: str) -> NDArray[np.bool_]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.edits.sites import RESIDUAL, PlaceName
 from probe_kit.intervene.kinds.base import (
     ConditionName,
     EffectRow,
@@ -66,8 +67,9 @@ class PatchEffect(EffectRow):
 
         The first layer of the backbone holds the swapped images themselves, and the acting stream the action.
         """
-        stream, _, layer = self.place.partition("@")[0].partition(".")
-        return stream not in ("backbone", KV_STREAM) or (stream == "backbone" and int(layer) == 0)
+        place = PlaceName.parse(self.place)
+        is_first = place.stream == "backbone" and place.layer == 0 and place.quantity in ("", RESIDUAL)
+        return place.stream not in ("backbone", KV_STREAM) or is_first
 
     @property
     def name(self) -> str:

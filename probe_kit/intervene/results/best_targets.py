@@ -10,7 +10,7 @@ from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.closed_loop.intervention import ClosedLoop
 from probe_kit.intervene.kinds.interchange.intervention import NONE
 from probe_kit.intervene.kinds.site_effects import PatchEffect
-from probe_kit.intervene.results.site_maps import BACKBONE, stored_site_effects
+from probe_kit.intervene.results.site_maps import is_backbone_layer, stored_site_effects
 from probe_kit.intervene.store.settings import InterventionSettings
 from probe_kit.train.data.run_reader import RunReader
 
@@ -37,7 +37,7 @@ def _best(rows: Sequence[PatchEffect]) -> str | None:
     located = [row for row in rows if row.is_localised and not row.direction]
     if not located:
         return None
-    deepest = ([row for row in located if row.place.startswith(f"{BACKBONE}.")] or located)[-1]
+    deepest = ([row for row in located if is_backbone_layer(row)] or located)[-1]
     last = [row for row in located if row.place == deepest.place]
     best = max(last, key=lambda row: (row.role != ALL, row.effect or 0.0))
     return str(ConditionName(best.place, best.role))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.edits.sites import ALL
+from probe_kit.intervene.edits.sites import ALL, PlaceName
 from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.site_effects import PatchEffect, patch_effects
 from probe_kit.intervene.store.answers import IMAGE_SWAP
@@ -61,6 +61,12 @@ def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(row.place for row in found if not row.is_by_construction))
 
 
+def is_backbone_layer(row: PatchEffect) -> bool:
+    """Whether the backbone's stream itself was patched, not a part of a block such as one head."""
+    name = PlaceName.parse(row.place)
+    return name.stream == BACKBONE and name.is_whole_layer
+
+
 def stored_localised_sites(run: RunReader) -> dict[str, tuple[str, ...]]:
     """By category, `localised_sites` of its maps; without categories that were not searched.
 
@@ -71,7 +77,7 @@ def stored_localised_sites(run: RunReader) -> dict[str, tuple[str, ...]]:
     searched = {
         category
         for category, rows in maps.items()
-        if any(row.role == ALL and row.place.startswith(f"{BACKBONE}.") for row in rows)
+        if any(row.role == ALL and is_backbone_layer(row) for row in rows)
     }
     found = {category: localised_sites(rows) for category, rows in maps.items()}
     return {category: places for category, places in found.items() if places or category in searched}
@@ -186,8 +192,6 @@ def _stream(condition: str) -> str:
 def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
     """The backbone, then the acting stream, then `kv`; shallow before deep, all tokens before single roles."""
     place, role, *values = subject
-    stream, _, rest = place.partition(".")
-    layer, _, iterations = rest.partition("@")
-    first, _, last = iterations.partition("-")
-    part = {BACKBONE: 0, KV_STREAM: 2}.get(stream, 1)
-    return part, stream, int(layer), int(first or 0), int(last or first or 0), role != ALL, role, *values
+    name = PlaceName.parse(place)
+    part = {BACKBONE: 0, KV_STREAM: 2}.get(name.stream, 1)
+    return part, name.stream, *name.depth, role != ALL, role, *values

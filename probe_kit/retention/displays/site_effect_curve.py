@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.edits.sites import ALL
+from probe_kit.intervene.edits.sites import ALL, PlaceName
 from probe_kit.intervene.kinds.site_effects import PatchEffect
 from probe_kit.intervene.results.site_maps import BACKBONE, stored_site_effects
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
@@ -122,7 +122,7 @@ def shown_passing(run: RunReader) -> dict[str, list[PatchEffect]]:
         category: [
             row
             for row in rows
-            if "@" not in row.place
+            if PlaceName.parse(row.place).is_whole_layer
             and (_stream(row) == BACKBONE or (_stream(row) == KV_STREAM and row.role == ALL))
         ]
         for category, rows in stored_site_effects(run).items()
@@ -146,11 +146,11 @@ def _points(rows: Sequence[PatchEffect]) -> Points:
 
 
 def _stream(row: PatchEffect) -> str:
-    return row.place.partition(".")[0]
+    return PlaceName.parse(row.place).stream
 
 
 def _layer(row: PatchEffect) -> int:
-    return int(row.place.partition(".")[2])
+    return PlaceName.parse(row.place).layer
 
 
 PLACE = 13

@@ -228,7 +228,7 @@ def test_places_are_layers_or_layers_over_iterations(twin: "Policy") -> None:
     with pytest.raises(UnknownSiteError, match="each with directions of its own"):
         _ = every.only_site
     (memory,) = resolve_sites("kv.02", twin)
-    with pytest.raises(UnknownSiteError, match="no direction is found; name a place of another stream"):
+    with pytest.raises(UnknownSiteError, match="no direction is found; name a place of a residual stream"):
         _ = memory.only_site
 
 

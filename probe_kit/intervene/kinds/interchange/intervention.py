@@ -152,7 +152,7 @@ class PatchedFromSource:
     def _change(self, context: ConditionContext, tokens: int) -> TokenEdit:
         source = source_of(context, self.source_sites)
         if self.bases is None:
-            return ReplaceWith(source, tokens)
+            return self.place.limit(ReplaceWith(source, tokens))
         basis = self.bases.basis(self.direction, context.replay_input.episode_id, context.replay_input.category)
         return ReplaceInSubspace(source, tokens, basis)
 

@@ -45,7 +45,8 @@ class CellsPatched:
         for cell in cells:
             tokens = role_tokens(session.policy, replay_input, cell.place.stream, cell.role, context.memo)
             for site in cell.place.sites:
-                changes.setdefault(site, []).append((tokens, ReplaceWith(source, tokens.count)))
+                change = cell.place.limit(ReplaceWith(source, tokens.count))
+                changes.setdefault(site, []).append((tokens, change))
         with apply_patches(session.policy, changes) as edit_log:
             chunk = session.act(replay_input.seen, replay_input.seed)
         return ConditionResult(chunk, edit_log)

@@ -37,8 +37,8 @@ class JointPlaces(Intervention):
     """Every cell alone, all cells but it, all of them, and the smallest set that carries the effect.
 
     A cell is the tokens of a role at a place. sites: patterns of places that are read in parallel, the blocks of
-    `kv` or one layer; of several layers of a residual stream the first decides. roles: of the cells' tokens. The
-    smallest set is searched in one half of each category's groups, drawn with `seed`, and scored in the other.
+    `kv`, one layer, or the heads of one block; of several layers the first decides. roles: of the cells' tokens.
+    The smallest set is searched in one half of each category's groups, drawn with `seed`, and scored in the other.
     """
 
     sites: tuple[str, ...] = SITES
@@ -96,11 +96,11 @@ class JointPlaces(Intervention):
 
     def _cells(self, session: ReplaySession) -> tuple[Cell, ...]:
         places = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
-        residual = [name for name, place in places.items() if place.stream != KV_STREAM]
-        if len(residual) > 1 or (residual and len(places) > 1):
+        layers = {KV_STREAM if place.stream == KV_STREAM else place.layer for place in places.values()}
+        if len(layers) > 1:
             raise UsageError(
                 f"{', '.join(places)} come one after the other, so that the first decides for all; name blocks of "
-                "kv, such as kv.*, or one layer, such as backbone.02"
+                "kv, such as kv.*, or one layer, such as backbone.02 or backbone.02.heads.*"
             )
         cells = tuple(
             Cell(place, role)

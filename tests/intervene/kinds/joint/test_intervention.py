@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from probe_kit._terminal.console import out
-from probe_kit.errors import UnsupportedInterventionError
+from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.extract import Run
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.intervene import Interchange, InterventionResult, ReplaySource, run_intervention
 from probe_kit.intervene.kinds.joint.effects import joint_keys_in_use, stored_joint_places
 from probe_kit.intervene.kinds.joint.intervention import JointPlaces
 from probe_kit.intervene.results.inventory import listed_interventions
+from probe_kit.intervene.results.site_maps import stored_localised_sites, stored_site_effects
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -60,6 +61,33 @@ def test_it_is_stored_listed_and_shown(copy: Run, result: InterventionResult) ->
         out.print(result.to_rich(), width=160)
     assert "all cells of kv" in printed.get()
     assert len(result.table) == len(rows)
+
+
+def test_heads_of_one_block_are_cells_and_no_search_of_the_backbone(
+    copy: Run, source: ReplaySource, twin: "Policy"
+) -> None:
+    asked = {"categories": ("color",), "items": 1, "roles": ("image",)}
+    heads = ("backbone.01.heads.2", "backbone.01.heads.3")
+    jointly, singly = (
+        run_intervention(copy, kind(sites=heads, **asked), source, load=lambda *_: twin).outcomes
+        for kind in (JointPlaces, Interchange)
+    )
+    np.testing.assert_array_equal(
+        jointly.of("alone|backbone.01.heads.3|image"), singly.of("backbone.01.heads.3|image")
+    )
+    rows = stored_site_effects(copy)["color"]
+    assert [row.place for row in rows if row.role == "image" and "heads" in row.place] == [
+        "backbone.01.heads.2",
+        "backbone.01.heads.3",
+    ]
+    assert not any(row.is_by_construction for row in rows if "heads" in row.place)
+    assert "color" not in stored_localised_sites(copy), "heads alone are no search of the backbone"
+
+
+def test_heads_of_two_blocks_come_one_after_the_other(copy: Run, source: ReplaySource, twin: "Policy") -> None:
+    asked = JointPlaces(categories=("color",), items=1, sites=("backbone.*.heads.*",), roles=("image",))
+    with pytest.raises(UsageError, match=r"come one after the other.*backbone\.02\.heads\.\*"):
+        run_intervention(copy, asked, source, load=lambda *_: twin)
 
 
 def test_a_family_without_keys_and_values_is_refused_by_name() -> None:
