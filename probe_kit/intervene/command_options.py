@@ -39,7 +39,7 @@ Sites = Annotated[
     _inside_option(
         "--sites",
         **LISTED,
-        help="Sites, comma-separated, such as backbone.*, backbone.02, expert.03@0-4, backbone.02.heads.* or kv.*.",
+        help="Sites, comma-separated: backbone.*, backbone.02, expert.03@0-4, backbone.02.heads.* or kv.*.",
     ),
 ]
 Roles = Annotated[
