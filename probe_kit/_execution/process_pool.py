@@ -9,6 +9,9 @@ from typing import Any, Self
 from probe_kit._execution.child_process import Child
 from probe_kit.errors import ProbeKitError
 
+LONGEST_WAIT_S = 1.0
+"""A signal that arrives just before the system call does not end it: an endless wait would miss Ctrl-C."""
+
 
 @dataclass(frozen=True)
 class Ended:
@@ -65,7 +68,9 @@ class ProcessPool:
 
         Raises the ProbeKitError that a process sends.
         """
-        ready = wait([child.connection for child in self._children.values()])
+        connections = [child.connection for child in self._children.values()]
+        while not (ready := wait(connections, LONGEST_WAIT_S)):
+            pass
         for slot, child in self._children.copy().items():
             if child.connection not in ready:
                 continue
