@@ -143,6 +143,7 @@ def test_a_corrupt_picture_is_named_with_exit_code_1(small_suite: Suite, tmp_pat
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suite: Suite, tmp_path: Path) -> None:
     run = tmp_path / "run"
     command = [sys.executable, "-m", "probe_kit", "extract", "--model", "expert", "--out", str(run)]

@@ -93,6 +93,7 @@ def locale(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return {**plain, "LOCPATH": str(folder), "LC_ALL": "en_US.ISO-8859-1"}
 
 
+@pytest.mark.slow
 def test_pages_and_tables_are_utf_8_under_a_locale_that_is_not(
     locale: dict[str, str], small_suite: Suite, little_runs: Path, tmp_path: Path
 ) -> None:

@@ -54,6 +54,7 @@ def test_before_a_command_begins_nothing_is_lost_and_nothing_is_traced(
     assert done.stderr == "interrupted before anything was begun\n"
 
 
+@pytest.mark.slow
 def test_while_a_command_imports_its_libraries_it_says_that_what_is_finished_is_kept(
     small_suite: Suite, tmp_path: Path
 ) -> None:

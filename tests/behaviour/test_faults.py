@@ -34,6 +34,7 @@ def assert_nothing_is_silent(stored: Stored, seeds: range) -> None:
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.slow
 def test_no_accident_changes_a_number_unseen(stored: Stored) -> None:
     assert_nothing_is_silent(stored, range(FAST))
 

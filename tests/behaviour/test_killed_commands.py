@@ -161,6 +161,7 @@ def _command(name: str, request: pytest.FixtureRequest) -> KilledCommand:
 ALL = ("suite build", "suite convert", "run seal", "train", "intervene", "ask", "extract")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["suite build", "run seal"])
 def test_a_kill_loses_nothing_and_changes_no_byte(
     name: str, request: pytest.FixtureRequest, tmp_path: Path

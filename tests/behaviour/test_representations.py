@@ -334,6 +334,7 @@ def assert_none_is_silent(stored: Stored, seeds: range) -> None:
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.slow
 def test_no_changed_byte_of_a_real_run_is_silent(real: Stored) -> None:
     assert_none_is_silent(real, range(30))
 

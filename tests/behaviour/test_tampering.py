@@ -385,6 +385,7 @@ def test_pictures_of_a_report_are_protected(run: Path, other: Path, how: str) ->
     assert_found(run, f"frames/{first.name}", deep=True)
 
 
+@pytest.mark.slow
 def test_whoever_wants_no_pictures_may_delete_all_of_them(run: Path, little_runs: Path) -> None:
     shutil.rmtree(run / "frames")
     assert read_thumbnail(run, 0) is None
@@ -449,6 +450,7 @@ def test_lost_settings_are_found_and_no_older_probes_are_read(run: Path, which: 
         retention_table([open_run(run)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["decisions", "directions", "controls"])
 @pytest.mark.parametrize("how", ["lost", "flipped", "another's"])
 def test_changed_files_of_probes_are_found(run: Path, name: str, how: str, other: Path) -> None:
@@ -500,6 +502,7 @@ def test_probes_of_activations_that_are_no_more_are_found(run: Path) -> None:
         load_results(open_run(run))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_an_interrupted_sweep_is_continued_only_from_what_it_left(run: Path) -> None:
     opened = open_run(run)
@@ -538,6 +541,7 @@ def stored_intervention(run: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -613,6 +617,7 @@ def test_a_pipe_or_a_device_in_the_place_of_a_file_is_not_waited_for(run: Path, 
 # -- nothing -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_copies_that_lie_about_change_nothing_and_are_named(run: Path, little_runs: Path) -> None:
     (settings,) = (run / "sealed").iterdir()
     probes = stored_probes(run)[0]

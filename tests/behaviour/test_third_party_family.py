@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from probe_kit.extract import Run
 from probe_kit.suite import Suite
 from tests.support.distributions import install
@@ -28,6 +30,7 @@ print(CliRunner().invoke(app, ["models"]).stdout)
 """
 
 
+@pytest.mark.slow
 def test_no_command_that_needs_no_model_imports_torch_or_a_third_party(
     recorded_run: Run, small_suite: Suite, tmp_path: Path
 ) -> None:

@@ -156,6 +156,7 @@ def test_tiles_are_as_heavy_as_theirs(env):
     assert [client.getDynamicsInfo(env.scene.tiles[side], -1)[0] for side in SIDES] == [0.81, 0.81]
 
 
+@pytest.mark.slow
 def test_pushed_tiles_and_a_rammed_table_leave_no_trace_in_the_next_episode(env):
     """Contacts of tiles that can be pushed survive a restored state, unless they wait elsewhere in it."""
     reference = episode_digest.released_digest(env, seed=3)
@@ -166,6 +167,7 @@ def test_pushed_tiles_and_a_rammed_table_leave_no_trace_in_the_next_episode(env)
     assert episode_digest.released_digest(env, seed=3, look=True) == reference, "looking moves the pictures alone"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start_jitter", [pytest.param(0.0, marks=pytest.mark.slow), 0.003])
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_hand_that_closed_before_holds_the_cube_as_one_that_closes_now(arm, start_jitter, make_env):

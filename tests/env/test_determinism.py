@@ -25,11 +25,13 @@ def env():
     env.close()
 
 
+@pytest.mark.slow
 def test_other_episodes_in_between_leave_no_trace(env, reference):
     assert episode_digest.digest(env, seed=4) != reference
     assert episode_digest.digest(env, seed=3) == reference
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("actions", [0, 1, 12])
 def test_an_episode_broken_off_in_the_middle_leaves_no_trace(actions, env, reference):
     """After 1 action the cube still touches the table, after 12 it is in the hand."""

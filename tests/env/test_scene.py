@@ -111,6 +111,7 @@ def resident_megabytes():
         return int(statm.read().split()[1]) * 4096 / 2**20
 
 
+@pytest.mark.slow
 def test_a_reload_frees_the_textures(own_scene):
     """Of 300 textures the server alone would keep 60 MB; an attack measured 0.4 MB per episode."""
 

@@ -38,6 +38,7 @@ def test_a_hundred_random_episodes_are_all_correct(arm, play_many):
     assert max(o.distance_correct for o in outcomes) < 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", EPISODES)
 def test_the_mirrored_expert_answers_every_question_wrong(count, play_many):
     outcomes = play_many(count, mirrored=True)
@@ -45,11 +46,13 @@ def test_the_mirrored_expert_answers_every_question_wrong(count, play_many):
     assert {o.side_placed for o in outcomes} == {"left", "right"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tile_side", [0.088, 0.154])
 def test_the_expert_succeeds_on_smaller_and_larger_tiles(tile_side, play_many):
     assert all(o.is_success for o in play_many(2, tile_side=tile_side))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", ARMS)
 def test_an_episode_that_starts_with_the_cube_in_hand_is_half_as_long(arm, play_many):
     grasped, plain = play_many(4, arm=arm, start_grasped=True), play_many(4, arm=arm)

@@ -109,6 +109,7 @@ def test_who_acts_in_the_same_scene_begins_with_the_same_frame(
     assert acted["first_frame_sha256"].nunique() == 2, "items of a pair share their pictures, exchanged"
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_continues_to_the_same_bytes(settings: AskSettings, asked: Run, tmp_path: Path) -> None:
     class CrashError(Exception):
         pass
@@ -129,6 +130,7 @@ def test_other_questions_are_another_run(settings: AskSettings, asked: Run, chan
         prepare(replace(settings, tokens="pooled", **change), asked.path)
 
 
+@pytest.mark.slow
 def test_a_batch_answers_alike(settings: AskSettings, asked: Run, tmp_path: Path) -> None:
     run = ask_run(replace(settings, batch=3), tmp_path / "run")
     np.testing.assert_allclose(run.episodes["margin"], asked.episodes["margin"], atol=1e-4)

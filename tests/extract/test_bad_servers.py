@@ -103,6 +103,7 @@ def test_requests_that_nobody_answers_are_repeated(
     assert objects(run) == whole
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize(
     "ill", ["busy", *(pytest.param(ill, marks=pytest.mark.slow) for ill in ("torn", "unanswered", "silent"))]
@@ -143,6 +144,7 @@ def test_a_server_that_dies_and_returns_is_waited_for(
     assert objects(run) == whole
 
 
+@pytest.mark.slow
 def test_nothing_is_committed_that_the_server_kept_only_in_part(
     suite: Suite, whole: dict[str, bytes], bad_server: BadServer
 ) -> None:
@@ -218,6 +220,7 @@ def kept(little_runs: Path, bad_server: BadServer) -> Run:
     return open_run(there)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("ill", ["busy", pytest.param("silent", marks=pytest.mark.slow)])
 def test_reading_from_a_server_that_fails_says_what_to_do(ill: str, kept: Run, bad_server: BadServer) -> None:
@@ -248,6 +251,7 @@ def test_reading_from_a_server_on_a_bad_day_gives_the_same_numbers(kept: Run, ba
     assert bad_server.day.seen.total() > 5
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("impatient")
 def test_a_store_that_never_answered_is_given_up_soon(bad_server: BadServer) -> None:
     bad_server.stop()

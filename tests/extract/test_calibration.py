@@ -59,6 +59,7 @@ def test_the_card_bounds_what_is_tried(of_card: int | None, episodes: int, most:
     assert largest_batch(of_card, episodes) == most
 
 
+@pytest.mark.slow
 def test_a_policy_that_takes_one_observation_is_calibrated_to_the_same_bytes(
     small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

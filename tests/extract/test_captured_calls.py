@@ -141,6 +141,7 @@ def test_token_views_of_a_later_inference_are_probed_too(run: Run) -> None:
     assert int(results.scores["n"].iloc[0]) == run.reached(2).sum()
 
 
+@pytest.mark.slow
 def test_a_real_policy_is_captured_at_every_inference(small_suite: Suite, tmp_path: Path) -> None:
     settings = ExtractSettings(
         "pi0-tiny", suite=small_suite.folder, items=2, scene=SceneSpec(max_steps=4), execute=2, captured_calls=2,

@@ -51,8 +51,7 @@ def whole(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     "point",
     [
         "before-commit",
-        "after-commit",
-        *(pytest.param(f"{when}-put", marks=pytest.mark.slow) for when in ("before", "after")),
+        *(pytest.param(point, marks=pytest.mark.slow) for point in ("after-commit", "before-put", "after-put")),
     ],
 )
 def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
@@ -67,6 +66,7 @@ def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
     assert tree(run) == tree(whole)
 
 
+@pytest.mark.slow
 def test_three_writers_at_once_give_the_same_store(suite: Suite, whole: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     writers = [start(run, suite) for _ in range(3)]
@@ -135,6 +135,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", str(disk)], check=True)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="mounts a tmpfs")
 def test_a_full_disk_is_named_and_leaves_a_store_that_resumes(suite: Suite, whole: Path, small_disk: Path) -> None:
     run = small_disk / "run"

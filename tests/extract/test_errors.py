@@ -79,6 +79,7 @@ def spoiled_after_planning(suite: Suite, tmp_path: Path, **how: object) -> Extra
     return extraction
 
 
+@pytest.mark.slow
 def test_a_worker_process_hands_its_error_on(suite: Suite, tmp_path: Path) -> None:
     extraction = spoiled_after_planning(suite, tmp_path, workers=1)
     with pytest.raises(SuiteError, match="changed"):
@@ -142,6 +143,7 @@ def test_an_adapter_that_acts_otherwise_under_capture_stops_the_run(
     assert not (tmp_path / "run" / "certificate.json").exists()
 
 
+@pytest.mark.slow
 def test_the_certificate_holds_what_was_measured_in_every_process(suite: Suite, tmp_path: Path) -> None:
     settings = ExtractSettings("pi0-tiny", suite=suite.folder, scene=SHORT, env_workers=0)
     run = extract_run(settings, tmp_path / "run")

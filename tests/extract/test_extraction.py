@@ -121,6 +121,7 @@ def test_a_nan_action_stops_the_run_and_commits_nothing(
     assert open_run(tmp_path / "run", allow_partial=True).episodes.empty
 
 
+@pytest.mark.slow
 def test_the_expert_is_always_right_and_its_mirror_image_always_wrong(small_suite: Suite, tmp_path: Path) -> None:
     for model, outcome in (("expert", "correct"), ("expert-mirrored", "wrong")):
         settings = ExtractSettings(model, suite=small_suite.folder, categories=("shape",), items=2, scene=IN_HAND)
@@ -163,6 +164,7 @@ def test_seeds_do_not_depend_on_which_other_episodes_are_run(small_suite: Suite)
     assert all(seeds[planned.episode.episode_id] == planned.policy_seed for planned in part)
 
 
+@pytest.mark.slow
 def test_runs_that_share_a_policy_hold_the_same_bytes_as_runs_that_load_their_own(
     two_items: Suite, tmp_path: Path
 ) -> None:
@@ -241,6 +243,7 @@ def test_a_run_that_does_not_fit_the_disk_is_refused_unless_forced(
     assert len(extraction.run(tmp_path / "run", force=True).episodes) == 4
 
 
+@pytest.mark.slow
 def test_the_first_episode_can_be_filmed(two_items: Suite, tmp_path: Path) -> None:
     from PIL import Image
 

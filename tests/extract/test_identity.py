@@ -80,6 +80,7 @@ def test_a_run_is_not_continued_where_numbers_come_out_otherwise(
     assert caught.value.exit_code == 3
 
 
+@pytest.mark.slow
 def test_a_mixed_run_says_so(suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begin(expert(suite), tmp_path / "run")
     elsewhere(monkeypatch, torch="1.0", device="cuda")
@@ -100,6 +101,7 @@ def test_a_copy_of_a_run_does_not_count_beside_it(suite: Suite, tmp_path: Path) 
         retention_table({"a": [run], "b": [copy]})
 
 
+@pytest.mark.slow
 def test_other_writers_interpreters_and_processes_are_no_other_numbers(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

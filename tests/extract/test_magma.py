@@ -14,6 +14,8 @@ from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from tests.support.magma_checkpoints import write_checkpoint
 
+pytestmark = pytest.mark.slow
+
 STEPS = 2
 
 

@@ -48,6 +48,7 @@ def test_a_run_has_the_two_streams_and_every_token_has_its_role(settings: Extrac
             assert column.std(axis=0).max() > 0
 
 
+@pytest.mark.slow
 def test_other_units_are_another_run(settings: ExtractSettings, tmp_path: Path) -> None:
     extract_run(settings, tmp_path / "run")
     other = replace(settings, options={"tokenizer": "bytes", "unnorm_key": "mine"})

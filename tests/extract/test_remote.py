@@ -103,6 +103,7 @@ def test_worker_processes_share_a_bucket(suite: Suite, tmp_path: Path, bucket: s
     assert together.stamp == alone.stamp
 
 
+@pytest.mark.slow
 def test_other_settings_are_refused_in_a_bucket_too(suite: Suite, bucket: str) -> None:
     settings = ExtractSettings("expert", suite=suite.folder, items=2, scene=SHORT)
     extract_run(settings, f"{bucket}/run")
@@ -141,6 +142,7 @@ def flip_a_bit(location: Location, key: str) -> None:
     location.write(key, bytes(content))
 
 
+@pytest.mark.slow
 def test_damage_in_a_bucket_is_found_and_never_read_as_numbers(little_runs: Path, bucket: str) -> None:
     copied = copy_to(bucket, locate(little_runs / "run"))
     shard = next(key for key in copied.location.keys("data.zarr/expert/tokens") if "/c/7/" in key)

@@ -116,6 +116,7 @@ def test_an_inference_per_action_has_a_control_step_per_action(recorded_run: Run
     assert recorded_run.control_steps.tolist() == [expected] * len(recorded_run.episodes)
 
 
+@pytest.mark.slow
 def test_who_does_not_act_infers_at_the_first_control_step_and_a_script_never(
     small_suite: Suite, tmp_path: Path
 ) -> None:
@@ -136,6 +137,7 @@ def test_seconds_of_inference_and_simulation_are_stored_per_episode(acted: Run) 
     assert (seconds.sum(axis=1) < 120).all()
 
 
+@pytest.mark.slow
 def test_runs_that_took_other_seconds_and_were_resumed_are_equal_in_every_other_byte(
     acted: Run, small_suite: Suite, tmp_path: Path
 ) -> None:
@@ -151,6 +153,7 @@ def test_runs_that_took_other_seconds_and_were_resumed_are_equal_in_every_other_
     assert files_of(again.path, but=()) != files_of(acted.path, but=())
 
 
+@pytest.mark.slow
 def test_two_workers_store_the_same_and_their_own_seconds(small_suite: Suite, tmp_path: Path) -> None:
     here = extract_run(scripted(small_suite), tmp_path / "here")
     run = extract_run(replace(scripted(small_suite), workers=2), tmp_path / "run")
@@ -174,6 +177,7 @@ def test_all_seconds_may_be_deleted_and_one_alone_is_damage(acted: Run, tmp_path
 # -- label --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_runs_that_differ_in_their_label_only_are_one_run(small_suite: Suite, tmp_path: Path) -> None:
     first = extract_run(scripted(small_suite, label="mine"), tmp_path / "run")
     before, label = files_of(first.path, but=("label.json",)), first.label

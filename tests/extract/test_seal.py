@@ -49,6 +49,7 @@ def test_sealing_again_gives_the_same_bytes_and_a_second_time_does_nothing(copy:
     assert tree(copy) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("finished", [True, False])
 def test_what_a_killed_seal_left_is_cleared_by_the_next_one(copy: Path, finished: bool) -> None:
     before = tree(copy)
@@ -61,6 +62,7 @@ def test_what_a_killed_seal_left_is_cleared_by_the_next_one(copy: Path, finished
     assert tree(copy) == before
 
 
+@pytest.mark.slow
 def test_a_slab_smaller_than_the_run_changes_nothing(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = tree(copy)
     shutil.rmtree(copy / "columns.zarr")

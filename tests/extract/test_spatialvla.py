@@ -62,6 +62,7 @@ def test_three_families_stand_in_one_table(settings: ExtractSettings, tmp_path: 
     assert all(row.success.n_items == 12 for row in rows)
 
 
+@pytest.mark.slow
 def test_another_camera_is_another_run(settings: ExtractSettings, tmp_path: Path) -> None:
     small = replace(settings, items=2)
     extract_run(small, tmp_path / "run")

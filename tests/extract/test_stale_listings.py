@@ -21,6 +21,8 @@ from tests.extract.contents import objects
 from tests.support.little_run import episode, little_plan, little_writer
 from tests.support.s3_server import BadServer
 
+pytestmark = pytest.mark.slow
+
 EPISODES = 3
 SITE = Site("expert", 0, iteration=1)
 

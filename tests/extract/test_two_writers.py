@@ -64,6 +64,7 @@ def interrupt(number: int, act: Callable[[], object], monkeypatch: pytest.Monkey
     monkeypatch.setattr(writers, "write_commit", commit_later)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["folder", "bucket"], indirect=True)
 def test_an_episode_that_another_process_finished_keeps_its_numbers(where: str, plan: Plan) -> None:
     first, second = (little_writer(locate(where), plan) for _ in range(2))

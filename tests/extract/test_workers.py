@@ -45,6 +45,7 @@ def test_environment_processes_give_the_same_bytes(suite: Suite, plain: Path, tm
     assert commits(run.path) == commits(plain)
 
 
+@pytest.mark.slow
 def test_a_batch_gives_the_same_numbers_up_to_float_rounding(suite: Suite, plain: Path, tmp_path: Path) -> None:
     run, one = extract_run(settings(suite, batch=3, env_workers=0), tmp_path / "run"), open_run(plain)
     for stream in run.streams:
@@ -63,6 +64,7 @@ def test_a_simulating_process_starts_without_the_array_store_and_torch() -> None
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8").stdout == "[]\n"
 
 
+@pytest.mark.slow
 def test_a_simulator_that_dies_costs_its_episode_and_is_replaced(suite: Suite) -> None:
     planned = prepare(ExtractSettings("expert", suite=suite.folder)).plan.episodes[0]
     stage = ProcessStage(SHORT, None)
@@ -77,6 +79,7 @@ def test_a_simulator_that_dies_costs_its_episode_and_is_replaced(suite: Suite) -
         stage.close()
 
 
+@pytest.mark.slow
 def test_an_episode_that_fails_twice_is_named_and_all_others_are_kept(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

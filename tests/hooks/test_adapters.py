@@ -36,6 +36,7 @@ class TestSmolVLA(AdapterContract):
         return load_smolvla(str(checkpoint))
 
 
+@pytest.mark.slow
 class TestSmolVLAWithMarkedPicturesMaskedCamerasAndAFixedPrefix(TestSmolVLA):
     @pytest.fixture(scope="class")
     def checkpoint(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -58,6 +59,7 @@ class _Golden:
         return AdapterContract.examples(model, "open the drawer", "open the tray")
 
 
+@pytest.mark.slow
 class TestGoldenPi0(_Golden, AdapterContract):
     """Two cameras, of which one stays masked, and an empty one."""
 
@@ -66,6 +68,7 @@ class TestGoldenPi0(_Golden, AdapterContract):
         return load_pi0(str(golden_pi0 / "checkpoint"))
 
 
+@pytest.mark.slow
 class TestGoldenSmolVLA(_Golden, AdapterContract):
     @pytest.fixture(scope="class")
     def policy(self, golden_smolvla: Path) -> SmolVLA:

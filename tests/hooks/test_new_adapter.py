@@ -38,6 +38,7 @@ def ran(folder: Path, *arguments: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_it_keeps_the_contract_as_it_is(installed: Path) -> None:
     assert ENTRY.splitlines()[1].replace("my_vla:FAMILY", '"my_vla:FAMILY"') in (
         installed / "pyproject.toml"

@@ -294,6 +294,7 @@ def test_final_positions_need_positions_and_a_scene(tmp_path: Path, outcome_tabl
 # -- collect_figures -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_gallery_saves_every_figure_twice_and_keeps_none_open(probed_run: ProbedRun, tmp_path: Path) -> None:
     run = probed_run({"color": SIGNAL, "shape": SIGNAL})
     saved = list(save_figures(collect_figures([run], retention_table([run])), tmp_path / "figures"))

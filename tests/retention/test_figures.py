@@ -99,6 +99,7 @@ def test_nothing_is_clipped_footers_are_one_line_and_the_width_is_used(drawn: Dr
         assert any(suite in figure.caption for suite in suites), name  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_saved_pixels_are_fit_for_print_and_carry_their_caption(probed_run: ProbedRun, tmp_path: Path) -> None:
     run = probed_run({"color": SIGNAL})
     for path in save_figures(collect_figures([run], retention_table([run])), tmp_path / "figures"):
@@ -265,6 +266,7 @@ def test_heat_colours_are_told_apart_without_red_and_green_and_in_grey() -> None
     assert (np.diff(lightness) < -5).all(), "grey alone orders them"
 
 
+@pytest.mark.slow
 def test_tables_of_colours_have_a_key(probed_run: ProbedRun) -> None:
     from probe_kit.retention.report import report_html
 

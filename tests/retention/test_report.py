@@ -58,6 +58,7 @@ def test_the_page_needs_nothing_but_itself(probed_run: ProbedRun) -> None:
     assert "default-src 'none'" in page
 
 
+@pytest.mark.slow
 def test_the_same_run_gives_the_same_page(probed_run: ProbedRun) -> None:
     run = probed_run({"color": SIGNAL, "shape": NOISE})
     assert report_html([run]) == report_html([run])
@@ -116,6 +117,7 @@ def test_a_report_is_written_whole_and_replaces_an_older_one(tmp_path: Path, out
     assert list(path.parent.iterdir()) == [path], "no draft stays behind"
 
 
+@pytest.mark.slow
 def test_making_a_report_imports_neither_simulator_nor_model(tmp_path: Path, outcome_table: Any) -> None:
     outcome_table(6, 4, 2).to_json(tmp_path / "episodes.json")
     code = f"""

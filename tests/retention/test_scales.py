@@ -50,6 +50,7 @@ def colours(figure: "Figure") -> set[tuple[float, float]]:
     return {image.get_clim() for axes in figure.axes for image in axes.images if image.get_array().ndim == 2}  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_maps_run_from_chance_to_100_percent_whatever_they_hold(
     known: ProbeResults, guessed: ProbeResults
 ) -> None:
@@ -71,6 +72,7 @@ def test_the_best_guess_of_an_untrained_network_is_pale_and_full_knowledge_nearl
     assert darkest[1] > 2.2
 
 
+@pytest.mark.slow
 def test_accuracies_have_one_axis_in_every_figure_alone_and_together(
     known: ProbeResults, guessed: ProbeResults
 ) -> None:

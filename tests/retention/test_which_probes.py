@@ -76,6 +76,7 @@ MIXTURES = {
 FIRST, *OTHERS = MIXTURES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [FIRST, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)])
 def test_rows_of_other_settings_are_pointed_out_in_every_format(probed_run: ProbedRun, name: str) -> None:
     value, words = MIXTURES[name]

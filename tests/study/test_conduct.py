@@ -74,6 +74,7 @@ def states(file: Path) -> dict[str, tuple[str, int]]:
     return {one.cell.name: (one.state, one.done) for one in plan_study(load_study(file)).cells}
 
 
+@pytest.mark.slow
 def test_a_model_that_fails_stops_itself_alone_and_the_rest_is_played_once(file: Path) -> None:
     assert set(states(file).values()) == {("new", 0)}
     told: list[str] = []

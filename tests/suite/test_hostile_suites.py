@@ -49,6 +49,7 @@ def restored(place: Path, original: Path) -> None:
         shutil.copyfile(original / name, place / name)
 
 
+@pytest.mark.slow
 @given(field=st.sampled_from(FIELDS), value=st.sampled_from(HOSTILE))
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 def test_any_value_in_any_field_is_refused_by_name(

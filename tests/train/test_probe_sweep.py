@@ -118,6 +118,7 @@ def with_tokens(run: ArrayRun, strength: float) -> ArrayRun:
     return run
 
 
+@pytest.mark.slow
 def test_token_views_are_probed_beside_pooled_ones_with_fewer_permuted_labels(planted_run: PlantedRun) -> None:
     run = with_tokens(planted_run(), strength=2.0)
     results = train_probes(run, views=("mean", "tokens"), permutations=6, token_permutations=4)

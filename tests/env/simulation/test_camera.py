@@ -59,6 +59,7 @@ def show_table(scene, visible):
         scene.client.changeVisualShape(body, -1, rgbaColor=color if visible else (0, 0, 0, 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["bridge", "vl-think", "frontal"])
 def test_the_layered_picture_equals_the_naive_rendering_bit_for_bit(preset, make_env):
     env = make_env(preset)

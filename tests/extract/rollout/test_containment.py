@@ -125,7 +125,10 @@ def fork(_: Any, chunks: Any) -> Any:
 
 @pytest.mark.parametrize(
     "spoil",
-    [reseed, scribble, change_later, *(pytest.param(one, marks=pytest.mark.slow) for one in (move, deafen, fork))],
+    [
+        reseed,
+        *(pytest.param(one, marks=pytest.mark.slow) for one in (scribble, change_later, move, deafen, fork)),
+    ],
 )
 @pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 def test_what_a_policy_changes_around_itself_changes_no_number_and_is_put_back(
@@ -192,7 +195,7 @@ def generator_exit(_: Any) -> Any:
     [
         (press, "failed while it acted: KeyboardInterrupt"),
         pytest.param(generator_exit, "failed while it acted: GeneratorExit", marks=pytest.mark.slow),
-        (lambda _: Wild(), "the policy gave a Wild for 1 observations"),
+        pytest.param(lambda _: Wild(), "the policy gave a Wild for 1 observations", marks=pytest.mark.slow),
         pytest.param(
             lambda chunks: chunks.tolist(), "the policy gave a list for 1 observations", marks=pytest.mark.slow
         ),
@@ -201,7 +204,11 @@ def generator_exit(_: Any) -> Any:
             "the policy gave a Tensor for 1 observations",
             marks=pytest.mark.slow,
         ),
-        (lambda chunks: chunks.astype(np.float64), r"ndarray of shape \(1, \d+, 7\) and float64"),
+        pytest.param(
+            lambda chunks: chunks.astype(np.float64),
+            r"ndarray of shape \(1, \d+, 7\) and float64",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             lambda chunks: chunks.astype(object),
             r"ndarray of shape \(1, \d+, 7\) and object",
@@ -336,6 +343,7 @@ def test_a_limit_changes_no_name_of_a_run(settings: ExtractSettings) -> None:
     assert replace(settings, workers=1, inference_limit=5.0).choices() == settings.choices()
 
 
+@pytest.mark.slow
 def test_the_limit_ends_a_process_that_holds_the_interpreter() -> None:
     code = (
         "from probe_kit.hooks.checkpoints.containment import contained\nwith contained(0.2):\n  sum(range(10**12))"

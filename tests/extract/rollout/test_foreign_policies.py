@@ -52,7 +52,11 @@ def fall(_: Any) -> Any:
         (leave, r"PolicyFailedError: pi0-tiny failed while it acted: it called sys.exit\(0\)"),
         (fall, "PolicyFailedError: pi0-tiny failed while it acted: KeyError: 'no such thing'"),
         (lambda chunks: chunks * np.nan, r"ActionError: action .* is not finite \(NaN or infinity\)"),
-        (lambda _: None, "PolicyFailedError: the policy gave a NoneType for 1 observations"),
+        pytest.param(
+            lambda _: None,
+            "PolicyFailedError: the policy gave a NoneType for 1 observations",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             lambda chunks: chunks[:, :, :6],
             r"PolicyFailedError: the policy gave a ndarray of shape \(1, \d+, 6\)",

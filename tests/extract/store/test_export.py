@@ -40,6 +40,7 @@ def test_parquet_holds_a_row_per_vector(recorded_run: Run, tmp_path: Path) -> No
     np.testing.assert_array_equal(np.stack(chosen["vector"]), recorded_run.column(SITE))
 
 
+@pytest.mark.slow
 def test_the_checksum_beside_the_file_is_that_of_the_file(recorded_run: Run, tmp_path: Path) -> None:
     out = export_run(recorded_run.path, "safetensors", tmp_path / "run.safetensors")
     digest, name = (tmp_path / "run.safetensors.sha256").read_text(encoding="utf-8").split()

@@ -1,6 +1,7 @@
 """A run grows: by more items, categories and wordings; what it has stays byte for byte, and nothing ever goes."""
 
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -92,7 +93,9 @@ def contents(run: Run) -> dict[str, Any]:
 # -- what grew is what would have been extracted at once ---------------------------------------------------
 
 
-@pytest.mark.parametrize("chain", CHAINS)
+@pytest.mark.parametrize(
+    "chain", [name if name == "both" else pytest.param(name, marks=pytest.mark.slow) for name in CHAINS]
+)
 def test_a_grown_run_equals_one_extracted_at_once_episode_by_episode(
     chain: str, small_suite: Suite, tmp_path: Path
 ) -> None:
@@ -119,6 +122,7 @@ def test_a_grown_run_equals_one_extracted_at_once_episode_by_episode(
     assert (found.ok, found.finished, found.strays) == (True, True, ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chain", CHAINS)
 def test_growing_changes_no_byte_of_what_is_there(chain: str, small_suite: Suite, tmp_path: Path) -> None:
     *first, last = CHAINS[chain]
@@ -248,6 +252,7 @@ class KilledError(Exception):
     """Stands for a process that ends here."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "point", ["before the record", "after the record", "after some metadata", "after metadata"]
 )
@@ -367,9 +372,14 @@ def test_former_probes_and_seals_are_named_and_not_read(small_suite: Suite, tmp_
 # -- a growth record is a record ---------------------------------------------------------------------------
 
 
+@pytest.fixture(scope="module")
+def untouched(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return extracted(tmp_path_factory.mktemp("grown") / "run", small_suite, COLOR[:2]).path
+
+
 @pytest.fixture
-def grown(small_suite: Suite, tmp_path: Path) -> Path:
-    return extracted(tmp_path / "run", small_suite, COLOR[:2]).path
+def grown(untouched: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(untouched, tmp_path / "run"))
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,7 @@ def test_every_episode_keeps_its_first_and_last_frame(run: Run) -> None:
         assert np.hypot(*(cube(first) - cube(last))) > 10, "the expert carried the cube"
 
 
+@pytest.mark.slow
 def test_thumbnails_change_neither_numbers_nor_settings_and_can_be_left_out(
     settings: ExtractSettings, run: Run, tmp_path: Path
 ) -> None:
@@ -58,6 +59,7 @@ def test_thumbnails_change_neither_numbers_nor_settings_and_can_be_left_out(
     assert read_thumbnail(bare.path, 0) is None
 
 
+@pytest.mark.slow
 def test_environment_processes_give_the_same_thumbnails(
     settings: ExtractSettings, run: Run, tmp_path: Path
 ) -> None:
@@ -66,6 +68,7 @@ def test_environment_processes_give_the_same_thumbnails(
         assert read_thumbnail(other.path, number) == read_thumbnail(run.path, number)
 
 
+@pytest.mark.slow
 def test_a_torn_thumbnail_of_a_killed_process_is_cleared(settings: ExtractSettings, tmp_path: Path) -> None:
     run = extract_run(settings, tmp_path / "run")
     torn = run.path / "frames" / "abc.tmp"

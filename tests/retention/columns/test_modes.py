@@ -88,6 +88,7 @@ def test_the_summary_says_how_many_answers_are_right(shown: Mapping[str, str]) -
     assert f"the VLM answers right in {share:.0f}\u00a0%" in shown["report"]
 
 
+@pytest.mark.slow
 def test_a_policy_is_described_as_before_and_a_mixture_as_both(tmp_path: Path) -> None:
     policy = acted(tmp_path, RIGHT)
     alone, both = formats([policy]), formats([policy, vlm(tmp_path)])

@@ -129,6 +129,7 @@ def test_a_policy_whose_source_was_asked_is_not_compared_with_other_weights(tmp_
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("card", "words"),
     [

@@ -23,12 +23,14 @@ def honest(embedded: Suite) -> tuple[Baseline, ...]:
     return run_baselines(embedded)
 
 
+@pytest.mark.slow
 def test_every_embedded_category_is_within_its_limit(honest: tuple[Baseline, ...], embedded: Suite) -> None:
     assert {baseline.category for baseline in honest} == set(embedded.categories)
     assert {baseline.name for baseline in honest} == {"position", "instruction", "pixels", "statistics"}
     assert [str(baseline) for baseline in honest if not baseline.ok] == []
 
 
+@pytest.mark.slow
 def test_twins_put_every_baseline_at_exactly_one_half(honest: tuple[Baseline, ...]) -> None:
     assert {baseline.accuracy for baseline in honest} == {0.5}
 

@@ -128,6 +128,7 @@ def test_pairs_that_wait_for_a_person_are_written_out_even_if_no_item_is(okvqa_r
     assert len(suite.items) == len(rows) == 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["review.jsonl", "review.csv"])
 def test_a_review_is_not_written_over(name: str, compbench_root: Path, tmp_path: Path) -> None:
     path = tmp_path / name

@@ -37,6 +37,7 @@ def tiles(category: str, count: int = 60) -> list[Any]:
     return [tile for couple in couples(category, count) for tile in (couple.left_tile, couple.right_tile)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("category", list(GENERATORS))
 def test_equal_tiles_give_equal_pixels(category: str) -> None:
     assert [tile.draw().tobytes() for tile in tiles(category, 3)] == [
@@ -60,6 +61,7 @@ def test_there_are_at_least_150_items_without_repeating_a_question(category: str
         assert len(questions) >= 150
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("category", list(GENERATORS))
 def test_a_tile_is_256_pixels_square_and_nothing_touches_its_border(category: str) -> None:
     for tile in tiles(category, 8):

@@ -42,6 +42,7 @@ def test_version_2_asks_the_questions_of_version_1_in_its_words() -> None:
         assert generator.pairs == GENERATORS[category].pairs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("category", CHANGED)
 def test_pictures_stay_on_their_tile_and_stand_out(category: str) -> None:
     for tile in tiles(category):

@@ -30,6 +30,7 @@ def test_baselines_of_a_fair_suite_are_at_chance_and_stored(planted_run: Planted
         assert (score.n, score.chance) == (80, 0.5)
 
 
+@pytest.mark.slow
 def test_a_suite_that_keeps_the_answer_on_one_side_is_found_out(planted_run: PlantedRun) -> None:
     run = planted_run()
     run.episodes["side_correct"] = run.episodes["layout"].map({"original": "left", "swapped": "right"})
@@ -120,6 +121,7 @@ FAILURES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", FAILURES.values(), ids=FAILURES)
 def test_what_is_wrong_is_said_before_any_work_and_leaves_what_retention_reads(
     planted_run: PlantedRun, options: dict[str, object]

@@ -33,6 +33,7 @@ def one_after_another(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> li
         return cross_validate(*arguments)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 @given(groups=st.integers(6, 14), width=st.integers(1, 50), columns=st.integers(1, 4), seed=st.integers(0, 2**31))
 @settings(max_examples=12, deadline=None, derandomize=True, suppress_health_check=KEEPING_THE_PATCH)
 def test_decisions_strengths_and_weights_are_those_of_single_folds(

@@ -135,6 +135,7 @@ REFUSED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("filled")
 @pytest.mark.parametrize(("drawing", "name", "reason"), REFUSED.values(), ids=REFUSED)
 def test_a_default_control_without_its_pictures_is_said_aloud_and_one_that_was_asked_for_is_an_error(
@@ -154,6 +155,7 @@ def test_a_default_control_without_its_pictures_is_said_aloud_and_one_that_was_a
     assert found.scores["exceeds_random_features"].notna().all()
 
 
+@pytest.mark.slow
 def test_the_same_control_is_the_default_in_python_and_on_the_command_line(filled: Path, tmp_path: Path) -> None:
     runs = [run_on(extracted_suite(12), tmp_path / name) for name in ("python", "command")]
     shutil.rmtree(filled)

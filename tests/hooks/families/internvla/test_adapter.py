@@ -50,6 +50,7 @@ class TestInternVLA(AdapterContract):
         return loaded
 
 
+@pytest.mark.slow
 class TestConvertedInternVLA(AdapterContract):
     """One folder of safetensors, whose tensors can be damaged one by one."""
 
@@ -69,6 +70,7 @@ class TestConvertedInternVLA(AdapterContract):
         return {"steps": 5, "guidance": 1.0, "unnorm_key": "fractal20220817_data", "vlm": vlm, "tokenizer": vlm}
 
 
+@pytest.mark.slow
 class TestInternVLAWithoutGuidance(AdapterContract):
     @pytest.fixture
     def policy(self, run: Path) -> InternVLA:

@@ -68,6 +68,7 @@ class TestMagmaWithWholePictures(AdapterContract):
         return [small, Observation(np.tile(large.image, (3, 1, 1)), large.state, large.instruction)]
 
 
+@pytest.mark.slow
 class TestMagmaDrawn(AdapterContract):
     @pytest.fixture
     def policy(self, folder: Path) -> Magma:

@@ -42,6 +42,7 @@ def test_everything_recorded_is_compared_and_within_its_tolerance(golden_magma: 
         assert len(by_status) == len(recorded.files) - INPUTS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_nothing_is_tuned_to_one_reference(tmp_path: Path, variant: str) -> None:
     sizes, steps, fields = VARIANTS[variant]
@@ -55,6 +56,7 @@ def test_nothing_is_tuned_to_one_reference(tmp_path: Path, variant: str) -> None
         assert len(by_status) == len(recorded.files) - INPUTS + 1  # the choice of crops is recorded elsewhere
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hidden_states", "batch_logits", "stage2", "generated_ids", "detok_table"])
 def test_an_output_that_differs_is_over(tmp_path: Path, name: str) -> None:
     sizes, steps, fields = VARIANTS["one crop, then four"]

@@ -64,6 +64,7 @@ class TestFusedLlama(AdapterContract):
         return fused
 
 
+@pytest.mark.slow
 class TestSingleTowerMistralWithATokenizerFile(AdapterContract):
     @pytest.fixture
     def policy(self, mistral: OpenVLA) -> OpenVLA:

@@ -95,6 +95,7 @@ class TestWholeChunkHeardWithinSlotsByTheTrainingCamera(_Letters, AdapterContrac
         return chunked
 
 
+@pytest.mark.slow
 class TestWithoutDepth(_Letters, AdapterContract):
     @pytest.fixture
     def policy(self, flat: SpatialVLA) -> SpatialVLA:

@@ -28,6 +28,7 @@ def test_the_golden_reference_is_reproduced_in_every_output(golden_spatialvla: P
     assert max(c.error or 0 for c in verification.comparisons) < 5e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("output", ["generated_step_hidden", "xyz", "batch_hidden_states", "decode_table"])
 def test_one_wrong_number_in_the_reference_is_noticed(
     golden_spatialvla: Path, tmp_path: Path, output: str
@@ -47,6 +48,7 @@ def test_full_size_keys_are_equal(golden_spatialvla: Path) -> None:
     assert verify_keys("spatialvla", golden_spatialvla / "real_keys.json.gz").passed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own_camera", [True, False])
 def test_a_reference_of_other_sizes_is_compared_in_every_output(tmp_path: Path, own_camera: bool) -> None:
     """Other patches, points, bins, chunk, tokens and padding, recorded from the network itself.

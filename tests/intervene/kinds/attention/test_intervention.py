@@ -189,6 +189,7 @@ def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: ReplaySo
     assert effects.to_rich() is not None
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_gives_the_same_bytes_and_damage_is_found(
     copy: Run, attention_records: InterventionResult, source: ReplaySource, twin: "Policy", tmp_path: Path
 ) -> None:

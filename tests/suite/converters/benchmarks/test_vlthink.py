@@ -68,6 +68,7 @@ def test_signs_named_after_a_side_are_marked_and_can_be_left_out(vlthink_root: P
     assert len(without.items) == 4 * 3
 
 
+@pytest.mark.slow
 def test_real_colours_are_eight_and_eleven_when_repainted(real: Path, tmp_path: Path) -> None:
     suite = convert("vl-think", real, tmp_path / "eight", categories=["color"])
     assert len({item.target_concept for item in suite.items}) == 8
