@@ -39,6 +39,8 @@ FORMER_PLAN_FILE = "plan.json"
 LABEL_FILE, TIMES, LEFT_OUT_FILE = "label.json", "times", "left-out.json"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
 FRAMES, CERTIFICATES, SEALED, PROBES, PROVENANCE = "frames", "certificates", "sealed", "probes", "provenance"
+PROBE_DIRECTIONS = "directions.npz"
+"""Of the files of a probe result, the weights: nine tenths of its bytes."""
 INTERVENTIONS = "interventions"
 TRAJECTORY, TRAJECTORY_AXES = "trajectory", 3
 """The array of what happened in episodes, beside those of streams; an episode that did not act has no object."""

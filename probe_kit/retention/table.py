@@ -216,6 +216,7 @@ def retention_table(
     against: str | None = None,
     labels: Mapping[str, str] | None = None,
     pairs: Sequence[tuple[str, str]] | None = None,
+    categories: Sequence[str] | None = None,
 ) -> RetentionTable:
     """Success rates, probe peaks and retention of several runs, per category and view.
 
@@ -232,6 +233,7 @@ def retention_table(
     compare every VLM run with every acting one, see `vlm_vla_differences`. labels: names of runs in tables and
     figures by their location, instead of their own. pairs: by location, the runs that are compared, each the first
     minus the second, instead of the first run with every other; all of them are one family of tests.
+    categories: rows of these alone, and means over them; probes are those of the whole runs.
     Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
     is not that of the runs, for a run that is given twice, or for `against` or `pairs` where they are none of the
     runs; SceneError for overlapping zones.
@@ -250,7 +252,7 @@ def retention_table(
     if unscored and isinstance(runs, Mapping):
         raise NoTrajectoryError(f"groups cannot be compared by the rule {rule}: {unscored[0]}")
     notes += unscored
-    settings = RowSettings(views, iterations, epsilons, rule, last_steps, absent_below)
+    settings = RowSettings(views, iterations, epsilons, rule, last_steps, absent_below, categories)
     drawn: list[RowWithEstimates] = []
     means: list[RetentionRow] = []
     for name, run in listed:

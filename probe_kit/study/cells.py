@@ -38,7 +38,8 @@ class Cell:
     """A run of the study. settings: what it is played with, without its selection.
 
     model, way: names in the file; way is the condition or the ask. selections: of the blocks that use the run, by
-    their names. unavailable: why it is not played, empty if it is. suite: of all cells.
+    their names. unavailable: why it is not played, empty if it is. suite: of all cells. packed_key: in an archive,
+    the key of the run that was packed.
     """
 
     model: str
@@ -48,6 +49,7 @@ class Cell:
     selections: Mapping[str, Selection]
     suite: PlannedSuite
     unavailable: str = ""
+    packed_key: str = ""
 
     @property
     def name(self) -> str:
@@ -89,6 +91,8 @@ class Cell:
     @cached_property
     def key(self) -> str:
         """Hash of all that the settings decide but the selection: what the run's folder is named by."""
+        if self.packed_key:
+            return self.packed_key
         settings = self.settings
         known = {
             **settings.choices(),

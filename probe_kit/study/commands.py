@@ -1,12 +1,14 @@
 """`probe-kit study`: a whole study from one file."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from probe_kit._terminal.console import counter, marked, out, print_json, print_text, progress, say
+from probe_kit._terminal.console import counter, err, marked, out, print_json, print_text, progress, say
 from probe_kit._terminal.options import AsJson, EnvWorkers, Partial
+from probe_kit.errors import UsageError
 from probe_kit.train.command_options import Jobs
 
 if TYPE_CHECKING:
@@ -45,6 +47,8 @@ def run(
     from probe_kit.study import conduct_study, fit_probes, load_study, plan_study
 
     study = load_study(file)
+    if study.archive is not None and not dry_run:
+        raise UsageError(f"{file} is an archive without activations; nothing can be added to its runs")
     plan = plan_study(study, only)
     if dry_run or as_json:
         print_json(plan.to_json()) if as_json else _print_plan(plan)
@@ -90,23 +94,102 @@ def status(file: File, only: Only = None, as_json: AsJson = False) -> None:
 @app.command("table")
 def table(
     file: File,
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Table of the file.")],
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Table of the file; all of them by default.")
+    ] = None,
     style: Annotated[Style, typer.Option("--format", help="Output format.")] = "table",
     partial: Partial = False,
 ) -> None:
-    """Print a table of a study from its stored runs. Loads no model."""
+    """Print a table of a study, or all, from its stored runs. Loads no model."""
     from probe_kit.retention.formats.latex import latex_table
-    from probe_kit.retention.formats.markdown import markdown_table
     from probe_kit.study import load_study, make_table
+    from probe_kit.study.tables.formats import markdown_text, table_json
 
-    made = make_table(load_study(file), name, partial)
+    study = load_study(file)
+    made = {one: make_table(study, one, partial) for one in ([name] if name else study.study.tables)}
     if style == "json":
-        print_json({"table": made.text.title, "note": made.text.note, "numbers": list(made.numbers)})
-    elif style == "table":
-        _print_table(made.text)
-    else:
-        text = latex_table(made.text) if style == "latex" else f"{markdown_table(made.text)}\n{made.text.note}."
-        print_text(text)
+        found = {one: table_json(own) for one, own in made.items()}
+        print_json(found[name] if name else found)
+        return
+    for own in made.values():
+        if style == "table":
+            _print_table(own.text)
+        else:
+            print_text(latex_table(own.text) if style == "latex" else markdown_text(own))
+    if not name:
+        tests = sum(own.n_tests for own in made.values())
+        say(f"{len(made)} tables with {tests} tests; each is corrected within its own comparison.")
+
+
+@app.command("figure")
+def figure(
+    file: File,
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="Figure of the file; all of them by default.")
+    ] = None,
+    out_folder: Annotated[
+        Path, typer.Option("--out", metavar="FOLDER", help="Folder for PNG and PDF files.")
+    ] = Path("figures"),
+    partial: Partial = False,
+) -> None:
+    """Draw a figure of a study, or all, from its stored runs. Loads no model."""
+    from probe_kit.retention.commands import check_file
+    from probe_kit.retention.displays import save_figures
+    from probe_kit.study import load_study, make_figures
+
+    check_file(out_folder)
+    study = load_study(file)
+    for one in [name] if name else study.study.figures:
+        for path in save_figures(make_figures(study, one, partial), out_folder):
+            out.print(str(path), highlight=False, markup=False, soft_wrap=True)
+
+
+@app.command("pack")
+def pack(
+    file: File,
+    out_file: Annotated[Path, typer.Option("--out", metavar="PATH", help="Zip file (*.zip), or a folder.")],
+    directions: Annotated[bool, typer.Option("--directions", help="With the weights of probes.")] = False,
+    pictures: Annotated[bool, typer.Option("--pictures", help="With frames and videos.")] = False,
+    partial: Partial = False,
+) -> None:
+    """Pack runs without activations, and all tables; `study table PATH` prints them from the archive alone."""
+    from probe_kit.study import load_study, pack_study
+
+    with err.status("packing"):
+        made = pack_study(load_study(file), out_file, partial, directions, pictures)
+    out.print(f"{out_file}: {len(made.keys)} runs, without {', '.join(made.left_out)}", soft_wrap=True)
+    for name, reason in made.missing.items():
+        out.print(f"not packed: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
+
+
+@app.command("publish")
+def publish(
+    file: File,
+    repository: Annotated[str, typer.Argument(metavar="REPO", help="Data set on the hub, as owner/name.")],
+    out_folder: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Folder for the data set.")],
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Write the folder, and upload nothing.")] = False,
+    pull_request: Annotated[
+        bool, typer.Option("--pr", help="Open a pull request in a data set that exists.")
+    ] = False,
+    private: Annotated[bool, typer.Option("--private", help="Make a new data set private.")] = False,
+    licence: Annotated[
+        str | None, typer.Option("--license", metavar="NAME", help="Of the data set, such as cc-by-4.0.")
+    ] = None,
+    partial: Partial = False,
+) -> None:
+    """Publish a study as a data set: card, episodes, tables, archive and hashes. Activations stay here."""
+    from probe_kit.study import load_study, publish_data_set, write_data_set
+
+    with err.status("packing"):
+        made = write_data_set(load_study(file), out_folder, partial, licence)
+    for name, reason in made.missing.items():
+        out.print(f"not in it: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
+    if dry_run:
+        out.print(str(out_folder), highlight=False, markup=False, soft_wrap=True)
+        return
+    with err.status("uploading"):
+        address = publish_data_set(out_folder, repository, pull_request, private)
+    out.print(address, highlight=False, markup=False, soft_wrap=True)
 
 
 def _print_table(text: "TextTable") -> None:

@@ -1,7 +1,7 @@
 """Reading of study files, your own and those of the package."""
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from probe_kit.errors import UsageError
 from probe_kit.study import schema
+from probe_kit.study.archive import RUNS, STUDY_FILE, Pack, open_archive
 from probe_kit.study.cells import Cell
 from probe_kit.study.expansion import expand
 from probe_kit.study.mistakes import Mistake, StudyFileError
@@ -24,12 +25,16 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class LoadedStudy:
-    """A study file without mistakes. file: where it lies. cells: the runs that it needs."""
+    """A study file without mistakes. file: where it lies. cells: the runs that it needs.
+
+    archive: the folder of an archive that it was read from, whose runs hold no activations; else None.
+    """
 
     file: Path
     study: schema.Study
     suite: PlannedSuite
     cells: tuple[Cell, ...]
+    archive: Path | None = None
 
 
 def find_study(name: str) -> Path:
@@ -54,10 +59,12 @@ def load_study(name: str | Path) -> LoadedStudy:
     """Read a study file and expand it; loads no model, draws no picture and needs no network.
 
     Paths in the file are relative to the working directory, as on the command line.
-    name: a path, or the name of a study of the package. Raises UsageError if there is none, and StudyFileError,
-    which lists all mistakes with their lines.
+    name: a path, the name of a study of the package, or an archive of `pack_study`, as a folder or zip file.
+    Raises UsageError if there is none, StudyFileError, which lists all mistakes with their lines, and
+    RunDamagedError for an archive that was changed.
     """
-    file = find_study(str(name))
+    archive = open_archive(name)
+    file = find_study(str(name)) if archive is None else archive / STUDY_FILE
     try:
         text = file.read_text(encoding="utf-8")
         study = schema.Study.model_validate(tomllib.loads(text))
@@ -67,13 +74,23 @@ def load_study(name: str | Path) -> LoadedStudy:
         raise UsageError(f"{file}: {error}. The file is TOML 1.0") from error
     except ValidationError as error:
         raise StudyFileError(str(file), text, _mistakes(error)) from None
-    suite, mistakes = planned_suite(study.suite)
+    suite, mistakes = planned_suite(study.suite) if archive is None else (_packed_suite(archive), [])
     mistakes += reference_mistakes(study, suite)
     if not mistakes:
         cells, mistakes = expand(study, suite)
     if mistakes:
         raise StudyFileError(str(file), text, mistakes)
-    return LoadedStudy(file, study, suite, tuple(cells))
+    if archive is None:
+        return LoadedStudy(file, study, suite, tuple(cells))
+    keys, home = Pack.read(archive).keys, str(archive / RUNS)
+    packed = tuple(replace(cell, packed_key=keys.get(cell.name, "")) for cell in cells)
+    return LoadedStudy(file, study.model_copy(update={"out": home}), suite, packed, archive)
+
+
+def _packed_suite(archive: Path) -> PlannedSuite:
+    """The suite as it was when the study was packed; its items are not in the archive."""
+    suite = Pack.read(archive).suite
+    return PlannedSuite(str(suite["identity"]), dict(suite["items"]), None, "the archive", here=False)
 
 
 def _mistakes(error: ValidationError) -> list[Mistake]:
@@ -114,5 +131,6 @@ _TABLES: dict[str, type[BaseModel]] = {
     "comparisons": schema.ComparisonTable,
     "drift": schema.DriftTable,
     "tables": schema.TableTable,
+    "figures": schema.FigureTable,
 }
 """By the first name of a path, what the tables there may say."""

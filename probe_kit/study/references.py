@@ -30,6 +30,7 @@ def reference_mistakes(study: Study, suite: PlannedSuite) -> list[Mistake]:
     """Everything that is wrong with the names of a file, in the order of its tables."""
     checks: tuple[Callable[[Study, PlannedSuite], Iterator[Mistake]], ...] = (
         _suite, _models, _lineages, _blocks, _excludes, _unused, _probes, _comparisons, _drift, _tables,
+        _figures,
     )  # fmt: skip
     return [mistake for check in checks for mistake in check(study, suite)]
 
@@ -288,6 +289,17 @@ def _tables(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
             if named is not None and named not in known:
                 yield Mistake((*place, part), unknown(part, named, list(known)))
         yield from _kind_of_comparison(study, name)
+        if table.elsewhere is not None:
+            yield from each_unknown((*place, "elsewhere"), "model", table.elsewhere.values, list(study.models))
+            if table.kind != "score":
+                said = f"numbers from elsewhere stand in tables of kind 'score', not {table.kind!r}"
+                yield Mistake((*place, "elsewhere"), said)
+
+
+def _figures(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
+    for name, figure in study.figures.items():
+        yield from each_unknown(("figures", name, "runs"), "block", figure.runs, _block_names(study))
+        yield from _categories(("figures", name, "categories"), figure.categories, suite)
 
 
 _SHOWS = {"ablation": "pairs", "chain": "chain", "groups": "groups"}

@@ -21,6 +21,7 @@ Size = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,3}x[1-9][0-9]{0,3}$")]
 TableKind = Literal[
     "success", "sides", "ablation", "vlms", "vlm-vla", "probing", "groups", "chain", "score", "stages", "drift"
 ]
+FigureKind = Literal["curves", "sides", "dose", "overview"]
 KINDS: tuple[TableKind, ...] = get_args(TableKind)
 
 
@@ -152,14 +153,35 @@ class DriftTable(_Table):
     view: str = "mean"
 
 
+class ElsewhereTable(_Table):
+    """Numbers that were not measured here, beside the score. values: by model. source: where they are from."""
+
+    title: Annotated[str, Field(min_length=1)]
+    source: Annotated[str, Field(min_length=1)]
+    values: Annotated[dict[str, float], Field(min_length=1)]
+
+
 class TableTable(_Table):
-    """A table to print. runs: blocks it is made of; comparison, drift: by name, where its kind shows one."""
+    """A table to print. runs: blocks it is made of; comparison, drift: by name, where its kind shows one.
+
+    elsewhere: of a table of kind `score`, a column of numbers from elsewhere.
+    """
 
     kind: TableKind
     runs: Names | None = None
     comparison: str | None = None
     drift: str | None = None
     categories: Names | None = None
+    elsewhere: ElsewhereTable | None = None
+
+
+class FigureTable(_Table):
+    """A figure to draw. runs: blocks it is made of. view: of the tokens in curves, the first probed by default."""
+
+    kind: FigureKind
+    runs: Names
+    categories: Names | None = None
+    view: str | None = None
 
 
 class Study(_Table):
@@ -181,6 +203,7 @@ class Study(_Table):
     comparisons: dict[Name, ComparisonTable] = {}
     drift: dict[Name, DriftTable] = {}
     tables: dict[Name, TableTable] = {}
+    figures: dict[Name, FigureTable] = {}
 
     @property
     def folder(self) -> str:

@@ -10,6 +10,7 @@ from probe_kit.errors import UsageError
 from probe_kit.statistics import model_groups
 from probe_kit.statistics.estimates.mover import NO_LIMITS
 from probe_kit.statistics.model_groups import exchange_p, welch_interval
+from probe_kit.statistics.paired_tests import flip_gains_p
 
 
 def gap(first: np.ndarray, second: np.ndarray) -> float:
@@ -46,6 +47,22 @@ def test_p_is_below_five_percent_in_at_most_five_percent_of_equal_groups() -> No
     generator = np.random.default_rng(0)
     found = [exchange_p(*generator.standard_normal((2, 4))).p for _ in range(1000)]
     assert np.mean(np.array(found) <= 0.05) < 0.06
+
+
+def test_items_as_the_unit_take_differences_between_models_for_an_effect_of_their_group() -> None:
+    """Three and three models without any effect of the group, as different as the paper's six (8 points).
+
+    Why comparisons of groups lead with p over models: the p over items is small in half of all categories.
+    """
+    generator = np.random.default_rng(0)
+    over_items, over_models = [], []
+    for _ in range(200):
+        rates = generator.normal(0.6, 0.08, 6).clip(0, 1)
+        right = generator.binomial(2, rates[:, None], (6, 150))  # of two layouts, 150 items
+        over_items.append(flip_gains_p(right[:3].sum(axis=0) - right[3:].sum(axis=0), np.arange(150)))
+        over_models.append(exchange_p(*right.mean(axis=1).reshape(2, 3)).p)
+    assert 0.4 < np.mean(np.array(over_items) < 0.05) < 0.75
+    assert np.mean(np.array(over_models) <= 0.05) <= 0.06
 
 
 def test_labels_of_very_many_models_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -181,6 +181,22 @@ MISTAKES: list[tuple[str, str, str]] = [
     ('comparison = "light"', 'comparison = "dark"  # here', "unknown comparison 'dark'"),
     ('comparison = "light"', 'comparison = "tuning"  # here', "'tuning' has no pairs"),
     ('kind = "success"\nruns = ["main"]', 'kind = "success"\nruns = ["mane"]  # here', "unknown block 'mane'"),
+    (
+        "[tables.light]",
+        '[figures.all]\nkind = "overview"\nruns = ["mane"]  # here\n\n[tables.light]',
+        "figures.all.runs: unknown block 'mane'",
+    ),
+    (
+        "[tables.light]",
+        '[figures.all]\nkind = "bars"  # here\nruns = ["main"]\n\n[tables.light]',
+        "figures.all.kind: should be 'curves'",
+    ),
+    (
+        'kind = "success"\nruns = ["main"]',
+        'kind = "success"\nruns = ["main"]\n'
+        'elsewhere = { title = "x", source = "y", values = { base = 1 } }  # here',
+        "numbers from elsewhere stand in tables of kind 'score'",
+    ),
 ]
 ELSEWHERE = {
     "'base' names no untrained network": 'controls = ["untrained"]',

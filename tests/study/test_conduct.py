@@ -120,7 +120,7 @@ def test_tables_are_made_of_stored_runs_alone_and_name_what_is_missing(file: Pat
     with pytest.raises(RunIncompleteError, match=r"broken/short is not whole: .* \(--partial\)"):
         make_table(study, "main")
     made = make_table(study, "main", partial=True)
-    assert made.text.columns == ("system", "Color", "mean")
+    assert made.text.columns == ("system", "Color", "mean", "score")
     assert [cells[0] for cells in made.text.cells] == ["expert", "idle"]
     assert made.text.note.endswith("broken · short is missing")
     light = make_table(study, "light")

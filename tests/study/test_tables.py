@@ -1,13 +1,21 @@
 """Named tables from runs whose outcomes are known."""
 
+from dataclasses import replace
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
+import pytest
 
+from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
+from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.known_used import match_runs
-from probe_kit.study.tables.compared import stages_table
-from tests.retention.asked_runs import acted, asked, probes
+from probe_kit.retention.formats.latex import latex_table
+from probe_kit.statistics.paired_tests import holm
+from probe_kit.study.tables.compared import difference_table, stages_table
+from probe_kit.study.tables.rates import score_table, success_table, vlm_table
+from tests.retention.asked_runs import SaidRun, acted, asked, probes
 
 
 def test_stages_count_items_that_are_right_in_both_layouts(tmp_path: Path) -> None:
@@ -24,3 +32,101 @@ def test_stages_count_items_that_are_right_in_both_layouts(tmp_path: Path) -> No
     (shown,) = with_probes.text.cells
     assert shown[6] == str(number["answered_and_encoded"])
     assert shown[7].startswith(f"{100 * number['share_not_acted_on']:.1f} [")
+
+
+RIGHT = {"emotion": 0.5, "color": 0.9, "shape": 0.7, "traffic": 0.2}
+
+
+def drawn(names: list[str], items: int = 20, seed: int = 0) -> list[SaidRun]:
+    """A policy run per name whose episodes are right with these shares."""
+    draw = np.random.default_rng(seed)
+    right = [{category: draw.random((items, 2)) < share for category, share in RIGHT.items()} for _ in names]
+    return [
+        replace(acted(Path("/made") / name, one, name), path=Path("/made") / name)
+        for name, one in zip(names, right, strict=True)
+    ]
+
+
+def test_domains_of_several_categories_have_the_mean_of_their_category_means() -> None:
+    table = retention_table(drawn(["one", "two"]), pairs=())
+    made = success_table(table)
+    assert made.text.columns == (
+        "system", "Emotion", "Color", "Shape", "physical", "Traffic", "mean", "score",
+    )  # fmt: skip
+    assert made.text.heads == (("", 1), ("social", 1), ("physical", 3), ("normative", 1), ("", 2))
+    rates = {row.category: row.success.sr or 0 for row in table.rows if row.run.label == "one"}
+    shown = dict(zip(made.text.columns, made.text.cells[0], strict=True))
+    assert shown["physical"] == f"{50 * (rates['color'] + rates['shape']):.1f}"
+    assert shown["score"] == f"{200 * (fmean(rates.values()) - 0.5):.2f}"
+    (number,) = [one for one in made.numbers if one["system"] == "one" and one.get("categories")]
+    assert (number["domain"], number["sr"]) == ("physical", pytest.approx((rates["color"] + rates["shape"]) / 2))
+    assert "outcome rule disc; 40 episodes per category" in made.text.note
+
+
+def test_latex_spans_domains_and_divides_what_is_too_wide() -> None:
+    text = latex_table(success_table(retention_table(drawn(["one"]), pairs=())).text)
+    assert r" & \multicolumn{1}{c}{social} & \multicolumn{3}{c}{physical} & " in text
+    assert r"\cmidrule(lr){2-2} \cmidrule(lr){3-5} \cmidrule(lr){6-6}" in text
+    assert "↑" not in text
+    assert r"$\uparrow$" in text
+    heads = (("", 1), ("a", 6), ("b", 6), ("c", 2), ("", 2))
+    columns = tuple(f"c{at}" for at in range(17))
+    wide = latex_table(TextTable("wide", "note", columns, (tuple(map(str, range(17))),), heads))
+    assert [line.count("&") + 1 for line in wide.splitlines() if line.startswith(("c0", "0 "))] == [13, 13, 5, 5]
+    assert wide.count(r"\begin{table}") == 1
+    assert r"c0 & c13 & c14 & c15 & c16 \\" in wide
+
+
+def test_fewer_than_ten_groups_have_no_p_and_no_part_in_holms_correction() -> None:
+    """Twenty items are ten groups in a category; eighteen are nine."""
+    one, two = drawn(["one", "two"])
+    nine = two.episodes[~((two.episodes["category"] == "color") & two.episodes["group_id"].str.endswith("-9"))]
+    made = difference_table(retention_table([one, replace(two, episodes=nine)]), "compared")
+    p = {number["category"]: number["p"] for number in made.numbers}
+    assert p["color"] is None
+    assert None not in (p["emotion"], p["shape"], p["traffic"], p["mean"])
+    known = [(number["p"], number["p_holm"]) for number in made.numbers if number["category"] in RIGHT]
+    assert holm([own for own, _ in known]) == [corrected for _, corrected in known]
+    assert "no p with fewer than 10 independent groups of items" in made.text.note
+    assert dict(zip(p, (cells[4] for cells in made.text.cells), strict=True))["color"] == "18 of 20"
+    assert made.n_tests == 4
+
+
+def test_less_than_four_fifths_of_the_items_in_common_is_marked() -> None:
+    one, two = drawn(["one", "two"], items=30)
+    kept = two.episodes["group_id"].str.rsplit("-", n=1).str[-1].astype(int) < 11
+    made = difference_table(retention_table([one, replace(two, episodes=two.episodes[kept])]), "compared")
+    assert {cells[4] for cells in made.text.cells} == {"22 of 30 !", "88 of 120 !"}
+    assert "! fewer than 80 % of the items in common" in made.text.note
+
+
+def test_numbers_from_elsewhere_stand_beside_the_score_with_their_source() -> None:
+    one, two = drawn(["one", "two"])
+    table = retention_table([one, two], pairs=())
+    made = score_table(table, "LIBERO %", "a paper", {str(one.location): 76.5})
+    assert made.text.columns[-1] == "LIBERO %"
+    assert [cells[-1] for cells in made.text.cells] == ["76.5", "–"]
+    assert "LIBERO %: not measured here, from a paper" in made.text.note
+    (mean, _) = table.means
+    assert mean.success.ci is not None
+    limits = [(end or 0) * 200 - 100 for end in mean.success.ci]
+    assert made.numbers[0]["score_ci"] == pytest.approx(limits)
+
+
+def test_vlms_are_listed_by_prompt_and_size_of_the_picture(tmp_path: Path) -> None:
+    right = {"color": np.ones((20, 2), bool)}
+    run = asked(tmp_path, right, prompt="p2", picture_size="560x480")
+    made = vlm_table(retention_table([run], pairs=()))
+    assert made.text.columns == ("system", "prompt", "picture", "Color", "mean")
+    assert made.text.cells[0][1:3] == ("p2", "560x480")
+
+
+def test_a_rate_whose_interval_and_range_of_guessing_disagree_is_marked() -> None:
+    """Items of a group that answer alike widen the one and the other by different rules."""
+    table = retention_table(drawn(["one"]), pairs=())
+    rows = [replace(row, success=replace(row.success, ci=(0.51, 0.9))) for row in table.rows]
+    made = success_table(replace(table, rows=rows))
+    shown = dict(zip(made.text.columns, made.text.cells[0], strict=True))
+    assert shown["Emotion"].endswith(" *")
+    assert not shown["Color"].endswith("*")
+    assert "disagree about 50 %" in made.text.note

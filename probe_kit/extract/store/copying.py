@@ -3,7 +3,14 @@
 from pathlib import Path
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.run_layout import DATA, ILLUSTRATIONS, LEFT_OUT_FILE, RUN_FILE
+from probe_kit.extract.run_layout import (
+    DATA,
+    ILLUSTRATIONS,
+    LEFT_OUT_FILE,
+    PROBE_DIRECTIONS,
+    PROBES,
+    RUN_FILE,
+)
 from probe_kit.extract.store.format.left_out import is_left_out, left_out_record
 from probe_kit.extract.store.integrity.orphans import known_keys
 from probe_kit.extract.store.locations.locate import locate
@@ -12,13 +19,18 @@ from probe_kit.extract.store.run import Run, open_run
 
 
 def copy_run(
-    path: Path | str | Location, out: Path | str | Location, pictures: bool = False, allow_partial: bool = False
+    path: Path | str | Location,
+    out: Path | str | Location,
+    pictures: bool = False,
+    allow_partial: bool = False,
+    directions: bool = True,
 ) -> Run:
     """Copy the run at `path` to `out` without its activations, and open the copy.
 
     The copy holds plan, outcomes, trajectories, probes, interventions and certificates, byte for byte: every table
     can be made of it. Its identity, stamp and settings are those of the run. `column` and `tokens` raise
-    ActivationsLeftOutError, and nothing can be added to it. pictures: copy frames and videos too.
+    ActivationsLeftOutError, and nothing can be added to it. pictures: copy frames and videos too. directions: copy
+    the weights of probes, without which `ProbeResults.direction` raises RunDamagedError.
     Raises UsageError if anything lies at `out`, and what `open_run` raises.
     """
     run, there = open_run(path, allow_partial), locate(out)
@@ -30,6 +42,8 @@ def copy_run(
         inside = key.removeprefix(f"{DATA}/")
         unwanted = inside != key and is_left_out(inside, arrays)
         if unwanted or (not pictures and key.partition("/")[0] in ILLUSTRATIONS):
+            continue
+        if not directions and key.startswith(f"{PROBES}/") and key.rpartition("/")[2] == PROBE_DIRECTIONS:
             continue
         if run.location.exists(key):
             there.write_record(key, run.location.read(key))

@@ -20,12 +20,16 @@ from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 @dataclass(frozen=True)
 class TextTable:
-    """title and note: what it shows, and what to know when reading it. cells: a row of text per line."""
+    """title and note: what it shows, and what to know when reading it. cells: a row of text per line.
+
+    heads: names over adjoining columns and how many these are, empty names included; drawn in LaTeX.
+    """
 
     title: str
     note: str
     columns: tuple[str, ...]
     cells: tuple[tuple[str, ...], ...]
+    heads: tuple[tuple[str, int], ...] = ()
 
 
 def size_table(means: Sequence[RetentionRow]) -> TextTable | None:

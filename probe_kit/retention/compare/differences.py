@@ -10,6 +10,7 @@ import numpy as np
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.paired_gains import gains_p
+from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.compare.common_items import CommonItems
 from probe_kit.retention.estimators.stream_scores import (
     ACTION,
@@ -69,8 +70,9 @@ class Difference:
     `mean`. Intervals and p are of these models on other items. sr_models, retention_models: of other models,
     where a side is a group of several. call: the captured inference that both were probed at, None without
     probes or where they differ. mode: what the models of both did. n_items: items that all runs of both sides have
-    and that the numbers are of; of_items: items that any of them has. None where that is not known. In a row of
-    category `mean`, numbers are averages over the `categories` that both groups have.
+    and that the numbers are of; of_items: items that any of them has. None where that is not known. n_groups:
+    independent groups of items whose signs `p` flips, None without a p. In a row of category `mean`, numbers are
+    averages over the `categories` that both groups have.
     """
 
     group: str
@@ -97,6 +99,7 @@ class Difference:
     categories: tuple[str, ...] = ()
     n_items: int | None = None
     of_items: int | None = None
+    n_groups: int | None = None
 
 
 @dataclass(frozen=True)
@@ -249,12 +252,15 @@ def _compare(
     return rows
 
 
-def _p(outcomes: tuple[Outcomes, Outcomes], categories: Sequence[str], gaps: Sequence[_Gap]) -> float | None:
-    """Of success rates, if both sides have one on the same items."""
+def _p(
+    outcomes: tuple[Outcomes, Outcomes], categories: Sequence[str], gaps: Sequence[_Gap]
+) -> tuple[float | None, int | None]:
+    """Of success rates, if both sides have one on the same items, and how many groups of items it rests on."""
     if not all(gap.paired and gap.sr is not None for gap in gaps):
-        return None
+        return None, None
     here, there = ([table for name in categories for table in side.get(name, ())] for side in outcomes)
-    return gains_p(here, there)
+    p = gains_p(here, there)
+    return p, None if p is None else len({unit for table in here for unit in units_of(table)})
 
 
 def _row(
@@ -263,7 +269,7 @@ def _row(
     view: str | None,
     gaps: Sequence[_Gap],
     drawn: tuple[Drawn, Drawn],
-    p: float | None,
+    tested: tuple[float | None, int | None],
 ) -> Difference:
     """Of one category, or of the mean of several."""
     rows = [[of_side[category] for category in categories] for of_side in drawn]
@@ -290,7 +296,8 @@ def _row(
         **numbers,  # type: ignore[arg-type]
         sr_models=_models(rows, _sr_of_model),
         retention_models=None if ratio is None else _models(rows, _retention_of_model),
-        p=p,
+        p=tested[0],
+        n_groups=tested[1],
     )
 
 

@@ -28,7 +28,7 @@ class VlmVlaDifference:
     these began with the same frame; None where a run has no hashes. p: exact, signs of whole groups
     flipped, of all items at once in the row `mean`; None unless paired. p_holm: over the categories of all pairs
     of the table, or over the pairs in rows `mean`. source: whether the policy's network grew from the weights that
-    were asked; `unknown` where cards do not say.
+    were asked; `unknown` where cards do not say. n_groups: independent groups of items that `p` rests on.
     """
 
     asked: str
@@ -45,6 +45,7 @@ class VlmVlaDifference:
     p_holm: float | None = None
     source: Relation = "unknown"
     of_items: int | None = None
+    n_groups: int | None = None
 
 
 def vlm_vla_differences(
@@ -138,6 +139,7 @@ def _compare(
         difference_ci=limits(gap.interval),
         p=_p(pair.here, pair.there) if pair.paired else None,
         of_items=pair.of_items,
+        n_groups=len(set(units_of(pair.here))) if pair.paired else None,
     )
     return row, gap
 
@@ -174,4 +176,5 @@ def _mean(pairs: Sequence[_Episodes], rows: Sequence[VlmVlaDifference], gaps: Se
         difference_ci=limits(gap.interval),
         p=_p(pd.concat([one.here for one in pairs]), pd.concat([one.there for one in pairs])) if paired else None,
         of_items=sum(known) if len(known) == len(rows) else None,
+        n_groups=sum(row.n_groups or 0 for row in rows) if paired else None,
     )

@@ -45,19 +45,24 @@ _SIDESTEP = 0.08  # of a layer, so that bars do not hide each other
 
 
 def curves_side_by_side(
-    results: Sequence[ProbeResults], names: Sequence[str], view: str, iterations: Iterations = "best"
+    results: Sequence[ProbeResults],
+    names: Sequence[str],
+    view: str,
+    iterations: Iterations = "best",
+    categories: Sequence[str] | None = None,
 ) -> "Figure":
     """Layer curves of several runs: a panel per category and part of the model, a line per run.
 
     Of iterative streams the best of the iterations at each layer counts. Lines have no intervals: the table says
     whether two runs differ. Along the lower side layers, or depth as a fraction where runs differ in their
-    number. names: of the runs, in order. view: one that some of them were probed in. Raises UsageError if none
-    was.
+    number. names: of the runs, in order. view: one that some of them were probed in. categories: that are shown,
+    all by default. Raises UsageError if none was.
     """
     known = [(at, one) for at, one in enumerate(results) if view in one.settings.views]
     panels_of = [
         (category, part)
         for category in _categories([one for _, one in known])
+        if categories is None or category in categories
         for part in PARTS
         if any(_curve(one, category, view, part, iterations) is not None for _, one in known)
     ]

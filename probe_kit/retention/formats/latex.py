@@ -1,7 +1,8 @@
 """The retention tables in LaTeX: booktabs rules, and five heat colours."""
 
 from collections.abc import Iterable, Sequence
-from itertools import pairwise
+from dataclasses import replace
+from itertools import accumulate, pairwise
 
 from probe_kit.retention.columns.columns import Column
 from probe_kit.retention.columns.lines import TableRow
@@ -26,7 +27,13 @@ _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
     ">": "$>$",
     "·": r"$\cdot$",
     "✓": r"$^{*}$",
+    "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$",
+    "→": r"$\rightarrow$",
+    "π": r"$\pi$",
 }
+MOST_COLUMNS = 13
+"""Of a tabular; a wider table of text is printed as several below each other, each with the first column."""
 
 
 def latex(
@@ -65,27 +72,73 @@ def _table(table: Table) -> str:
 
 
 def latex_table(table: TextTable) -> str:
-    """A table of text as a `table` environment; needs the package booktabs."""
+    """A table of text as a `table` environment; needs the package booktabs.
+
+    Its heads span their columns. A table of more than MOST_COLUMNS is divided between heads.
+    """
+    return _in_table(f"{table.title} ({table.note})", [_tabular_of(part) for part in _parts(table)])
+
+
+def _tabular_of(table: TextTable) -> list[str]:
     lines = [_line(map(_marked, cells)) for cells in table.cells]
-    return _environment(f"{table.title} ({table.note})", table.columns, lines)
+    return _tabular(table.columns, lines, _heads(table.heads))
+
+
+def _heads(heads: Sequence[tuple[str, int]]) -> list[str]:
+    """A line of names over several columns, and the rules below them."""
+    if not heads:
+        return []
+    ends = list(accumulate(count for _, count in heads))
+    rules = [
+        rf"\cmidrule(lr){{{end - count + 1}-{end}}}"
+        for (name, count), end in zip(heads, ends, strict=True)
+        if name
+    ]
+    return [_line(rf"\multicolumn{{{count}}}{{c}}{{{escape(name)}}}" for name, count in heads), " ".join(rules)]
+
+
+def _parts(table: TextTable) -> list[TextTable]:
+    """Tables of at most MOST_COLUMNS, each with the first column; a head that is wider stays whole."""
+    if len(table.columns) <= MOST_COLUMNS:
+        return [table]
+    first, *others = table.heads or (("", 1) for _ in table.columns)
+    parts: list[list[tuple[int, tuple[str, int]]]] = [[]]
+    at = first[1]
+    for head in others:
+        if parts[-1] and first[1] + sum(count for _, (_, count) in parts[-1]) + head[1] > MOST_COLUMNS:
+            parts.append([])
+        parts[-1].append((at, head))
+        at += head[1]
+    return [_part(table, first, part) for part in parts]
+
+
+def _part(table: TextTable, first: tuple[str, int], heads: Sequence[tuple[int, tuple[str, int]]]) -> TextTable:
+    start, end = heads[0][0], heads[-1][0] + heads[-1][1][1]
+    columns, *cells = ((*row[: first[1]], *row[start:end]) for row in (table.columns, *table.cells))
+    shown = (first, *(head for _, head in heads)) if table.heads else ()
+    return replace(table, columns=columns, cells=tuple(cells), heads=shown)
 
 
 def _environment(caption: str, columns: Sequence[str], lines: Sequence[str]) -> str:
-    return "\n".join(
-        [
-            r"\begin{table}",
-            rf"\caption{{{escape(caption)}}}",
-            rf"\begin{{tabular}}{{{'l' * len(columns)}}}",
-            r"\toprule",
-            _line(map(_heading, columns)),
-            r"\midrule",
-            *lines,
-            r"\bottomrule",
-            r"\end{tabular}",
-            r"\end{table}",
-            "",
-        ]
-    )
+    return _in_table(caption, [_tabular(columns, lines)])
+
+
+def _in_table(caption: str, tabulars: Sequence[Sequence[str]]) -> str:
+    body = [line for at, tabular in enumerate(tabulars) for line in ([r"\par\medskip"] if at else []) + [*tabular]]
+    return "\n".join([r"\begin{table}", rf"\caption{{{escape(caption)}}}", *body, r"\end{table}", ""])
+
+
+def _tabular(columns: Sequence[str], lines: Sequence[str], heads: Sequence[str] = ()) -> list[str]:
+    return [
+        rf"\begin{{tabular}}{{{'l' * len(columns)}}}",
+        r"\toprule",
+        *heads,
+        _line(map(_heading, columns)),
+        r"\midrule",
+        *lines,
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
 
 
 def _line(cells: Iterable[str]) -> str:

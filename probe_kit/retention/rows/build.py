@@ -73,6 +73,7 @@ class RowSettings:
     rule: str = DEFAULT_RULE
     last_steps: int = 1
     absent_below: float = ABSENT_BELOW
+    categories: Sequence[str] | None = None
 
 
 def run_rows(
@@ -93,6 +94,7 @@ def run_rows(
     drawn = [
         _row(judged, results, settings, group, str(category), episodes, view)
         for category, episodes in judged.run.episodes.groupby("category", sort=False)
+        if settings.categories is None or category in settings.categories
         for view in shown
     ]
     return [

@@ -1,10 +1,10 @@
 """Tables of differences: conditions, steps of a chain, groups of models, and VLMs against policies."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from probe_kit.retention.columns.text import (
     difference_interval,
-    difference_items,
     difference_test,
     models_test,
     number,
@@ -12,33 +12,62 @@ from probe_kit.retention.columns.text import (
     with_limits,
 )
 from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.compare.common_items import MANY
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.compare.known_used import OVERALL, KnownUsedTable
 from probe_kit.retention.compare.vlm_vla import VlmVlaDifference
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.retention.table import RetentionTable
-from probe_kit.study.tables.named_table import NamedTable, Number
+from probe_kit.statistics.multiple_testing import corrected
+from probe_kit.study.tables.named_table import NamedTable, Number, caption
 from probe_kit.suite.categories import category_of
 
 _TEST = "p: exact, signs of whole groups of items flipped; (Holm) over all categories and pairs of this comparison"
+FEWEST_GROUPS = 10
+"""Of items, with which a difference is tested."""
+_FEW = "!"
 
 
 def difference_table(table: RetentionTable, title: str) -> NamedTable:
     """Differences of success rates, a row per pair and category; the whole comparison is one family of tests."""
-    found = _once(table.differences)
+    found = _tested(_once(table.differences))
     cells = tuple(
         (
             f"{row.group} − {row.minus}",
             _category(row.category),
             difference_interval(row.sr, row.sr_ci),
             difference_test(row),
-            difference_items(row) or "all",
+            _items(row.n_items, row.of_items),
         )
         for row in found
     )
-    columns = ("systems", "category", "difference, points [95 %]", "p (Holm)", "items in common")
-    made = NamedTable(TextTable(title, _TEST, columns, cells), tuple(map(_number, found)))
-    return made.with_note([sentence.removesuffix(".") for sentence in table.unpaired])
+    columns = ("systems", "category", "difference, points [95 %]", "p (Holm)", "items")
+    made = NamedTable(TextTable(title, caption(table, [_TEST]), columns, cells), tuple(map(_number, found)))
+    return made.with_note([*_remarks(found), *(sentence.removesuffix(".") for sentence in table.unpaired)])
+
+
+def _tested[Compared: (Difference, VlmVlaDifference)](rows: Sequence[Compared]) -> list[Compared]:
+    """The same without tests of fewer than FEWEST_GROUPS groups, and Holm's p over those that are left."""
+    kept = [row if (row.n_groups or 0) >= FEWEST_GROUPS else replace(row, p=None) for row in rows]
+    p_holm = corrected(kept, lambda row: row.p, lambda row: row.category == MEAN)
+    return [replace(row, p_holm=p) for row, p in zip(kept, p_holm, strict=True)]
+
+
+def _items(count: int | None, of_count: int | None) -> str:
+    """Items in common, of how many where some are left out, and a mark where that is more than a fifth."""
+    if count is None or of_count is None:
+        return "other items" if count is None else str(count)
+    if count == of_count:
+        return str(count)
+    return f"{count} of {of_count}" + (f" {_FEW}" if count < MANY * of_count else "")
+
+
+def _remarks(rows: Sequence[Difference] | Sequence[VlmVlaDifference]) -> list[str]:
+    """What marks and missing p-values of these rows mean."""
+    left_out = any(row.n_items is not None and (row.n_items < MANY * (row.of_items or 0)) for row in rows)
+    few = any(row.n_groups is not None and row.n_groups < FEWEST_GROUPS for row in rows)
+    found = [f"{_FEW} fewer than {100 * MANY:.0f} % of the items in common"] if left_out else []
+    return found + ([f"no p with fewer than {FEWEST_GROUPS} independent groups of items"] if few else [])
 
 
 def group_table(table: RetentionTable, title: str) -> NamedTable:
@@ -58,11 +87,13 @@ def group_table(table: RetentionTable, title: str) -> NamedTable:
         "Welch's interval; the last column is of these models on other items"
     )
     columns = ("groups", "category", "p over models (least)", "these models, points [95 %]")
-    return NamedTable(TextTable(title, note, columns, cells), tuple(map(_number, found)))
+    numbers = tuple({**_number(row), "p": None, "p_holm": None} for row in found)
+    return NamedTable(TextTable(title, caption(table, [note]), columns, cells), numbers)
 
 
-def vlm_vla_table(found: Sequence[VlmVlaDifference]) -> NamedTable:
+def vlm_vla_table(differences: Sequence[VlmVlaDifference]) -> NamedTable:
     """Share right of VLMs minus success rate of policies, where the file names the VLM of a policy."""
+    found = _tested(differences)
     cells = tuple(
         (
             f"{row.asked} − {row.acted}",
@@ -71,7 +102,7 @@ def vlm_vla_table(found: Sequence[VlmVlaDifference]) -> NamedTable:
             percent(row.sr),
             with_limits(percent(row.difference), row.difference_ci, percent),
             number(row.p_holm, 4),
-            str(row.n_items),
+            _items(row.n_items, row.of_items),
         )
         for row in found
     )
@@ -87,6 +118,8 @@ def vlm_vla_table(found: Sequence[VlmVlaDifference]) -> NamedTable:
             "p": row.p,
             "p_holm": row.p_holm,
             "items": row.n_items,
+            "of_items": row.of_items,
+            "groups": row.n_groups,
             "same_frames": row.same_frames,
             "source": row.source,
         }
@@ -95,7 +128,7 @@ def vlm_vla_table(found: Sequence[VlmVlaDifference]) -> NamedTable:
     other = "; some pairs began with OTHER first frames" if any(row.same_frames is False for row in found) else ""
     note = f"{_TEST.replace('this comparison', 'the table')}{other}"
     columns = ("systems", "category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p (Holm)", "items")
-    return NamedTable(TextTable("VLM − VLA", note, columns, cells), tuple(numbers))
+    return NamedTable(TextTable("VLM − VLA", note, columns, cells), tuple(numbers)).with_note(_remarks(found))
 
 
 def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
@@ -161,6 +194,7 @@ def _number(row: Difference) -> Number:
         "p_holm": row.p_holm,
         "items": row.n_items,
         "of_items": row.of_items,
+        "groups": row.n_groups,
         "p_over_models": None if models is None else models.p,
         "least_p_over_models": None if models is None else models.smallest_p,
         "models_ci": None if models is None else models.ci,

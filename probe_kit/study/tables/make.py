@@ -1,23 +1,31 @@
 """Making of a study's named tables."""
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import product
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.extract.store.provenance import differences
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
 from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
 from probe_kit.retention.compare.vlm_vla import vlm_vla_differences
 from probe_kit.retention.table import RetentionTable
+from probe_kit.study.archive import TABLES, Pack
 from probe_kit.study.cells import Cell, Selection
+from probe_kit.study.drift.measures import CategoryDrift, measure_drift
 from probe_kit.study.mistakes import unknown
 from probe_kit.study.planned_suite import slugs
 from probe_kit.study.reading import LoadedStudy
-from probe_kit.study.schema import ComparisonTable, TableTable
+from probe_kit.study.schema import ComparisonTable, DriftTable, TableTable
 from probe_kit.study.tables.compared import difference_table, group_table, stages_table, vlm_vla_table
+from probe_kit.study.tables.drifts import drift_table
+from probe_kit.study.tables.formats import table_of_record
 from probe_kit.study.tables.named_table import NamedTable
-from probe_kit.study.tables.rates import probing_table, score_table, sides_table, success_table
+from probe_kit.study.tables.rates import probing_table, score_table, sides_table, success_table, vlm_table
 from probe_kit.study.tables.stored_runs import StoredRun, StoredRuns, of_blocks, stored_runs
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results
@@ -27,43 +35,72 @@ if TYPE_CHECKING:
 
 _OF_RUNS: Mapping[str, Callable[[RetentionTable], NamedTable]] = {
     "success": success_table,
-    "vlms": success_table,
+    "vlms": vlm_table,
     "sides": sides_table,
-    "score": score_table,
-    "probing": probing_table,
 }
 
 
 def make_table(study: LoadedStudy, name: str, partial: bool = False) -> NamedTable:
     """A table of a study file, from stored runs alone: no model and no simulator.
 
-    partial: accept runs that are missing or unfinished; the note names them. Raises UsageError for an unknown name
-    or a kind that no code makes yet, RunIncompleteError for runs that are missing, and what `open_run` raises.
+    partial: accept runs that are missing or unfinished; the note names them. Raises UsageError for an unknown
+    name, RunIncompleteError for runs that are missing, and what `open_run` raises.
     """
     if name not in study.study.tables:
         raise UsageError(unknown("table", name, list(study.study.tables)))
     table = study.study.tables[name]
-    categories = None if table.categories is None else slugs(table.categories)
-    runs = stored_runs(study, _wanted(study, table), partial, categories)
+    if study.archive is not None and table.kind == "drift":
+        return _packed(study.archive, name)
+    runs = stored_runs(study, _wanted(study, table), partial, _categories(table))
     if not runs.found:
         raise UsageError(
             f"no run of the table {name!r} is stored. Play them with `probe-kit study run {study.file}`"
         )
-    return _made(study, table, runs, name).with_note(runs.missing)
+    return _made(study, table, runs, name).with_note([*runs.missing, *_versions(runs)])
+
+
+def _categories(table: TableTable) -> tuple[str, ...] | None:
+    return None if table.categories is None else slugs(table.categories)
+
+
+def _packed(archive: Path, name: str) -> NamedTable:
+    """A table as it was packed, because it is made of activations."""
+    try:
+        return table_of_record(json.loads((archive / TABLES / f"{name}.json").read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        why = Pack.read(archive).missing.get(f"table {name}", "it was not made")
+        raise UsageError(f"the archive holds no table {name!r}: {why}") from None
+
+
+def _versions(runs: StoredRuns) -> list[str]:
+    """What changes numbers and is not the same for all runs, such as the version of torch."""
+    made = [own for one in runs.found for own in one.run.provenances.values()]
+    different = ", ".join(differences(made))
+    return [f"runs were made with different {different}"] if different else []
 
 
 def _made(study: LoadedStudy, table: TableTable, runs: StoredRuns, name: str) -> NamedTable:
     labels, opened = runs.labels(study), [one.run for one in runs.found]
     if table.kind in _OF_RUNS:
         return _OF_RUNS[table.kind](retention_table(opened, labels=labels, pairs=()))
+    if table.kind == "score":
+        found, further = retention_table(opened, labels=labels, pairs=()), table.elsewhere
+        if further is None:
+            return score_table(found)
+        named = {one.place: one.cell.model for one in runs.found}
+        values = {place: further.values[name] for place, name in named.items() if name in further.values}
+        return score_table(found, further.title, further.source, values)
     if table.kind == "vlm-vla":
         read = [scored(run, "text") for run in opened]
         return vlm_vla_table(vlm_vla_differences(read, labels, _sources(study, runs.found)))
+    if table.kind == "probing":
+        probed, chosen = [one.probed.in_wording() for one in runs.found], _categories(table)
+        return probing_table(retention_table(probed, labels=labels, pairs=(), categories=chosen))
+    if table.kind == "drift":
+        return _drift(study, study.study.drift[table.drift or ""], runs, labels, name)
     if table.kind == "stages":
         return stages_table(_joins(study, runs, labels))
-    comparison = study.study.comparisons.get(table.comparison or "")
-    if comparison is None:
-        raise UsageError(f"tables of kind {table.kind!r} are not made by this version; {name!r} is one")
+    comparison = study.study.comparisons[table.comparison or ""]
     if comparison.groups is not None:
         return group_table(retention_table(_groups(study, comparison.groups, runs), labels=labels), name)
     pairs = _pairs(comparison, runs.found)
@@ -72,6 +109,10 @@ def _made(study: LoadedStudy, table: TableTable, runs: StoredRuns, name: str) ->
 
 def _wanted(study: LoadedStudy, table: TableTable) -> Callable[[Cell], Selection | None]:
     """What a table shows of each cell."""
+    if table.kind == "drift":
+        pairs = study.study.drift[table.drift or ""].pairs
+        names = {cell.name for pair in pairs for side in pair for cell in _side(study.cells, side)}
+        return lambda cell: cell.selection if cell.name in names else None
     comparison = study.study.comparisons.get(table.comparison or "")
     if comparison is None:
         return of_blocks(table.runs or ())
@@ -131,12 +172,35 @@ def _sources(study: LoadedStudy, found: tuple[StoredRun, ...]) -> list[tuple[str
     ]
 
 
+def _drift(
+    study: LoadedStudy, table: DriftTable, runs: StoredRuns, labels: Mapping[str, str], name: str
+) -> NamedTable:
+    """Every pair of the file whose runs are both stored."""
+    there = {one.cell.name: one for one in runs.found}
+    found: dict[tuple[str, str], list[CategoryDrift]] = {}
+    for cells in ([_side(study.cells, side) for side in pair] for pair in table.pairs):
+        for before, after in ((there.get(one.name), there.get(other.name)) for one, other in product(*cells)):
+            if before is not None and after is not None and before.cell.seed == after.cell.seed:
+                sides = (before.probed.in_wording(), after.probed.in_wording())
+                shown = set(before.run.items["category"])
+                each = measure_drift(*sides, table.view, labels)
+                found[labels[before.place], labels[after.place]] = [one for one in each if one.category in shown]
+    return drift_table(found, name, table.view)
+
+
+def _side(cells: Sequence[Cell], side: str) -> list[Cell]:
+    """The runs that a side of a pair names: those of a model's first condition, or of the one that is given."""
+    model, _, way = side.partition("/")
+    own = [cell for cell in cells if cell.model == model and (cell.way == way if way else not cell.asks)]
+    return [cell for cell in own if cell.way == own[0].way]
+
+
 def _joins(study: LoadedStudy, runs: StoredRuns, labels: Mapping[str, str]) -> list[KnownUsedTable]:
     """Every policy run joined with the run of its VLM, with the probes of the policy where there are any."""
-    opened = {one.place: one.run for one in runs.found}
+    opened = {one.place: one for one in runs.found}
     joins = [
         replace(
-            match_runs(scored(opened[vlm], "text"), opened[policy], _probes(opened[policy])),
+            match_runs(scored(opened[vlm].run, "text"), opened[policy].run, _probes(opened[policy].probed)),
             asked=labels[vlm],
             acted=labels[policy],
         )

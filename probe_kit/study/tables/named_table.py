@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.table import RetentionTable
 from probe_kit.suite.categories import category_of, in_order
 
 Number = Mapping[str, Any]
@@ -21,6 +22,26 @@ class NamedTable:
         """The same with more sentences below it."""
         note = "; ".join([self.text.note, *sentences])
         return replace(self, text=replace(self.text, note=note))
+
+    @property
+    def n_tests(self) -> int:
+        """How many tests the table prints."""
+        return sum(
+            number.get("p") is not None or number.get("p_over_models") is not None for number in self.numbers
+        )
+
+
+def caption(table: RetentionTable, sentences: Sequence[str]) -> str:
+    """What a table is of: sentences, the outcome rule, the captured inference, and episodes per category."""
+    acted = any(row.run.mode == "acts" and row.success.sr is not None for row in table.rows)
+    calls = sorted({row.run.call for row in table.rows if row.run.call is not None})
+    counts = sorted({row.success.n_episodes for row in table.rows})
+    found = [*sentences]
+    found += [f"outcome rule {table.rule}"] if acted else []
+    found += [f"captured inference {', '.join(map(str, calls))}"] if calls and calls != [0] else []
+    if counts:
+        found.append(f"{counts[0] if len(counts) == 1 else f'{counts[0]} to {counts[-1]}'} episodes per category")
+    return "; ".join(found)
 
 
 def titles(categories: Sequence[str]) -> tuple[str, ...]:

@@ -1,23 +1,54 @@
 """Tables with a row per system and a column per category: success rates, sides, scores and probes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from statistics import fmean
 
-from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.text import percent
+from probe_kit.retention.behaviour.success_rate import Regime, normalised_score
+from probe_kit.retention.columns.text import percent, retention_value, with_limits
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
-from probe_kit.study.tables.named_table import NamedTable, Number, ordered, titles
+from probe_kit.study.tables.named_table import NamedTable, Number, caption, ordered, titles
+from probe_kit.suite.categories import OWN_DOMAIN, category_of
 
 MARKS = {Regime.KNOWLEDGE: " ↑", Regime.FAILURE: " ↓"}
+DISAGREES = "*"
+"""Of a rate whose 95 % interval and whose regime say different things about guessing."""
 _MARKED = "↑ above what guessing reaches, ↓ below it, at 95 % with items as the unit"
 _MEAN = "the mean is over the categories that a system has"
-Cell = Callable[[RetentionRow], str]
+OfSystem = Mapping[str, RetentionRow]
+"""Rows of one system by category, its mean among them."""
+
+
+@dataclass(frozen=True)
+class _Column:
+    """heading: of the column. domain: the head over it, empty for none. cell: what it says of a system."""
+
+    heading: str
+    domain: str
+    cell: Callable[[OfSystem], str]
 
 
 def success_table(table: RetentionTable) -> NamedTable:
-    """Success rates of policies, and shares right of VLMs, by system and category; the mean last."""
-    return _pivot(table, "Success rate %", f"{_MARKED}; {_MEAN}", success_cell)
+    """Success rates of policies, and shares right of VLMs, by system and category; means and score last.
+
+    A domain of several categories has a mean of its own, of the category means.
+    """
+    columns = [*_by_category(table, success_cell, domain_means=True), _SCORE]
+    made = _pivot(table, "Success rate %", [_MARKED, *_disagreement(table), _MEAN], columns)
+    return NamedTable(made.text, (*made.numbers, *_domain_numbers(table)))
+
+
+def vlm_table(table: RetentionTable) -> NamedTable:
+    """Shares right of VLMs by prompt, size of the picture and category."""
+    asked = [
+        _Column("prompt", "", lambda own: own[MEAN].answers.prompt or "–"),
+        _Column("picture", "", lambda own: own[MEAN].answers.picture_size or "–"),
+    ]
+    columns = [*asked, *_by_category(table, success_cell)]
+    return _pivot(table, "Share right %", [_MARKED, *_disagreement(table), _MEAN], columns)
 
 
 def success_cell(row: RetentionRow) -> str:
@@ -25,30 +56,76 @@ def success_cell(row: RetentionRow) -> str:
     own = row.success
     if own.sr is None:
         return "–"
-    return percent(own.sr) + ("" if own.regime is None else MARKS.get(own.regime, ""))
+    if own.regime is None:
+        return percent(own.sr)
+    return percent(own.sr) + MARKS.get(own.regime, "") + (f" {DISAGREES}" if _disagrees(row) else "")
+
+
+def _disagrees(row: RetentionRow) -> bool:
+    """Whether the interval excludes one half and the regime does not, or the other way round."""
+    low, high = row.success.ci or (None, None)
+    if row.success.regime is None or low is None or high is None:
+        return False
+    return (low > 0.5 or high < 0.5) != (row.success.regime != Regime.NO_RELIABLE_KNOWLEDGE)
+
+
+def _disagreement(table: RetentionTable) -> list[str]:
+    found = any(_disagrees(row) for row in table.rows)
+    return ["* the 95 % interval and the range of guessing disagree about 50 %"] if found else []
 
 
 def sides_table(table: RetentionTable) -> NamedTable:
-    """Success rates where the correct picture lay on the left and on the right."""
-    note = f"left / right: side of the correct picture; {_MEAN}"
-    return _pivot(
-        table, "Success rate % by side", note, lambda row: _two(row.success.sr_left, row.success.sr_right)
-    )
+    """Success rates where the correct picture lay on the left and on the right, then by layout of the pictures."""
+    by_side = _Column("half", "", lambda _: "left / right")
+    by_layout = _Column("half", "", lambda _: "original / swapped")
+    note = ["left, right: side of the correct picture", _MEAN]
+    title = "Success rate % by side and layout"
+    sides = _pivot(table, title, note, [by_side, *_by_category(table, _sides)])
+    layouts = _pivot(table, title, note, [by_layout, *_by_category(table, _layouts)])
+    cells = tuple(row for both in zip(sides.text.cells, layouts.text.cells, strict=True) for row in both)
+    text = TextTable(sides.text.title, sides.text.note, sides.text.columns, cells, sides.text.heads)
+    return NamedTable(text, sides.numbers)
+
+
+def _sides(row: RetentionRow) -> str:
+    return _two(row.success.sr_left, row.success.sr_right)
+
+
+def _layouts(row: RetentionRow) -> str:
+    return _two(row.success.sr_original, row.success.sr_swapped)
 
 
 def _two(left: float | None, right: float | None) -> str:
     return "–" if left is None and right is None else f"{percent(left)} / {percent(right)}"
 
 
-def score_table(table: RetentionTable) -> NamedTable:
-    """The normalised score of every system: 0 for guessing, 100 for perfection."""
+def _scored(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+_SCORE = _Column("score", "", lambda own: _scored(own[MEAN].success.normalised_score))
+
+
+def score_table(
+    table: RetentionTable, title: str = "", source: str = "", elsewhere: Mapping[str, float] | None = None
+) -> NamedTable:
+    """The normalised score of every system with its interval: 0 for guessing, 100 for perfection.
+
+    title, source, elsewhere: a further column of numbers that were not measured here, by location of the run.
+    """
     means = [row for row in once_per_run(table.means) if row.success.sr is not None]
+    further = {} if elsewhere is None else elsewhere
     cells = tuple(
         (
             row.run.label,
-            "–" if row.success.normalised_score is None else f"{row.success.normalised_score:.2f}",
+            with_limits(_scored(row.success.normalised_score), _score_limits(row), _scored),
             percent(row.success.sr),
             str(len(row.categories)),
+            *(
+                []
+                if elsewhere is None
+                else [f"{further[place]:g}" if (place := row.run.location) in further else "–"]
+            ),
         )
         for row in means
     )
@@ -56,29 +133,42 @@ def score_table(table: RetentionTable) -> NamedTable:
         {
             "system": row.run.label,
             "score": row.success.normalised_score,
+            "score_ci": _score_limits(row),
             "sr": row.success.sr,
             "ci": row.success.ci,
+            "elsewhere": further.get(row.run.location),
+            "elsewhere_source": source or None,
         }
         for row in means
     ]
-    note = "score = (mean % − 50) / 50 × 100 over the categories of a system"
-    columns = ("system", "score", "mean %", "categories")
-    return NamedTable(TextTable("Normalised score", note, columns, cells), tuple(numbers))
+    note = ["score = (mean % − 50) / 50 × 100 over the categories of a system, 95 % interval"]
+    note += [f"{title}: not measured here, from {source}"] if elsewhere is not None else []
+    columns = ("system", "score [95 %]", "mean %", "categories", *([] if elsewhere is None else [title]))
+    return NamedTable(TextTable("Normalised score", caption(table, note), columns, cells), tuple(numbers))
+
+
+def _score_limits(row: RetentionRow) -> tuple[float | None, float | None] | None:
+    """The interval of the mean on the scale of the score, which is linear in it."""
+    if row.success.ci is None:
+        return None
+    low, high = (None if end is None else (end - 0.5) * 200 for end in row.success.ci)
+    return low, high
 
 
 def probing_table(table: RetentionTable) -> NamedTable:
-    """Best accuracy in the backbone and where the action is made, and retention, as means over the categories."""
+    """Best accuracy in the backbone and where the action is made, and retention, by category and as a mean."""
+    rows = [row for row in table.all_rows if row.view is not None]
     cells = tuple(
         (
             row.run.label,
             row.view or "–",
+            row.category if row.category == MEAN else category_of(row.category).title,
             percent(row.backbone.score),
             percent(row.action.score),
-            _ratio(row.retention.value if row.retention.defined else None),
-            _ratio(row.retention.published),
-            str(len(row.categories)),
+            retention_value(row),
+            _scored(row.retention.published),
         )
-        for row in table.means
+        for row in rows
     )
     numbers = [
         {
@@ -96,13 +186,13 @@ def probing_table(table: RetentionTable) -> NamedTable:
         }
         for row in table.all_rows
     ]
-    note = "cross-fitted scores of the best sites; published: the paper's mean of ratios per category"
-    columns = ("system", "view", "backbone %", "action %", "retention", "published", "categories")
-    return NamedTable(TextTable("Probes", note, columns, cells), tuple(numbers))
-
-
-def _ratio(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
+    note = [
+        "cross-fitted scores of the best sites",
+        "n/a: the backbone's signal is not shown; such categories are not in the mean of retention",
+        "published: the paper's ratio of best accuracies, in the mean its mean over categories",
+    ]
+    columns = ("system", "view", "category", "backbone %", "action %", "retention [95 %]", "published")
+    return NamedTable(TextTable("Probes", caption(table, note), columns, cells), tuple(numbers))
 
 
 def once_per_run(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
@@ -110,17 +200,70 @@ def once_per_run(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
     return list({(row.run.location, row.category): row for row in reversed(rows)}.values())[::-1]
 
 
-def _pivot(table: RetentionTable, title: str, note: str, cell: Cell) -> NamedTable:
-    rows = once_per_run([*table.rows, *table.means])
-    categories = ordered([row.category for row in rows if row.category != MEAN])
-    by_place = {(row.run.label, row.category): row for row in rows}
-    systems = list(dict.fromkeys(row.run.label for row in rows))
-    columns = ("system", *titles(categories), MEAN)
-    cells = tuple(
-        (name, *(cell(by_place[name, one]) if (name, one) in by_place else "–" for one in (*categories, MEAN)))
-        for name in systems
+def domain_scores(table: RetentionTable) -> dict[str, dict[str, float]]:
+    """By domain and system, the normalised score of the mean over the domain's categories."""
+    found: dict[str, dict[str, float]] = {}
+    for domain, members in _domains(table):
+        for name, own in _systems(table).items():
+            mean = _mean_of(own, members)
+            if mean is not None:
+                found.setdefault(domain or OWN_DOMAIN, {})[name] = normalised_score([mean])
+    return found
+
+
+# -- columns by category -----------------------------------------------------------------------------------------
+
+
+def _by_category(
+    table: RetentionTable, cell: Callable[[RetentionRow], str], domain_means: bool = False
+) -> Iterator[_Column]:
+    """A column per category under its domain, then the mean."""
+
+    def of(category: str) -> Callable[[OfSystem], str]:
+        return lambda own: cell(own[category]) if category in own else "–"
+
+    for domain, members in _domains(table):
+        for name, title in zip(members, titles(members), strict=True):
+            yield _Column(title, domain, of(name))
+        if domain_means and domain and len(members) > 1:
+            yield _Column(domain, domain, lambda own, inside=tuple(members): percent(_mean_of(own, inside)))  # type: ignore[misc]
+    yield _Column(MEAN, "", of(MEAN))
+
+
+def _domains(table: RetentionTable) -> list[tuple[str, list[str]]]:
+    """Categories of a table in the order of the paper, by domain; those of a suite's own have none."""
+    categories = ordered([row.category for row in table.rows])
+    named = groupby(categories, key=lambda name: category_of(name).domain)
+    return [("" if domain == OWN_DOMAIN else domain, list(members)) for domain, members in named]
+
+
+def _mean_of(own: OfSystem, categories: Sequence[str]) -> float | None:
+    """Of the rates of categories, which count alike whatever their episodes."""
+    rates = [own[name].success.sr for name in categories if name in own]
+    known = [rate for rate in rates if rate is not None]
+    return fmean(known) if known else None
+
+
+def _systems(table: RetentionTable) -> dict[str, OfSystem]:
+    """By label, in order. Labels tell runs apart."""
+    found: dict[str, dict[str, RetentionRow]] = {}
+    for row in once_per_run([*table.rows, *table.means]):
+        found.setdefault(row.run.label, {})[row.category] = row
+    return dict(found)
+
+
+def _pivot(table: RetentionTable, title: str, note: Sequence[str], columns: Sequence[_Column]) -> NamedTable:
+    cells = tuple((name, *(column.cell(own) for column in columns)) for name, own in _systems(table).items())
+    heads = [(domain, len(list(under))) for domain, under in groupby(column.domain for column in columns)]
+    text = TextTable(
+        title,
+        caption(table, note),
+        ("system", *(column.heading for column in columns)),
+        cells,
+        (("", 1), *heads) if any(domain for domain, _ in heads) else (),
     )
-    return NamedTable(TextTable(title, note, columns, cells), tuple(_number(row) for row in rows))
+    rows = once_per_run([*table.rows, *table.means])
+    return NamedTable(text, tuple(_number(row) for row in rows))
 
 
 def _number(row: RetentionRow) -> Number:
@@ -129,13 +272,33 @@ def _number(row: RetentionRow) -> Number:
         "system": row.run.label,
         "run": row.run.location,
         "category": row.category,
+        "domain": None if row.category == MEAN else category_of(row.category).domain,
         "sr": own.sr,
         "ci": own.ci,
         "left": own.sr_left,
         "right": own.sr_right,
+        "original": own.sr_original,
+        "swapped": own.sr_swapped,
         "episodes": own.n_episodes,
         "items": own.n_items,
         "margin": own.chance_margin,
         "regime": None if own.regime is None else str(own.regime),
         "normalised_score": own.normalised_score,
+        "prompt": row.answers.prompt,
+        "picture_size": row.answers.picture_size,
     }
+
+
+def _domain_numbers(table: RetentionTable) -> Iterator[Number]:
+    """The means of domains of several categories."""
+    for name, own in _systems(table).items():
+        for domain, members in _domains(table):
+            if domain and len(members) > 1:
+                yield {
+                    "system": name,
+                    "run": own[MEAN].run.location,
+                    "category": MEAN,
+                    "domain": domain,
+                    "sr": _mean_of(own, members),
+                    "categories": [member for member in members if member in own],
+                }

@@ -12,14 +12,19 @@ from probe_kit.study.reading import LoadedStudy
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
+    from probe_kit.extract.store.locations.location import Location
 
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A run of the study, and the cell it is of."""
+    """A run of the study, and the cell it is of.
+
+    run: the items that a table shows. probed: those that the file's probes are fitted to.
+    """
 
     cell: Cell
     run: "Run"
+    probed: "Run"
 
     @property
     def place(self) -> str:
@@ -72,6 +77,11 @@ def stored_runs(
     return StoredRuns(tuple(found), tuple(missing))
 
 
+def stored_location(study: LoadedStudy, cell: Cell) -> "Location":
+    """Where the run of a cell lies."""
+    return locate(cell.location(study.study.folder))
+
+
 def open_cell(
     study: LoadedStudy,
     cell: Cell,
@@ -80,8 +90,11 @@ def open_cell(
     categories: Sequence[str] | None = None,
 ) -> StoredRun:
     """The stored run of a cell, restricted to a selection. Raises what `open_run` raises."""
-    run = open_run(locate(cell.location(study.study.folder)), allow_partial=partial)
-    return StoredRun(cell, _part(run, cell, selection, categories))
+    run = open_run(stored_location(study, cell), allow_partial=partial)
+    of_probes = (of_blocks(table.runs)(cell) for table in study.study.probes.values())
+    fitted = next((one for one in of_probes if one is not None), None)
+    shown = _part(run, cell, selection, categories)
+    return StoredRun(cell, shown, shown if fitted is None else _part(run, cell, fitted, None))
 
 
 def _part(run: "Run", cell: Cell, selection: Selection, categories: Sequence[str] | None) -> "Run":

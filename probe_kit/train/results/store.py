@@ -16,7 +16,7 @@ import numpy as np
 
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
-from probe_kit.extract.run_layout import PROBES
+from probe_kit.extract.run_layout import PROBE_DIRECTIONS, PROBES
 from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle
 from probe_kit.extract.store.format.stored_words import in_current_words
 from probe_kit.extract.store.locations.locate import locate
@@ -32,7 +32,7 @@ from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
 from probe_kit.train.settings import FORMAT, ProbeSettings, key_of
 
 SCORES, DECISIONS = "scores.csv", "decisions.npz"
-DIRECTIONS, CONTROLS = "directions.npz", "controls.json"
+DIRECTIONS, CONTROLS = PROBE_DIRECTIONS, "controls.json"
 
 
 def save_results(results: ProbeResults, run: Path | Location, *, asked: bool = True) -> None:

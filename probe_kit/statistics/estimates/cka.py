@@ -1,0 +1,53 @@
+"""Likeness of two sets of features of the same episodes: centred kernel alignment with the unbiased estimator.
+
+Song, Smola, Gretton, Bedo and Borgwardt, “Feature selection via dependence maximization”, JMLR 13 (2012);
+Nguyen, Raghu and Kornblith, “Do wide and deep networks learn the same things?”, ICLR 2021.
+"""
+
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+
+Matrix = NDArray[np.float64]
+
+FEWEST = 4
+"""Episodes that the unbiased estimator needs."""
+
+
+def unbiased_cka(first: Matrix, second: Matrix) -> float:
+    """Linear CKA of features (E, D) and (E, D') of the same episodes: 1 up to turning and scaling, 0 on average
+    where they are independent, whatever D.
+
+    HSIC = (tr KL + 1ᵀK1 · 1ᵀL1 / ((E − 1)(E − 2)) − 2 · 1ᵀKL1 / (E − 2)) / (E (E − 3)), with K and L the
+    products of the features, whose diagonal is 0. NaN where one set does not vary. Raises UsageError for fewer
+    than FEWEST episodes, or another number of episodes.
+    """
+    count = len(first)
+    if count != len(second) or count < FEWEST:
+        raise UsageError(
+            f"features of {count} and {len(second)} episodes; expected those of the same {FEWEST} or more episodes"
+        )
+    here, there = (_products(features) for features in (first, second))
+    spread = _hsic(here, here) * _hsic(there, there)
+    return _hsic(here, there) / sqrt(spread) if spread > 0 else float("nan")
+
+
+def _products(features: Matrix) -> Matrix:
+    """(E, E) inner products, of centred and scaled features so that they are of the order of 1; diagonal 0."""
+    centred = np.asarray(features, np.float64) - features.mean(axis=0, dtype=np.float64)
+    scale = np.sqrt((centred**2).sum(axis=1).mean())
+    products: Matrix = (centred / (scale or 1.0)) @ (centred / (scale or 1.0)).T
+    np.fill_diagonal(products, 0.0)
+    return products
+
+
+def _hsic(here: Matrix, there: Matrix) -> float:
+    count = len(here)
+    rows, columns = here.sum(axis=0), there.sum(axis=0)
+    total = float((here * there).sum())
+    total += float(rows.sum() * columns.sum()) / ((count - 1) * (count - 2))
+    total -= 2 * float(rows @ columns) / (count - 2)
+    return total / (count * (count - 3))

@@ -1,0 +1,197 @@
+"""Drift of every category from one run to another: transfer, own probes, directions, likeness, and a verdict."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.compare.common_items import common_items, wording_of
+from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.table import retention_table
+from probe_kit.statistics.estimates.cka import unbiased_cka
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.study.drift.transfer import Agreement, ProbedRun, Transfer, agreement, transfer
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.store import load_results
+
+FRAME = "first_frame_sha256"
+Verdict = Literal["kept", "moved", "forgotten", "learned", "not shown in either", "not clear"]
+VERDICTS: Mapping[Verdict, str] = {
+    "kept": "signal in both, and probes transfer after recentring",
+    "moved": "signal in both, and no transfer is shown",
+    "forgotten": "signal in the first alone, and the 95 % interval of the drop excludes 0",
+    "learned": "signal in the second alone, and the 95 % interval of the gain excludes 0",
+    "not shown in either": "signal in neither",
+    "not clear": "signal in one, and the interval of the difference includes 0 or there is none",
+}
+"""What each means; signal: above chance family-wise and better than every control that was run."""
+
+
+@dataclass(frozen=True)
+class SiteDrift:
+    """One site of one category: accuracies of transferred probes, there and back, and likeness."""
+
+    site: Site
+    raw: float
+    recentred: float
+    p_fwe: float
+    raw_back: float
+    recentred_back: float
+    p_fwe_back: float
+    cka: float
+    agreement: Agreement | None
+
+
+@dataclass(frozen=True)
+class CategoryDrift:
+    """One category of two runs; `before` and `after` are their rows of the retention table.
+
+    difference: before minus after. sites: of the backbone, empty where frames or words differ; best: the position
+    of the one at which the first run's own probes are best. why_alone: why nothing is transferred, empty if it is.
+    """
+
+    category: str
+    before: RetentionRow
+    after: RetentionRow
+    difference: Difference | None
+    sites: tuple[SiteDrift, ...]
+    best: int
+    episodes: int
+    why_alone: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """One of VERDICTS; `not clear` where probes could not be transferred and the verdict hangs on that."""
+        here, there = (row.backbone.verdict == "shown" for row in (self.before, self.after))
+        if here and there:
+            if not self.sites:
+                return "not clear"
+            return "kept" if self.p_transfer < SIGNIFICANCE else "moved"
+        if not (here or there):
+            return "not shown in either"
+        low, high = (self.difference and self.difference.backbone_ci) or (None, None)
+        if here:
+            return "forgotten" if low is not None and low > 0 else "not clear"
+        return "learned" if high is not None and high < 0 else "not clear"
+
+    @property
+    def p_transfer(self) -> float:
+        """Family-wise p of the recentred transfer over all sites; 1 without any."""
+        return min((one.p_fwe for one in self.sites), default=1.0)
+
+
+def measure_drift(
+    before: RunReader, after: RunReader, view: str = "mean", labels: Mapping[str, str] | None = None
+) -> list[CategoryDrift]:
+    """Drift of every category that both runs were probed in, in one view.
+
+    Probes are the stored ones of the first captured inference. Frames and words must be the same for a transfer:
+    otherwise only own accuracies are given. labels: names of the runs by location.
+    Raises NoProbesError, UnknownSiteError for a view that was not probed, and UsageError where the backbones have
+    no site of one name and width in common.
+    """
+    sides = [ProbedRun(run, load_results(run)) for run in (before, after)]
+    places = str(before.location), str(after.location)
+    runs, pairs = ([before, after], [places]) if places[0] != places[1] else ([before], [])
+    table = retention_table(runs, [view], labels=labels, pairs=pairs)
+    rows = {(row.run.location, row.category): row for row in table.rows if row.view == view}
+    gaps = {row.category: row for row in table.differences if row.view == view}
+    names = dict.fromkeys(row.category for row in table.rows)
+    why = why_alone(before, after)
+    return [
+        _category(
+            name, (sides[0], sides[1]), view, (rows[places[0], name], rows[places[1], name]), gaps.get(name), why
+        )
+        for name in names
+        if all((place, name) in rows for place in places)
+    ]
+
+
+def why_alone(before: RunReader, after: RunReader) -> str:
+    """Why probes of one run are not used on the other: other words or other frames; empty if they are."""
+    if ask_of(before) != ask_of(after) or wording_of(before) != wording_of(after):
+        return "other words"
+    tables = [run.episodes for run in (before, after)]
+    if not all(FRAME in table for table in tables):
+        return "frames unknown"
+    both = tables[0][["episode_id", FRAME]].merge(tables[1][["episode_id", FRAME]], on="episode_id")
+    return "" if len(both) and (both[f"{FRAME}_x"] == both[f"{FRAME}_y"]).all() else "other frames"
+
+
+def _category(
+    name: str,
+    sides: tuple[ProbedRun, ProbedRun],
+    view: str,
+    rows: tuple[RetentionRow, RetentionRow],
+    difference: Difference | None,
+    why: str,
+) -> CategoryDrift:
+    curves = [side.results.curves[name, view] for side in sides]
+    items = common_items([side.run for side in sides]).get(name)
+    episodes = np.intersect1d(curves[0].episodes, curves[1].episodes)
+    if items is None or not items.n_items or not episodes.size:
+        return CategoryDrift(name, *rows, difference, (), 0, 0, why or "no item in common")
+    if why:
+        return CategoryDrift(name, *rows, difference, (), 0, episodes.size, why)
+    sites = _common_sites(sides, name, view)
+    there, back = (
+        transfer(one, other, name, view, sites, episodes) for one, other in (sides, (sides[1], sides[0]))
+    )
+    found = tuple(_site(at, site, sides, name, view, episodes, (there, back)) for at, site in enumerate(sites))
+    own = [curves[0].correct[curves[0].sites.index(site)].mean() for site in sites]
+    return CategoryDrift(name, *rows, difference, found, int(np.argmax(own)), episodes.size)
+
+
+def _common_sites(sides: tuple[ProbedRun, ProbedRun], category: str, view: str) -> list[Site]:
+    """Sites of both backbones, by name, where these are equally wide."""
+    found = []
+    for side in sides:
+        curve = side.results.curves[category, view]
+        width = {name: stream.width for name, stream in side.run.streams.items()}
+        found.append({site: width[site.stream] for site in curve.sites if site.stream == curve.backbone_stream})
+    shared = [site for site in found[0] if found[0][site] == found[1].get(site)]
+    if not shared:
+        raise UsageError(
+            f"{sides[0].run.location} and {sides[1].run.location} have no site of the backbone with one name and "
+            "width in common: probes of one cannot be used on the other"
+        )
+    return shared
+
+
+def _site(
+    at: int,
+    site: Site,
+    sides: tuple[ProbedRun, ProbedRun],
+    category: str,
+    view: str,
+    episodes: NDArray[np.str_],
+    transfers: tuple[Transfer, Transfer],
+) -> SiteDrift:
+    here, there = (side.features(site, view, episodes) for side in sides)
+    signal = all(_has_signal(side, category, view, site) for side in sides)
+    directions = [side.results.direction(category, view, site) for side in sides]
+    to, back = transfers
+    found = agreement(directions[0], directions[1], there) if signal else None
+    return SiteDrift(
+        site=site,
+        raw=float(to.raw[at]),
+        recentred=float(to.recentred[at]),
+        p_fwe=float(to.p_fwe[at]),
+        raw_back=float(back.raw[at]),
+        recentred_back=float(back.recentred[at]),
+        p_fwe_back=float(back.p_fwe[at]),
+        cka=unbiased_cka(here, there),
+        agreement=found,
+    )
+
+
+def _has_signal(side: ProbedRun, category: str, view: str, site: Site) -> bool:
+    scores = side.results.scores
+    own = scores[(scores["category"] == category) & (scores["view"] == view) & (scores["site"] == str(site))]
+    return bool(own["signal"].iloc[0])

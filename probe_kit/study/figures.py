@@ -1,0 +1,143 @@
+"""Making of a study's named figures, with the figures of the retention table."""
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.intervene.results.site_maps import stored_steering
+from probe_kit.retention.displays import curves_side_by_side, dose_response, layer_curve
+from probe_kit.retention.displays.base.report_figure import ONLY_FILLED, ReportFigure, figure_of
+from probe_kit.retention.displays.base.style import BLUE, VERMILION, footer, panels, plain
+from probe_kit.retention.displays.heat_table import SideTableDisplay
+from probe_kit.retention.table import RetentionTable, retention_table
+from probe_kit.study.mistakes import unknown
+from probe_kit.study.planned_suite import slugs
+from probe_kit.study.reading import LoadedStudy
+from probe_kit.study.schema import FigureKind, FigureTable
+from probe_kit.study.tables.rates import domain_scores
+from probe_kit.study.tables.stored_runs import StoredRuns, of_blocks, stored_runs
+from probe_kit.train.results.store import load_results
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> list[ReportFigure]:
+    """The figures of one name, from stored runs alone; nothing is drawn yet.
+
+    A figure of the kind `dose` is one per run that was steered; others are one of all runs.
+    partial_runs: accept runs that are missing or unfinished. Raises UsageError for an unknown name, or where no
+    run has what the figure shows, and RunIncompleteError for runs that are missing.
+    """
+    if name not in study.study.figures:
+        raise UsageError(unknown("figure", name, list(study.study.figures)))
+    figure = study.study.figures[name]
+    chosen = None if figure.categories is None else slugs(figure.categories)
+    runs = stored_runs(study, of_blocks(figure.runs), partial_runs, chosen)
+    if not runs.found:
+        raise UsageError(
+            f"no run of the figure {name!r} is stored. Play them with `probe-kit study run {study.file}`"
+        )
+    return _MAKERS[figure.kind](_Source(name, figure, runs, chosen, runs.labels(study)))
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What a figure is made of. categories: slugs, None for all. labels: of the runs by location."""
+
+    name: str
+    figure: FigureTable
+    runs: StoredRuns
+    categories: tuple[str, ...] | None
+    labels: Mapping[str, str]
+
+    @property
+    def table(self) -> RetentionTable:
+        """Of all runs, nothing compared."""
+        return retention_table([one.run for one in self.runs.found], labels=self.labels, pairs=())
+
+
+def _curves(source: _Source) -> list[ReportFigure]:
+    """A panel per category and part of the model, a line per system; of one system a line per iteration."""
+    found = []
+    for one in source.runs.found:
+        with suppress(NoProbesError):
+            found.append((source.labels[one.place], load_results(one.probed.in_wording())))
+    if not found:
+        raise UsageError(
+            f"no run of the figure {source.name!r} has probes; name its block in a table [probes.NAME]"
+        )
+    names, results = [label for label, _ in found], [own for _, own in found]
+    view = source.figure.view or results[0].settings.views[0]
+    if len(results) == 1 and source.categories is None:
+        draw = partial(layer_curve, results[0], view)
+    else:
+        draw = partial(curves_side_by_side, results, names, view, categories=source.categories)
+    reading = f"How often a linear probe names the side of the correct picture, layer by layer. {ONLY_FILLED}."
+    return [ReportFigure(source.name, "Layer curves", "probes", reading, None, draw)]
+
+
+def _sides(source: _Source) -> list[ReportFigure]:
+    display = SideTableDisplay.from_table(source.table)
+    return [ReportFigure(source.name, display.title, "behaviour", display.note, None, partial(figure_of, display))]
+
+
+def _dose(source: _Source) -> list[ReportFigure]:
+    """A figure per run that was steered."""
+    steered = [one for one in source.runs.found if stored_steering(one.run)]
+    if not steered:
+        raise UsageError(
+            f"no run of the figure {source.name!r} was steered. Steer one with `probe-kit intervene "
+            f"{source.runs.found[0].place} --kind steer --sites backbone.NN --roles image`"
+        )
+    reading = "Episodes that turn to the side they are pushed to, minus those that turn from it, by coefficient."
+    found = []
+    for at, one in enumerate(steered):
+        stem = "-".join(
+            [source.name, one.cell.model, one.cell.way, *([str(one.cell.seed)] if one.cell.seed else [])]
+        )
+        title = f"Dose and response: {source.labels[one.place]}"
+        found.append(ReportFigure(stem, title, "interventions", reading, at, partial(dose_response, one.run)))
+    return found
+
+
+def _overview(source: _Source) -> list[ReportFigure]:
+    reading = "Normalised score of the mean over the categories of a domain: 0 for guessing, 100 for perfection."
+    draw = partial(draw_overview, source.table)
+    return [ReportFigure(source.name, "Score by domain", "behaviour", reading, None, draw)]
+
+
+_MAKERS: Mapping[FigureKind, Callable[[_Source], list[ReportFigure]]] = {
+    "curves": _curves,
+    "sides": _sides,
+    "dose": _dose,
+    "overview": _overview,
+}
+
+
+def draw_overview(table: RetentionTable) -> "Figure":
+    """Bars of the normalised score, a panel per domain on one scale, a bar per system.
+
+    Raises UsageError where no model acted or answered.
+    """
+    scores = domain_scores(table)
+    if not scores:
+        raise UsageError("no model of these runs acted or answered, so there is no score")
+    systems = list(dict.fromkeys(system for own in scores.values() for system in own))
+    figure, grid = panels(len(scores), width=3.1, height=0.24 * len(systems) + 0.8, columns=min(3, len(scores)))
+    for axes, (domain, own) in zip(grid, scores.items(), strict=True):
+        found = [own.get(system, 0.0) for system in systems]
+        axes.barh(range(len(systems)), found, color=[BLUE if score >= 0 else VERMILION for score in found])
+        axes.axvline(0, color="0.45", lw=1)
+        plain(axes)
+        axes.set_title(domain, fontsize=9, loc="left")
+    grid[0].set_yticks(range(len(systems)), systems, fontsize=8)
+    grid[0].set_ylim(len(systems) - 0.4, -0.6)
+    grid[0].set_xlim(-105, 105)
+    counts = sorted({row.success.n_episodes for row in table.rows})
+    episodes = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+    footer(figure, f"normalised score: 0 guessing, 100 perfection · n = {episodes} episodes per category")
+    return figure

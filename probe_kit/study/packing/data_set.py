@@ -1,0 +1,126 @@
+"""The data set of a study: a folder as the hub shows it, with card, episodes, tables, archive and sums."""
+
+import hashlib
+from collections.abc import Hashable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from probe_kit._system.optional_dependencies import require
+from probe_kit.errors import UsageError
+from probe_kit.study.archive import PACK_FILE, SUMS_FILE, TABLES, Pack, files_of, open_archive, write_sums
+from probe_kit.study.packing.pack import pack_study
+from probe_kit.study.reading import LoadedStudy, load_study
+from probe_kit.study.tables.stored_runs import open_cell
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ARCHIVE, EPISODES, CARD = "study.zip", "episodes.parquet", "README.md"
+_COLUMNS = {
+    "episode_id": "string", "item_id": "string", "group_id": "string", "category": "string", "layout": "string",
+    "wording": "string", "side_correct": "string", "side_placed": "string", "outcome": "string",
+    "first_frame_sha256": "string", "item_content_sha256": "string", "distance_correct": "float64",
+    "distance_wrong": "float64", "steps": "int64", "seconds_inference": "float64", "seconds_simulation": "float64",
+}  # fmt: skip
+"""Of the episodes of a run, those that are published, as far as a run has them: no text of an item."""
+
+
+def write_data_set(study: LoadedStudy, folder: Path, partial: bool = False, licence: str | None = None) -> Pack:
+    """Write the data set of a study to `folder`, which must not exist.
+
+    partial: leave out what is missing. licence: as the hub spells it, such as `cc-by-4.0`; named in the card.
+    Raises UsageError where anything lies there, MissingExtraError without pyarrow, and what `pack_study` raises.
+    """
+    parquet = require("pyarrow.parquet", "export")
+    if folder.exists():
+        raise UsageError(f"{folder} exists; choose another --out or remove it")
+    pack = pack_study(study, folder / ARCHIVE, partial)
+    packed = load_study(folder / ARCHIVE)
+    table = _episodes(packed)
+    arrow = require("pyarrow", "export").Table.from_pandas(table, preserve_index=False)
+    parquet.write_table(arrow, folder / EPISODES, compression="zstd")
+    source = open_archive(folder / ARCHIVE)
+    assert source is not None, "it was just written"
+    (folder / TABLES).mkdir()
+    for file in files_of(source / TABLES):
+        (folder / TABLES / file.name).write_bytes(file.read_bytes())
+    (folder / PACK_FILE).write_bytes((source / PACK_FILE).read_bytes())
+    (folder / CARD).write_text(_card(packed, pack, table, licence), encoding="utf-8")
+    write_sums(folder)
+    return pack
+
+
+def _episodes(study: LoadedStudy) -> "pd.DataFrame":
+    """A row per episode of every run: which run, and what happened."""
+    import pandas as pd
+
+    frames = []
+    for cell in study.cells:
+        if not cell.packed_key:
+            continue
+        own = open_cell(study, cell, cell.selection, partial=True).run.episodes
+        model, way = cell.model, cell.way
+        label = study.study.models[model].label or model
+        named: dict[str, str | int] = {
+            "system": label, "model": model, "way": way, "seed": cell.seed, "run": cell.name,
+        }  # fmt: skip
+        kinds: dict[Hashable, Any] = {name: kind for name, kind in _COLUMNS.items() if name in own}
+        frame = own[list(kinds)].astype(kinds)
+        for at, (name, value) in enumerate(named.items()):
+            frame.insert(at, name, value)
+        frames.append(frame)
+    if not frames:
+        raise UsageError("no run of the study is stored, so there is nothing to publish")
+    return pd.concat(frames, ignore_index=True)
+
+
+def _card(study: LoadedStudy, pack: Pack, table: "pd.DataFrame", licence: str | None) -> str:
+    """`README.md`: what the hub reads, then what people read."""
+    import yaml
+
+    features = [{"name": str(name), "dtype": _dtype(kind)} for name, kind in table.dtypes.items()]
+    head: dict[str, Any] = {
+        "pretty_name": study.study.name,
+        **({} if licence is None else {"license": licence}),
+        "tags": ["robotics", "vision-language-action", "interpretability", "probe-kit"],
+        "configs": [{"config_name": "episodes", "data_files": EPISODES}],
+        "dataset_info": {
+            "config_name": "episodes",
+            "features": features,
+            "splits": [{"name": "train", "num_examples": len(table)}],
+        },
+    }
+    front = yaml.safe_dump(head, sort_keys=False, allow_unicode=True)
+    return "\n".join(["---", front.rstrip(), "---", "", *_words(study, pack, len(table)), ""])
+
+
+def _words(study: LoadedStudy, pack: Pack, episodes: int) -> Iterator[str]:
+    yield f"# {study.study.name}"
+    yield ""
+    yield f"A study made with probe_kit {pack.version}: {len(pack.keys)} runs, {episodes:,} episodes."
+    yield f"Suite: {pack.suite['identity']}. Left out: {', '.join(pack.left_out)}."
+    yield ""
+    yield f"* `{EPISODES}`: a row per episode of every run"
+    yield f"* `{TABLES}/`: every table as JSON, Markdown and LaTeX"
+    yield f"* `{ARCHIVE}`: the runs without activations; `probe-kit study table {ARCHIVE}` prints the tables"
+    yield f"* `{SUMS_FILE}`: `sha256sum --check {SUMS_FILE}`"
+    if pack.missing:
+        yield ""
+        yield "Not in it:"
+        yield ""
+        yield from (f"* {name}: {reason}" for name, reason in pack.missing.items())
+    yield ""
+    yield "## Tables"
+    for name in study.study.tables:
+        if (record := study.archive and study.archive / TABLES / f"{name}.md") and record.is_file():
+            yield ""
+            yield record.read_text(encoding="utf-8").rstrip()
+
+
+def _dtype(kind: Any) -> str:
+    return kind.name if kind.name in ("float64", "int64", "bool") else "string"
+
+
+def data_set_version(folder: Path) -> str:
+    """What names the content of a data set: the beginning of the hash of its sums."""
+    return hashlib.sha256((folder / SUMS_FILE).read_bytes()).hexdigest()[:12]

@@ -1,0 +1,88 @@
+"""Packing of a study: its runs without activations, its tables, and their sums."""
+
+import json
+import tempfile
+from pathlib import Path
+
+import probe_kit.version
+from probe_kit.errors import NoProbesError, ProbeKitError, RunIncompleteError, UsageError
+from probe_kit.extract import copy_run
+from probe_kit.retention.formats.latex import latex_table
+from probe_kit.study.archive import PACK_FILE, RUNS, STUDY_FILE, TABLES, Pack, write_sums, write_zip
+from probe_kit.study.reading import LoadedStudy
+from probe_kit.study.tables.formats import markdown_text, table_record
+from probe_kit.study.tables.make import make_table
+from probe_kit.study.tables.stored_runs import stored_location
+
+ACTIVATIONS, PICTURES, DIRECTIONS = "activations", "pictures", "probe directions"
+
+
+def pack_study(
+    study: LoadedStudy, out: Path, partial: bool = False, directions: bool = False, pictures: bool = False
+) -> Pack:
+    """Write the archive of a study to `out`: a zip file if it ends in `.zip`, else a folder.
+
+    Every table of the file can be printed from it alone. directions: with the weights of probes. pictures: with
+    frames and videos. partial: leave out runs and tables that are missing; `pack.json` names them and the reason.
+    Raises UsageError where anything lies at `out`, and RunIncompleteError for missing runs.
+    """
+    if out.exists():
+        raise UsageError(f"{out} exists; choose another --out or remove it")
+    if out.suffix != ".zip":
+        return _pack(study, out, partial, directions, pictures)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}-") as draft:
+        folder = Path(draft) / "pack"
+        found = _pack(study, folder, partial, directions, pictures)
+        whole = Path(draft) / out.name
+        write_zip(folder, whole)
+        whole.rename(out)
+    return found
+
+
+def _pack(study: LoadedStudy, folder: Path, partial: bool, directions: bool, pictures: bool) -> Pack:
+    missing = {cell.name: cell.unavailable for cell in study.cells if cell.unavailable}
+    keys: dict[str, str] = {}
+    for cell in study.cells:
+        if cell.unavailable:
+            continue
+        try:
+            copy_run(
+                stored_location(study, cell), cell.location(str(folder / RUNS)), pictures, partial, directions
+            )
+            keys[cell.name] = cell.key
+        except ProbeKitError as error:
+            if not partial:
+                raise RunIncompleteError(
+                    f"{cell.name} cannot be packed: {error}. Finish it with `probe-kit study run {study.file}`, "
+                    "or leave it out (--partial)"
+                ) from error
+            missing[cell.name] = str(error)
+    missing |= _write_tables(study, folder / TABLES, partial)
+    left = {ACTIVATIONS: False, PICTURES: pictures, DIRECTIONS: directions}
+    suite = {"identity": study.suite.identity, "items": dict(study.suite.items)}
+    left_out = [name for name, there in left.items() if not there]
+    pack = Pack(study.study.name, probe_kit.version.__version__, suite, keys, missing, left_out)
+    (folder / STUDY_FILE).write_bytes(study.file.read_bytes())
+    (folder / PACK_FILE).write_text(pack.to_json(), encoding="utf-8")
+    write_sums(folder)
+    return pack
+
+
+def _write_tables(study: LoadedStudy, folder: Path, partial: bool) -> dict[str, str]:
+    """Every table in three formats; returns why others are missing."""
+    folder.mkdir(parents=True)
+    missing = {}
+    for name in study.study.tables:
+        try:
+            made = make_table(study, name, partial)
+        except (UsageError, NoProbesError) as error:
+            if not partial:
+                raise
+            missing[f"table {name}"] = str(error)
+            continue
+        record = json.dumps(table_record(made), indent=1, ensure_ascii=False)
+        (folder / f"{name}.json").write_text(record, encoding="utf-8")
+        (folder / f"{name}.md").write_text(markdown_text(made) + "\n", encoding="utf-8")
+        (folder / f"{name}.tex").write_text(latex_table(made.text), encoding="utf-8")
+    return missing

@@ -1,0 +1,108 @@
+"""The table of drift: a row per pair of runs and category, the transfer of probes first."""
+
+from collections.abc import Mapping, Sequence
+
+from probe_kit.retention.columns.text import difference_interval, p_text, percent, with_limits
+from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.study.drift.measures import VERDICTS, CategoryDrift, SiteDrift
+from probe_kit.study.tables.named_table import NamedTable, Number
+from probe_kit.suite.categories import category_of
+
+_COLUMNS = (
+    "runs", "category", "verdict", "layer", "transfer %", "recentred % (p)", "back %", "recentred %",
+    "before %", "after %", "before − after, points [95 %]", "cosine (ceiling)", "CKA",
+)  # fmt: skip
+_NOTE = (
+    "transfer: accuracy of the first run's probes on the second run's activations, nothing is fitted",
+    "recentred: after centring and scaling on the second run's training folds, without labels",
+    "p: label permutations of whole groups, the best of all layers",
+    "layer: where the first run's own probes are best",
+    "before, after: cross-fitted accuracy of own probes",
+    "cosine: of the probes' directions, where both sides have signal; ceiling: between folds of the first run",
+    "CKA: unbiased, likeness of all features; it is no measure of loss",
+)
+
+
+def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title: str, view: str) -> NamedTable:
+    """Verdicts with their numbers. pairs: by the labels of both runs, the first one before the second."""
+    shown = [(names, one) for names, found in pairs.items() for one in found]
+    cells = tuple(
+        (f"{before} → {after}", category_of(one.category).title, one.verdict, *_cells(one))
+        for (before, after), one in shown
+    )
+    said = dict.fromkeys(one.verdict for _, one in shown)
+    note = [f"view {view}", *_NOTE, *(f"{name}: {VERDICTS[name]}" for name in said)]
+    alone = {f"{names[0]} → {names[1]}": one.why_alone for names, one in shown if one.why_alone}
+    note += [f"{name}: own accuracies only, {why}" for name, why in alone.items()]
+    heading = f"Drift: {title}" + (f" ({', '.join(dict.fromkeys(alone.values()))})" if alone else "")
+    numbers = tuple(number for names, one in shown for number in _numbers(names, one, view))
+    return NamedTable(TextTable(heading, "; ".join(note), _COLUMNS, cells), numbers)
+
+
+def _cells(one: CategoryDrift) -> tuple[str, ...]:
+    gap = one.difference
+    own = (
+        _own(one.before),
+        _own(one.after),
+        "–" if gap is None else difference_interval(gap.backbone, gap.backbone_ci),
+    )
+    if not one.sites:
+        return ("–",) * 5 + own + ("–", "–")
+    site = one.sites[one.best]
+    return (
+        str(site.site.layer),
+        percent(site.raw),
+        f"{percent(site.recentred)} ({p_text(one.p_transfer)})",
+        percent(site.raw_back),
+        percent(site.recentred_back),
+        *own,
+        _cosine(site),
+        f"{site.cka:.2f}",
+    )
+
+
+def _own(row: RetentionRow) -> str:
+    return with_limits(percent(row.backbone.score), row.backbone.ci, percent)
+
+
+def _cosine(site: SiteDrift) -> str:
+    return "–" if site.agreement is None else f"{site.agreement.raw:.2f} ({site.agreement.ceiling:.2f})"
+
+
+def _numbers(names: tuple[str, str], one: CategoryDrift, view: str) -> list[Number]:
+    """One of the category, then one of each site."""
+    gap = one.difference
+    place = {"before": names[0], "after": names[1], "category": one.category, "view": view}
+    whole: Number = {
+        **place,
+        "verdict": one.verdict,
+        "why_alone": one.why_alone or None,
+        "episodes": one.episodes,
+        "accuracy_before": one.before.backbone.score,
+        "accuracy_before_ci": one.before.backbone.ci,
+        "accuracy_after": one.after.backbone.score,
+        "accuracy_after_ci": one.after.backbone.ci,
+        "difference": None if gap is None else gap.backbone,
+        "difference_ci": None if gap is None else gap.backbone_ci,
+        "p": one.p_transfer if one.sites else None,
+    }
+    return [whole, *({**place, **_of_site(site)} for site in one.sites)]
+
+
+def _of_site(site: SiteDrift) -> Number:
+    found = site.agreement
+    return {
+        "site": str(site.site),
+        "layer": site.site.layer,
+        "transfer": site.raw,
+        "recentred": site.recentred,
+        "p_fwe": site.p_fwe,
+        "transfer_back": site.raw_back,
+        "recentred_back": site.recentred_back,
+        "p_fwe_back": site.p_fwe_back,
+        "cka": site.cka,
+        "cosine": None if found is None else found.raw,
+        "cosine_weighted": None if found is None else found.weighted,
+        "cosine_ceiling": None if found is None else found.ceiling,
+    }

@@ -1,0 +1,95 @@
+"""Archives of a study: every table from the archive alone, and nothing that was left out by mistake."""
+
+import json
+from pathlib import Path
+from shutil import copytree, rmtree
+from zipfile import ZipFile
+
+import pytest
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.errors import RunDamagedError, UsageError
+from probe_kit.study import LoadedStudy, load_study, make_table, pack_study, plan_study
+from probe_kit.study.tables.formats import table_of_record, table_record
+
+
+@pytest.fixture(scope="module")
+def archive(played: LoadedStudy, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("packed") / "study.zip"
+    pack_study(played, out)
+    return out
+
+
+def test_every_table_is_the_same_from_the_archive_alone(
+    played: LoadedStudy, archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither runs nor suite are where they were."""
+    before = {name: make_table(played, name).text for name in played.study.tables}
+    home = Path(played.study.folder)
+    away = tmp_path / "away"
+    home.rename(away)
+    monkeypatch.setattr("probe_kit.study.reading.planned_suite", None)
+    try:
+        packed = load_study(archive)
+        assert {name: make_table(packed, name).text for name in packed.study.tables} == before
+        assert {one.state for one in plan_study(packed).cells} == {"whole"}
+    finally:
+        away.rename(home)
+
+
+def test_an_archive_holds_no_picture_no_activation_and_no_name_of_this_machine(
+    played: LoadedStudy, archive: Path
+) -> None:
+    with ZipFile(archive) as packed:
+        names = packed.namelist()
+    assert not [name for name in names if name.endswith((".png", ".jpg", ".gif", ".mp4"))]
+    assert not [name for name in names if "/c/" in name and "/data.zarr/" in name and "pooled" in name]
+    assert {name.split("/")[0] for name in names} == {"study.toml", "pack.json", "runs", "tables", "SHA256SUMS"}
+    assert {f"tables/{name}.{end}" for name in played.study.tables for end in ("json", "md", "tex")} <= set(names)
+
+
+def test_the_same_study_gives_the_same_bytes(played: LoadedStudy, archive: Path, tmp_path: Path) -> None:
+    pack_study(played, tmp_path / "again.zip")
+    assert (tmp_path / "again.zip").read_bytes() == archive.read_bytes()
+
+
+def test_what_was_changed_or_lost_is_named(played: LoadedStudy, tmp_path: Path) -> None:
+    folder = tmp_path / "pack"
+    pack_study(played, folder)
+    changed = copytree(folder, tmp_path / "changed")
+    (changed / "tables" / "main.md").write_text("other", encoding="utf-8")
+    with pytest.raises(RunDamagedError, match=r"main\.md has other bytes than were packed"):
+        load_study(changed)
+    lost = copytree(folder, tmp_path / "lost")
+    rmtree(lost / "runs" / "idle")
+    with pytest.raises(RunDamagedError, match=r"runs/idle/.* is missing\. Fetch the archive again"):
+        load_study(lost)
+    with pytest.raises(UsageError, match="exists; choose another --out"):
+        pack_study(played, folder)
+    (tmp_path / "broken.zip").write_bytes(b"PK no zip")
+    with pytest.raises(RunDamagedError, match="no whole zip file"):
+        load_study(tmp_path / "broken.zip")
+
+
+def test_missing_runs_are_refused_or_named(played: LoadedStudy, tmp_path: Path) -> None:
+    file = tmp_path / "more.toml"
+    text = played.file.read_text(encoding="utf-8").replace("light_level = 0.7", "light_level = 0.6")
+    file.write_text(text, encoding="utf-8")
+    run = CliRunner()
+    refused = run.invoke(app, ["study", "pack", str(file), "--out", str(tmp_path / "a.zip")])
+    assert refused.exit_code != 0
+    assert not (tmp_path / "a.zip").exists()
+    made = run.invoke(app, ["study", "pack", str(file), "--out", str(tmp_path / "a.zip"), "--partial"])
+    assert made.exit_code == 0, made.output
+    assert "2 runs, without activations, pictures, probe directions" in made.stdout
+    assert "not packed: idle/dark: " in made.stdout
+    assert run.invoke(app, ["study", "table", str(tmp_path / "a.zip"), "main"]).exit_code == 0
+    assert run.invoke(app, ["study", "run", str(tmp_path / "a.zip")]).exit_code == 2
+
+
+def test_a_table_is_the_same_after_its_record(played: LoadedStudy) -> None:
+    made = make_table(played, "score")
+    again = table_of_record(json.loads(json.dumps(table_record(made))))
+    assert again.text == made.text
+    assert json.dumps(again.numbers) == json.dumps(made.numbers)
