@@ -1,5 +1,6 @@
 """A pool of child processes that run one service."""
 
+import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -81,3 +82,13 @@ class ProcessPool:
             if isinstance(message, ProbeKitError):
                 raise message
             yield slot, message
+
+
+def share_of_machine(slot: int, size: int, device: str) -> dict[str, str]:
+    """Variables of process number `slot` of `size`: a share of the cores, and one GPU where there are GPUs."""
+    share = {"OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // size))}
+    if device.startswith("cuda"):
+        import torch
+
+        share["CUDA_VISIBLE_DEVICES"] = str(slot % max(1, torch.cuda.device_count()))
+    return share

@@ -1,7 +1,11 @@
 """Estimated disk space of a run before compression, including probes, figures and report."""
 
+from collections.abc import Sequence
+
 from probe_kit.extract.plan import Plan
+from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import RunSettings
+from probe_kit.hooks.contract.views import view_names
 
 EPISODE = 40_000
 """Bytes of an episode's commit, trajectory and files of the file system (measured: 12 to 30 kB)."""
@@ -17,13 +21,32 @@ REPORT = 5_000_000
 
 def space_needed(plan: Plan, settings: RunSettings) -> dict[str, int]:
     """Bytes by part, uncompressed. Probes are those of one view; more views take as much again each."""
-    episodes, calls = len(plan.episodes), int(getattr(settings, "captured_calls", 1))
+    return space_of(plan.streams, len(plan.episodes), settings)
+
+
+def space_of(streams: Sequence[StoredStream], episodes: int, settings: RunSettings) -> dict[str, int]:
+    """The same for a number of episodes that store these streams."""
+    calls, with_tokens = int(getattr(settings, "captured_calls", 1)), settings.tokens == "all"
     films = {"all": episodes, "first": 1}.get(str(getattr(settings, "video", "none")), 0)
     thumbnails = 0 if settings.frames == "none" else episodes * THUMBNAILS
+    sites = sum(len(stream.stream.sites()) for stream in streams)
     return {
-        "activations": plan.bytes,
-        "columns": sum(stream.raw_bytes(False) for stream in plan.streams) * calls * episodes,
+        "activations": sum(stream.raw_bytes(with_tokens) for stream in streams) * calls * episodes,
+        "columns": sum(stream.raw_bytes(False) for stream in streams) * calls * episodes,
         "episodes": episodes * EPISODE + thumbnails + films * FILM,
-        "probes": plan.sites * episodes * DECISION,
-        "report": REPORT if plan.streams else 0,
+        "probes": sites * episodes * DECISION,
+        "report": REPORT if streams else 0,
     }
+
+
+def declared_streams(settings: RunSettings) -> list[StoredStream] | None:
+    """What a run stores of the streams that its family declares; None for one that declares none."""
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(settings.model)
+    declared = None if family is None else family.declared_streams(settings.options)
+    if declared is None:
+        return None
+    if settings.tokens == "none":
+        return []
+    return [StoredStream.of(one.stream, one.tokens, view_names(one.roles)) for one in declared]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from probe_kit.errors import UsageError
 from probe_kit.extract.calibration import Calibration, calibrated
 from probe_kit.extract.early import asked_objects, check_model, check_place, check_words, suite_name
+from probe_kit.extract.needs import declared_streams
 from probe_kit.extract.plan import Plan, instructions_of, make_plan, plan_episodes, skipped_items
 from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.rollout.answer_controller import AnswerController
@@ -14,14 +15,12 @@ from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, Po
 from probe_kit.extract.rollout.examples import check_unfit, example_observations
 from probe_kit.extract.rollout.preflight import run_preflight
 from probe_kit.extract.rollout.settings_checks import check_embodiment, check_meaningless, check_unreachable
-from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import provenance_here
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.extract.vqa.phrases import phrases
 from probe_kit.hashing import sha256_json
-from probe_kit.hooks.contract.views import view_names
 from probe_kit.suite import Suite, default_suite, load_suite
 
 if TYPE_CHECKING:
@@ -112,7 +111,7 @@ def load(
     if policy is None:
         _check_instructions(settings, instructions_of(asked), fetch)
     with_tokens = settings.tokens == "all"
-    if not fetch and (streams := _declared_streams(settings)) is not None:
+    if not fetch and (streams := declared_streams(settings)) is not None:
         plan = make_plan(suite, streams, settings.seed, settings.stored_calls, with_tokens, wordings, objects)
         return Prepared(settings, plan, _declared_card(settings), None, declared=True)
     if isinstance(settings, AskSettings):
@@ -159,19 +158,6 @@ def _check_instructions(settings: RunSettings, instructions: Sequence[str], fetc
     family = get_family(settings.model)
     if family is not None and isinstance(settings, ExtractSettings):
         family.check_instructions(settings.checkpoint, instructions, settings.options, fetch)
-
-
-def _declared_streams(settings: RunSettings) -> list[StoredStream] | None:
-    """What a run stores of the streams that its family declares; None for one that declares none."""
-    from probe_kit.hooks.registry import get_family
-
-    family = get_family(settings.model)
-    declared = None if family is None else family.declared_streams(settings.options)
-    if declared is None:
-        return None
-    if settings.tokens == "none":
-        return []
-    return [StoredStream.of(one.stream, one.tokens, view_names(one.roles)) for one in declared]
 
 
 def _declared_card(settings: RunSettings) -> dict[str, Any]:

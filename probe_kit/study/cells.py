@@ -1,5 +1,6 @@
 """Cells: one model in one condition, or asked in one way, with one seed. Known without loading a model."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
-from probe_kit.hashing import sha256_json
+from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.study.planned_suite import PlannedSuite
 
 KEY_DIGITS = 8
@@ -89,10 +90,8 @@ class Cell:
         return self.episodes * ceil(self.settings.scene.max_steps / (self.settings.execute or 1))
 
     @cached_property
-    def key(self) -> str:
-        """Hash of all that the settings decide but the selection: what the run's folder is named by."""
-        if self.packed_key:
-            return self.packed_key
+    def known(self) -> dict[str, Any]:
+        """All that the settings decide but the selection, as plain values."""
         settings = self.settings
         known = {
             **settings.choices(),
@@ -105,12 +104,23 @@ class Cell:
             "scene": settings.scene.to_json(),
             "suite": self.suite.identity,
         }
-        return sha256_json(known)[:KEY_DIGITS]
+        plain: dict[str, Any] = json.loads(canonical_json(known))
+        return plain
+
+    @cached_property
+    def key(self) -> str:
+        """Hash of `known`: what the run's folder is named by."""
+        return self.packed_key or sha256_json(self.known)[:KEY_DIGITS]
+
+    @property
+    def folder(self) -> str:
+        """The run's folder below `out`."""
+        seed = f"-seed{self.seed}" if self.seed else ""
+        return f"{self.model}/{self.way}{seed}-{self.key}"
 
     def location(self, out: str) -> str:
         """Where the run lies below `out`."""
-        seed = f"-seed{self.seed}" if self.seed else ""
-        return f"{out.rstrip('/')}/{self.model}/{self.way}{seed}-{self.key}"
+        return f"{out.rstrip('/')}/{self.folder}"
 
     @property
     def settings_to_play(self) -> RunSettings:

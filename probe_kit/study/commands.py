@@ -2,21 +2,33 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from probe_kit._terminal.console import counter, err, marked, out, print_json, print_text, progress, say
-from probe_kit._terminal.options import AsJson, EnvWorkers, Partial
+from probe_kit._terminal.options import AsJson, EnvWorkers, Partial, RayAddress, speed_option
 from probe_kit.errors import UsageError
+from probe_kit.study.planning.plan_lines import print_plan
 from probe_kit.train.command_options import Jobs
 
 if TYPE_CHECKING:
     from probe_kit.retention.columns.text_table import TextTable
-    from probe_kit.study import ModelFailure, ProbeFailure, StudyPlan
-    from probe_kit.study.plan import PlannedCell
+    from probe_kit.study import Failure, StudyPlan
+    from probe_kit.study.running.model_task import Event
 
-app = typer.Typer(help="Run a whole study from one file.", no_args_is_help=True)
+HELP = """Run a whole study from one file: models × conditions × categories.
+
+Print the plan, play what is missing, look at what is stored, and print the tables of the file. Stored runs are
+never played again.
+
+\b
+probe-kit study run embedded --dry-run
+probe-kit study run embedded
+probe-kit study status embedded
+probe-kit study table embedded success
+"""
+app = typer.Typer(help=HELP, no_args_is_help=True)
 UNFINISHED = 1
 Style = Literal["table", "markdown", "latex", "json"]
 File = Annotated[
@@ -33,61 +45,117 @@ def run(
     file: File,
     only: Only = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print the plan. Loads no model and writes nothing.")
+        bool, typer.Option("--dry-run", help="Print the plan and stop. Loads no model and writes no run.")
     ] = False,
     as_json: AsJson = False,
-    env_workers: EnvWorkers = None,
     no_probes: Annotated[bool, typer.Option("--no-probes", help="Fit no probes.")] = False,
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="Try models and episodes again that failed while they played.")
+    ] = False,
+    slots: Annotated[
+        int,
+        speed_option(
+            "--slots", min=0, max=1024, help="Number of processes with one model each. 0: use this process."
+        ),
+    ] = 0,
+    ray: RayAddress = None,
+    env_workers: EnvWorkers = None,
     jobs: Jobs = None,
+    calibrate: Annotated[
+        bool,
+        speed_option("--calibrate", help="Measure models on a few episodes, for the hours of the plan."),
+    ] = False,
 ) -> None:
     """Play and ask what a study needs and is not stored yet, then fit its probes.
 
-    Each model is loaded once for all of its runs. A model that fails stops itself alone. The same command resumes.
-    """
-    from probe_kit.study import conduct_study, fit_probes, load_study, plan_study
+    Each model is loaded once for all of its runs. A model that fails stops itself alone, and the ledger keeps the
+    reason. The same command resumes; what failed while it played is tried again with --retry-failed.
 
+    \b
+    probe-kit study run embedded --dry-run
+    probe-kit study run mine.toml --slots 2
+    probe-kit study run mine.toml --only base --retry-failed
+    """
+    from probe_kit.study import load_study, plan_study
+
+    if slots and ray is not None:
+        raise UsageError("give either --slots, for processes of this machine, or --ray, for a cluster")
     study = load_study(file)
     if study.archive is not None and not dry_run:
         raise UsageError(f"{file} is an archive without activations; nothing can be added to its runs")
     plan = plan_study(study, only)
+    if calibrate:
+        plan = _calibrated(plan, env_workers)
     if dry_run or as_json:
-        print_json(plan.to_json()) if as_json else _print_plan(plan)
+        print_json(plan.to_json()) if as_json else print_plan(plan)
     if dry_run:
         return
-    with progress() as bar:
-        counters: dict[str, Callable[..., None]] = {}
-
-        def tell(one: "PlannedCell", done: int, planned: int, outcome: str) -> None:
-            if one.cell.name not in counters:
-                counters[one.cell.name] = counter(bar, one.cell.name)
-            counters[one.cell.name](done, planned, outcome)
-
-        def count(name: str, done: int, sites: int, last: str) -> None:
-            name = f"probes of {name}"
-            if name not in counters:
-                counters[name] = counter(bar, name)
-            counters[name](done, sites, last)
-
-        failed: list[ModelFailure | ProbeFailure] = []
-        failed += conduct_study(plan, tell, lambda one: say(marked("[red]{}[/]", one)), env_workers)
-        unfitted = [] if no_probes else fit_probes(study, only, count, jobs)
-        failed += [one for one in unfitted if not one.missing]
+    failed = _played(plan, slots=slots, ray=ray, env_workers=env_workers, retry_failed=retry_failed)
+    if not no_probes:
+        failed += _probed(plan_study(study, only), jobs)
     after = plan_study(study, only)
-    _print_plan(after)
+    print_plan(after)
     for failure in failed:
         say(marked("[red]{}[/]", failure))
     if failed or after.totals()["missing"]:
         raise typer.Exit(UNFINISHED)
 
 
+def _calibrated(plan: "StudyPlan", env_workers: int | None) -> "StudyPlan":
+    """The plan again, with rates that were measured now."""
+    from probe_kit.study import calibrate_study, plan_study
+
+    failures = calibrate_study(plan, lambda name: say(f"measuring {name}"), env_workers)
+    for failure in failures:
+        say(marked("[yellow]not measured:[/] {}", failure))
+    return plan_study(plan.study, plan.only)
+
+
+def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
+    """Play what is missing, with a bar for the study and one per run in play."""
+    from probe_kit.study import Failure, Moved, conduct_study
+
+    with progress() as bar:
+        totals = plan.totals()
+        whole = counter(bar, f"study {plan.study.study.name}")
+        done, counters = [totals["episodes"] - totals["missing"]], dict[str, Callable[..., None]]()
+
+        def tell(event: "Event") -> None:
+            if isinstance(event, Failure):
+                say(marked("[red]{}[/]", event))
+            elif isinstance(event, Moved):
+                if event.run not in counters:
+                    counters[event.run] = counter(bar, event.run)
+                counters[event.run](event.done, event.planned)
+                done[0] += 1
+                whole(done[0], totals["episodes"])
+
+        return conduct_study(plan, tell, **options)
+
+
+def _probed(plan: "StudyPlan", jobs: int | None) -> "list[Failure]":
+    """Fit probes that are missing; what waits for a run is no failure of its own."""
+    from probe_kit.study import fit_probes
+
+    with progress() as bar:
+        counters: dict[str, Callable[..., None]] = {}
+
+        def count(name: str, done: int, sites: int, last: str) -> None:
+            if name not in counters:
+                counters[name] = counter(bar, f"probes of {name}")
+            counters[name](done, sites, last)
+
+        return [one for one in fit_probes(plan, count, jobs) if one.stage != "waiting"]
+
+
 @app.command("status")
 def status(file: File, only: Only = None, as_json: AsJson = False) -> None:
-    """Print which runs of a study are stored, and why others are to be made; exit with 1 if any is missing."""
+    """Print what is stored of a study, and why other runs are to be made; exit with 1 if anything is missing."""
     from probe_kit.study import load_study, plan_study
 
     plan = plan_study(load_study(file), only)
-    print_json(plan.to_json()) if as_json else _print_plan(plan)
-    if plan.totals()["missing"]:
+    print_json(plan.to_json()) if as_json else print_plan(plan)
+    if not plan.whole:
         raise typer.Exit(UNFINISHED)
 
 
@@ -199,42 +267,3 @@ def _print_table(text: "TextTable") -> None:
     for cells in text.cells:
         shown.add_row(*(marked("{}", cell) for cell in cells))
     out.print(shown)
-
-
-def _print_plan(plan: "StudyPlan") -> None:
-    """A line per run, then what all of them take."""
-    from rich.table import Table
-
-    name = plan.study.study.name
-    table = Table("model", "run", "blocks", "episodes", "inferences", "state", title=f"study {name}", box=None)
-    for column in table.columns[3:5]:
-        column.justify = "right"
-    for one in plan.cells:
-        cell = one.cell
-        way = cell.way + (f", seed {cell.seed}" if cell.seed else "")
-        inferences = "–" if cell.asks else f"{cell.inferences:,}"
-        cells = (cell.model, way, ", ".join(cell.selections), f"{cell.episodes:,}", inferences)
-        table.add_row(*(marked("{}", text) for text in (*cells, one.why)))
-    out.print(table)
-    for line in _lines(plan):
-        out.print(line, highlight=False, markup=False, soft_wrap=True)
-
-
-def _lines(plan: "StudyPlan") -> list[str]:
-    """Totals, hours with their source, and what is skipped."""
-    totals, suite = plan.totals(), plan.study.suite
-    lines = [
-        f"suite: {suite.identity}; items from {suite.source}",
-        f"{totals['runs']} runs, {totals['episodes']:,} episodes ({totals['acted']:,} acted, "
-        f"{totals['captured']:,} captured without acting, {totals['asked']:,} asked), at most "
-        f"{totals['inferences']:,} inferences of policies (given by shape: no model was loaded)",
-        f"missing: {totals['missing']:,} episodes",
-    ]
-    hours, unmeasured = plan.hours(), plan.unmeasured()
-    if hours:
-        each = ", ".join(f"{model} {value:.2g}" for model, value in hours.items())
-        lines.append(f"hours: {sum(hours.values()):.2g} ({each}; measured here in stored episodes)")
-    if unmeasured:
-        lines.append(f"hours unknown, because no episode was measured here: {', '.join(unmeasured)}")
-    lines += [f"skipped: {model}: {reason}" for model, reason in plan.skipped().items()]
-    return lines

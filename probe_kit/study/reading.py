@@ -123,6 +123,7 @@ def _near(path: tuple[str | int, ...]) -> str:
 
 _TABLES: dict[str, type[BaseModel]] = {
     "suite": schema.SuiteTable,
+    "reuse": schema.ReuseTable,
     "models": schema.ModelTable,
     "conditions": schema.ConditionTable,
     "asks": schema.AskTable,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.hooks.contract.options import check_options
@@ -29,8 +30,8 @@ _NEEDS = {
 def reference_mistakes(study: Study, suite: PlannedSuite) -> list[Mistake]:
     """Everything that is wrong with the names of a file, in the order of its tables."""
     checks: tuple[Callable[[Study, PlannedSuite], Iterator[Mistake]], ...] = (
-        _suite, _models, _lineages, _blocks, _excludes, _unused, _probes, _comparisons, _drift, _tables,
-        _figures,
+        _suite, _reuse, _models, _lineages, _blocks, _excludes, _unused, _probes, _comparisons, _drift,
+        _tables, _figures,
     )  # fmt: skip
     return [mistake for check in checks for mistake in check(study, suite)]
 
@@ -43,6 +44,14 @@ def _suite(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
             yield Mistake(("suite", "counts", name), str(error))
     yield from _categories(("suite", "categories"), study.suite.categories, suite)
     yield from _items(("suite", "items"), study.suite.items, suite, study.suite.categories)
+
+
+def _reuse(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
+    for folder in study.reuse.folders:
+        if not Path(folder).is_dir():
+            yield Mistake(
+                ("reuse", "folders"), f"there is no folder {folder!r}; name folders of runs, or leave it out"
+            )
 
 
 def _categories(path: tuple[str | int, ...], names: list[str] | None, suite: PlannedSuite) -> Iterator[Mistake]:

@@ -184,6 +184,12 @@ class FigureTable(_Table):
     view: str | None = None
 
 
+class ReuseTable(_Table):
+    """Folders of other runs, such as those made by hand; equal ones serve the study where they lie."""
+
+    folders: Names = []
+
+
 class Study(_Table):
     """A whole study file.
 
@@ -195,6 +201,7 @@ class Study(_Table):
     out: str | None = None
     scene: SceneName | None = None
     suite: SuiteTable = SuiteTable()
+    reuse: ReuseTable = ReuseTable()
     models: Annotated[dict[Name, ModelTable], Field(min_length=1)]
     conditions: dict[Name, ConditionTable] = {}
     asks: dict[Name, AskTable] = {}

@@ -1,12 +1,11 @@
 """Workers in processes of their own. Only episode numbers and outcomes are sent between processes."""
 
-import os
 from collections.abc import Callable
 from functools import partial
 from multiprocessing.connection import Connection
 from signal import SIGALRM
 
-from probe_kit._execution.process_pool import Ended, ProcessPool
+from probe_kit._execution.process_pool import Ended, ProcessPool, share_of_machine
 from probe_kit.errors import ProbeKitError, WorkerDiedError
 from probe_kit.extract.rollout.events import Event
 from probe_kit.extract.settings import RunSettings
@@ -27,7 +26,8 @@ def run_in_processes(
     """
     waiting: set[int] = set()
     began: set[int] = set()
-    with ProcessPool(_SERVICE, (settings, run), settings.workers, partial(_environment, settings)) as pool:
+    share = partial(share_of_machine, size=settings.workers, device=settings.device)
+    with ProcessPool(_SERVICE, (settings, run), settings.workers, share) as pool:
         while not scheduler.finished:
             for slot in sorted(waiting):
                 number = scheduler.take(slot)
@@ -65,17 +65,6 @@ def _give_back(slot: int, why: str, scheduler: Scheduler, on_event: Callable[[Ev
     tell_lost(f"worker {slot} {why}", len(scheduler.holds(slot)))
     for event in scheduler.lose(slot, f"the worker playing it {why}"):
         on_event(event)
-
-
-def _environment(settings: RunSettings, slot: int) -> dict[str, str]:
-    """One GPU per worker where there are GPUs, and a fair share of the cores."""
-    share = max(1, (os.cpu_count() or 1) // settings.workers)
-    environment = {"OMP_NUM_THREADS": str(share)}
-    if settings.device.startswith("cuda"):
-        import torch
-
-        environment["CUDA_VISIBLE_DEVICES"] = str(slot % max(1, torch.cuda.device_count()))
-    return environment
 
 
 def serve(connection: Connection) -> None:

@@ -8,6 +8,7 @@ from probe_kit.errors import ProbeKitError, RunIncompleteError
 from probe_kit.extract import open_run
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.study.cells import Cell, Selection
+from probe_kit.study.ledger import Ledger
 from probe_kit.study.reading import LoadedStudy
 
 if TYPE_CHECKING:
@@ -78,8 +79,9 @@ def stored_runs(
 
 
 def stored_location(study: LoadedStudy, cell: Cell) -> "Location":
-    """Where the run of a cell lies."""
-    return locate(cell.location(study.study.folder))
+    """Where the run of a cell lies: in its own place, or where an equal run serves it."""
+    out = study.study.folder
+    return locate(Ledger(out).location(cell, out))
 
 
 def open_cell(

@@ -1,6 +1,7 @@
 """Playing of studies: resumed, each model loaded once, and a model that fails alone."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -8,8 +9,9 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import RunIncompleteError, UsageError
-from probe_kit.extract import open_run
-from probe_kit.study import conduct_study, fit_probes, load_study, make_table, plan_study
+from probe_kit.extract import ExtractSettings, open_run
+from probe_kit.study import Failure, Ledger, conduct_study, fit_probes, load_study, make_table, plan_study
+from probe_kit.study.running import model_task
 from probe_kit.suite import Suite
 
 TEXT = """
@@ -79,13 +81,15 @@ def test_a_model_that_fails_stops_itself_alone_and_the_rest_is_played_once(file:
     assert set(states(file).values()) == {("new", 0)}
     told: list[str] = []
     (failure,) = conduct_study(
-        plan_study(load_study(file)), failed=lambda one: told.append(one.model), env_workers=0
+        plan_study(load_study(file)),
+        lambda event: told.append(event.model) if isinstance(event, Failure) else None,
+        env_workers=0,
     )
     assert (failure.model, failure.run, told) == ("broken", "broken/short", ["broken"])
     assert "nowhere" in failure.reason
     after = {
         "expert/short": ("whole", 4),
-        "broken/short": ("new", 0),
+        "broken/short": ("failed", 0),
         "idle/short": ("whole", 4),
         "idle/dark": ("whole", 4),
     }
@@ -159,20 +163,103 @@ def test_a_file_that_asks_for_more_items_plays_the_missing_ones_alone(file: Path
     assert shown["expert"] == 2
 
 
+def test_a_whole_study_is_entered_in_its_ledger_again_if_that_was_deleted(file: Path) -> None:
+    conduct_study(plan_study(load_study(file)), env_workers=0)
+    study = load_study(file)
+    ledger = Ledger(study.study.folder)
+    kept = {name: entry for name, entry in ledger.entries().items() if entry.played}
+    assert len(kept) == 3
+    shutil.rmtree(Path(study.study.folder) / "ledger")
+    conduct_study(plan_study(study), env_workers=0)
+    again = ledger.entries()
+    for name, entry in kept.items():
+        assert again[name].settings == entry.settings
+        found, made = again[name].played, entry.played
+        assert found is not None
+        assert made is not None
+        assert found.provenance == made.provenance
+        assert (found.settings_sha256, found.episodes, found.began) == (made.settings_sha256, made.episodes, "")
+
+
+def test_equal_runs_elsewhere_serve_a_study_and_stay_where_they_lie(file: Path) -> None:
+    conduct_study(plan_study(load_study(file)), env_workers=0)
+    text = file.read_text(encoding="utf-8")
+    out = load_study(file).study.folder
+    other = file.with_name("other.toml")
+    other.write_text(
+        text.replace(f'out = "{out}"', f'out = "{out}-other"\n[reuse]\nfolders = ["{out}"]').replace(
+            "light_level = 0.7", "light_level = 0.6"
+        ),
+        encoding="utf-8",
+    )
+    before = {path: path.stat().st_mtime_ns for path in Path(out).rglob("*") if path.is_file()}
+    conduct_study(plan_study(load_study(other)), env_workers=0)
+    plan = plan_study(load_study(other))
+    served = {one.cell.name: one.why.startswith("whole, served by ") for one in plan.cells}
+    assert served == {"expert/short": True, "broken/short": False, "idle/short": True, "idle/dark": False}
+    assert {one.cell.name: one.state for one in plan.cells}["idle/dark"] == "whole"
+    assert not list(Path(f"{out}-other").glob("expert/*"))
+    shown = make_table(load_study(other), "main", partial=True).text.cells
+    assert shown == make_table(load_study(file), "main", partial=True).text.cells
+    assert {path: path.stat().st_mtime_ns for path in Path(out).rglob("*") if path.is_file()} == before
+
+
+def test_every_scene_is_built_before_the_first_run_is_played(file: Path, tmp_path: Path) -> None:
+    torn = tmp_path / "torn.png"
+    torn.write_text("no picture", encoding="utf-8")
+    text = file.read_text(encoding="utf-8").replace(str(load_study(file).study.folder), str(tmp_path / "out"))
+    changed = tmp_path / "study.toml"
+    scene = f'rendering = "visual-matching"\nbackground = "{torn}"'
+    changed.write_text(text.replace("light_level = 0.7", scene), encoding="utf-8")
+    told: list[object] = []
+    failures = conduct_study(plan_study(load_study(changed)), told.append, env_workers=0)
+    assert [(one.stage, one.run) for one in failures] == [("checking", "broken/short"), ("checking", "idle/dark")]
+    assert [type(one).__name__ for one in told][:3] == ["Failure", "Failure", "Moved"]
+    assert states(changed)["idle/short"] == ("waiting", 0)
+    assert states(changed)["expert/short"] == ("whole", 4)
+    changed.write_text(text, encoding="utf-8")  # what failed before it played is tried again unasked
+    conduct_study(plan_study(load_study(changed)), env_workers=0)
+    assert states(changed)["idle/short"] == states(changed)["idle/dark"] == ("whole", 4)
+
+
+def test_what_fails_while_it_plays_is_kept_with_its_traceback_and_tried_again_on_request(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = file.read_text(encoding="utf-8").replace(str(load_study(file).study.folder), str(tmp_path / "out"))
+    text = text.replace(f'checkpoint = "{tmp_path / "out"}/nowhere"', "random_weights = true")
+    changed = tmp_path / "study.toml"
+    changed.write_text(text, encoding="utf-8")
+    tries: list[str] = []
+
+    def load(settings: ExtractSettings) -> None:
+        tries.append(settings.model)
+        raise RuntimeError("the loader of a family is wrong")
+
+    monkeypatch.setattr(model_task, "load_acting_policy", load)
+    for retry_failed, tried in ((False, 1), (False, 1), (True, 2)):
+        (failure,) = conduct_study(plan_study(load_study(changed)), env_workers=0, retry_failed=retry_failed)
+        assert (failure.stage, failure.error, failure.run) == ("playing", "RuntimeError", "broken/short")
+        assert "raise RuntimeError" in failure.traceback
+        assert len(tries) == tried
+    assert states(changed)["broken/short"] == ("failed", 0)
+    assert states(changed)["idle/dark"] == ("whole", 4)
+    result = CliRunner().invoke(app, ["study", "status", str(changed)], env={"COLUMNS": "200"})
+    assert result.exit_code == 1
+    assert "the loader of a family is wrong" in result.stdout
+
+
 @pytest.mark.slow
 def test_a_policy_is_loaded_once_for_all_of_its_runs(
     small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from probe_kit.study import conduct
-
     loaded: list[str] = []
-    load = conduct.load_acting_policy
+    load = model_task.load_acting_policy
 
     def count(settings):  # type: ignore[no-untyped-def]
         loaded.append(settings.model)
         return load(settings)
 
-    monkeypatch.setattr(conduct, "load_acting_policy", count)
+    monkeypatch.setattr(model_task, "load_acting_policy", count)
     text = TEXT.format(out=tmp_path / "out", suite=small_suite.folder)
     text = text.replace('family = "idle"', 'family = "pi0-tiny"\nrandom_weights = true')
     file = tmp_path / "study.toml"
@@ -193,11 +280,11 @@ def test_probes_of_the_file_are_fitted_once_and_shown(small_suite: Suite, tmp_pa
     file.write_text(f'{text}{probes}[tables.probing]\nkind = "probing"\nruns = ["main"]\n', encoding="utf-8")
     study = load_study(file)
     conduct_study(plan_study(study))
-    (missing,) = fit_probes(study)
-    assert (missing.run, missing.missing) == ("broken/short", True)
+    (missing,) = fit_probes(plan_study(study))
+    assert (missing.run, missing.stage) == ("broken/short", "waiting")
     made = make_table(study, "probing", partial=True)
     assert [cells[:2] for cells in made.text.cells] == [("expert", "mean"), ("idle", "mean")]
     stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("probes/*/*") if path.name == "scores.csv"}
     assert len(stored) == 2
-    fit_probes(study)
+    fit_probes(plan_study(study))
     assert {path: path.stat().st_mtime_ns for path in stored} == stored
