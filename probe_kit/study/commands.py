@@ -120,7 +120,7 @@ def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
         whole = counter(bar, f"study {plan.study.study.name}")
         done, counters = [totals["episodes"] - totals["missing"]], dict[str, Callable[..., None]]()
 
-        def tell(event: "Event") -> None:
+        def report(event: "Event") -> None:
             if isinstance(event, Failure):
                 say(marked("[red]{}[/]", event))
             elif isinstance(event, Moved):
@@ -130,7 +130,7 @@ def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
                 done[0] += 1
                 whole(done[0], totals["episodes"])
 
-        return conduct_study(plan, tell, **options)
+        return conduct_study(plan, report, **options)
 
 
 def _probed(plan: "StudyPlan", jobs: int | None) -> "list[Failure]":

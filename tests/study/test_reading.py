@@ -172,6 +172,7 @@ def test_the_papers_study_is_40_runs_of_104_000_episodes(monkeypatch: pytest.Mon
         "asked": 55_040,
         "inferences": 3_438_640,
         "missing": 104_000,
+        "unprobed": 0,
     }
     assert list(plan.skipped()) == ["pi0-paraphrases", "pi0-distill", "prismatic"]
     assert len(plan.study.study.models) == 20

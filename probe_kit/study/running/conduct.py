@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from probe_kit._system.optional_dependencies import require
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract import open_run
@@ -19,8 +20,8 @@ from probe_kit.study.running.model_task import (
     Event,
     Made,
     ModelTask,
+    Report,
     RunTask,
-    Tell,
     play_model,
     played_by,
 )
@@ -30,7 +31,7 @@ from probe_kit.study.running.ray import play_on_ray
 
 def conduct_study(
     plan: StudyPlan,
-    tell: Tell | None = None,
+    report: Report | None = None,
     *,
     slots: int = 0,
     ray: str | None = None,
@@ -42,12 +43,14 @@ def conduct_study(
     Every run is checked, and every scene built, before the first one is played. A model that fails stops itself
     alone: episodes that are committed stay, and the next call resumes after them. What failed while it was played
     is not tried again until its settings change, or with `retry_failed`. The ledger notes all of it.
-    tell: called with every event as it happens. slots: processes, each with one model at a time; 0 for this
+    report: called with every event as it happens. slots: processes, each with one model at a time; 0 for this
     process. ray: address of a Ray cluster that plays instead, or `auto`. env_workers: processes that simulate, as
     in `ExtractSettings`.
     Raises DiskSpaceError and StoreError, MissingExtraError without Ray, and UsageError if no cluster answers.
     """
-    course = _Course(plan, tell, ray, env_workers)
+    if ray is not None:
+        require("ray", "ray")
+    course = _Course(plan, report, ray, env_workers)
     missing = [one for one in plan.played if one.state != "whole"]
     if not retry_failed:
         course.failures += [one.failure for one in missing if one.failure and one.failure.stage in NOT_TRIED_AGAIN]
@@ -69,22 +72,22 @@ def conduct_study(
 class _Course:
     """What happens while a plan is played. failures: so far."""
 
-    def __init__(self, plan: StudyPlan, tell: Tell | None, ray: str | None, env_workers: int | None) -> None:
-        self._plan, self._tell, self._ray, self._env_workers = plan, tell, ray, env_workers
+    def __init__(self, plan: StudyPlan, report: Report | None, ray: str | None, env_workers: int | None) -> None:
+        self._plan, self._report, self._ray, self._env_workers = plan, report, ray, env_workers
         self._cells = {one.cell.name: one.cell for one in plan.cells}
         self.ledger = Ledger(plan.study.study.folder)
         self.failures: list[Failure] = []
 
     def note(self, event: Event) -> None:
-        """Write to the ledger what is made and what failed, and tell it."""
+        """Write to the ledger what is made and what failed, and report it."""
         if isinstance(event, Made):
             self.ledger.note(self._cells[event.run], played=event.played, failure=None)
         elif isinstance(event, Failure):
             self.failures.append(event)
             if not event.same(self.ledger.of(self._cells[event.run]).failure):
                 self.ledger.note(self._cells[event.run], failure=event)
-        if self._tell is not None:
-            self._tell(event)
+        if self._report is not None:
+            self._report(event)
 
     def note_found(self) -> None:
         """Enter runs that were whole before there was a ledger."""
@@ -106,7 +109,7 @@ class _Course:
             yield ModelTask(model, tuple(map(self._task, cells)), study.models[model].gpus, size, reuse)
 
     def _size(self, one: PlannedCell) -> float:
-        """Seconds; where no rate is known a tenth of one per inference, which sorts models all the same."""
+        """Seconds; where no rate is known, a tenth of one per inference."""
         return self._plan.cost.seconds.get(one.cell.name, 0.1 * one.missing * units(one.cell))
 
     def _problem(self, one: PlannedCell, rehearsed: list[SceneSpec]) -> Failure | None:

@@ -1,4 +1,4 @@
-"""A model's runs, sent to where they are played; the model is loaded once. What is told of them are events."""
+"""A model's runs, sent to where they are played; the model is loaded once. Playing reports events."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -74,29 +74,29 @@ class Made:
 
 
 Event = Moved | Made | Failure
-Tell = Callable[[Event], None]
+Report = Callable[[Event], None]
 
 
-def play_model(task: ModelTask, tell: Tell) -> None:
-    """Load the model and make its runs one after another; what fails is told, and committed episodes stay.
+def play_model(task: ModelTask, report: Report) -> None:
+    """Load the model and make its runs one after another; what fails is reported, and committed episodes stay.
 
     Episodes that are given up end their run alone; anything else ends the model. Raises DiskSpaceError and
     StoreError, which concern all runs.
     """
     loaded = _Loaded()
     for one in task.runs:
-        course = _Course(task, one, tell)
+        course = _Course(task, one, report)
         try:
-            tell(course.play(loaded))
+            report(course.play(loaded))
         except STOPS_ALL:
             raise
         except EpisodesFailedError as error:
             some = bool(one.done or course.moved)
-            tell(Failure.of("episodes" if some else "playing", task.model, one.run, error))
+            report(Failure.of("episodes" if some else "playing", task.model, one.run, error))
             if not some:
                 return
         except Exception as error:  # noqa: BLE001 - whatever a model raises must not end the others
-            tell(Failure.of("playing", task.model, one.run, error))
+            report(Failure.of("playing", task.model, one.run, error))
             return
 
 
@@ -124,7 +124,7 @@ class _Course:
 
     task: ModelTask
     one: RunTask
-    tell: Tell
+    report: Report
     moved: int = field(default=0)
 
     def play(self, loaded: _Loaded) -> Made:
@@ -141,7 +141,7 @@ class _Course:
 
     def _count(self, done: int, planned: int, outcome: str) -> None:
         self.moved += 1
-        self.tell(Moved(self.task.model, self.one.run, done, planned, outcome))
+        self.report(Moved(self.task.model, self.one.run, done, planned, outcome))
 
 
 def played_by(

@@ -56,7 +56,7 @@ def _fit(
     beside = None if control is None else _opened(study, table, control, of=cell)
     baselines = tuple(name for name in table.controls if name != "untrained")
 
-    def tell(done: int, sites: int, last: str) -> None:
+    def report(done: int, sites: int, last: str) -> None:
         if progress is not None:
             progress(cell.name, done, sites, last)
 
@@ -70,7 +70,7 @@ def _fit(
         untrained=None if beside is None else beside.run.in_wording(),
         seed=table.seed,
         jobs=jobs,
-        progress=tell,
+        progress=report,
     )
     known = what_decides(table, cell, own.run, None if beside is None else beside.run)
     return Probed(key=results.key, known=known, ended=now())

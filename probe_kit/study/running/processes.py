@@ -5,14 +5,14 @@ from multiprocessing.connection import Connection
 
 from probe_kit._execution.process_pool import Ended, ProcessPool, share_of_machine
 from probe_kit.errors import ProbeKitError, WorkerDiedError
-from probe_kit.study.running.model_task import ModelTask, Tell, play_model
+from probe_kit.study.running.model_task import ModelTask, Report, play_model
 from probe_kit.study.running.task_queue import MOST_LOSSES, TaskQueue, warn_of_loss
 
 IDLE = "idle"
 _SERVICE = "probe_kit.study.running.processes:serve"
 
 
-def play_in_processes(tasks: list[ModelTask], slots: int, tell: Tell) -> None:
+def play_in_processes(tasks: list[ModelTask], slots: int, report: Report) -> None:
     """Play models in `slots` processes; one that dies is replaced, and its model resumes.
 
     With GPUs each process has one of its own; further processes play models that need none.
@@ -33,7 +33,7 @@ def play_in_processes(tasks: list[ModelTask], slots: int, tell: Tell) -> None:
                 return
             for slot, message in pool.receive():
                 if isinstance(message, Ended):
-                    stillborn = _lost(queue, slot, message.code, stillborn, tell)
+                    stillborn = _lost(queue, slot, message.code, stillborn, report)
                     idle.discard(slot)
                     pool.restart(slot)
                 elif message == IDLE:
@@ -42,10 +42,10 @@ def play_in_processes(tasks: list[ModelTask], slots: int, tell: Tell) -> None:
                     idle.add(slot)
                 else:
                     queue.note(slot, message)
-                    tell(message)
+                    report(message)
 
 
-def _lost(queue: TaskQueue, slot: int, code: int, stillborn: int, tell: Tell) -> int:
+def _lost(queue: TaskQueue, slot: int, code: int, stillborn: int, report: Report) -> int:
     """Give back what a process held. Returns how many ended one after another before they began."""
     held = queue.holds(slot)
     if held is None:
@@ -55,7 +55,7 @@ def _lost(queue: TaskQueue, slot: int, code: int, stillborn: int, tell: Tell) ->
     warn_of_loss(f"process {slot}, which played {held.model}, ended with code {code}")
     failure = queue.lose(slot, f"its process ended with code {code}")
     if failure is not None:
-        tell(failure)
+        report(failure)
     return 0
 
 

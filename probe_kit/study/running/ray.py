@@ -6,21 +6,24 @@ from typing import Any
 from probe_kit._execution.ray_cluster import answer_of, ray_cluster
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import ProbeKitError
-from probe_kit.study.running.model_task import ModelTask, Tell, play_model
+from probe_kit.study.running.model_task import ModelTask, Report, play_model
 from probe_kit.study.running.task_queue import TaskQueue, warn_of_loss
 
 TURN_S = 0.5
-"""Seconds after which events are told, if no model ends before."""
+"""Seconds after which events are reported, if no model ends before."""
+
+_HEAD = "node:__internal_head__"
+"""What Ray calls the resource that the head node alone has."""
 
 
-def play_on_ray(tasks: list[ModelTask], address: str, tell: Tell) -> None:
+def play_on_ray(tasks: list[ModelTask], address: str, report: Report) -> None:
     """Play models on the nodes of a cluster, all of which see the runs' location; Ray finds room for each.
 
     A model whose node or process is lost resumes elsewhere. Raises MissingExtraError without Ray, UsageError if
     no cluster answers, and DiskSpaceError and StoreError of any node.
     """
     with ray_cluster(address, log_to_driver=True) as ray:
-        crew = _Crew(ray, TaskQueue(tasks), tell)
+        crew = _Crew(ray, TaskQueue(tasks), report)
         try:
             while not crew.finished:
                 crew.hand_out()
@@ -39,20 +42,16 @@ def play_there(place: int, task: ModelTask, events: Any) -> ProbeKitError | None
 
 
 class _Crew:
-    """Tasks on the cluster. Events come through a queue, which lives on the node of this process."""
+    """Tasks on the cluster. Events come through a queue on the head node, without which there is no cluster."""
 
-    def __init__(self, ray: Any, queue: TaskQueue, tell: Tell) -> None:
-        self._ray, self._queue, self._tell = ray, queue, tell
+    def __init__(self, ray: Any, queue: TaskQueue, report: Report) -> None:
+        self._ray, self._queue, self._report = ray, queue, report
         self._calls: dict[Any, int] = {}
         self._alive_at: dict[int, set[str]] = {}
         """By place, the nodes that were alive when it was handed its model."""
         self._places = 0
-        near = require("ray.util.scheduling_strategies", "ray").NodeAffinitySchedulingStrategy(
-            ray.get_runtime_context().get_node_id(), soft=True
-        )
-        self._events = require("ray.util.queue", "ray").Queue(
-            actor_options={"num_cpus": 0, "scheduling_strategy": near}
-        )
+        head = {"num_cpus": 0, "resources": {_HEAD: 0.001}}
+        self._events = require("ray.util.queue", "ray").Queue(actor_options=head)
         # A retry by Ray would know nothing of the runs that are made already.
         self._play = ray.remote(max_retries=0, num_cpus=1, scheduling_strategy="SPREAD")(play_there)
 
@@ -70,9 +69,9 @@ class _Crew:
             self._places += 1
 
     def collect(self) -> None:
-        """Wait a turn; tell what happened and note which models ended. Raises what stops the study."""
+        """Wait a turn; report what happened and note which models ended. Raises what stops the study."""
         ready, _ = self._ray.wait(list(self._calls), num_returns=1, timeout=TURN_S)
-        self._tell_events()
+        self._report_events()
         for call in ready:
             place = self._calls.pop(call)
             try:
@@ -82,11 +81,11 @@ class _Crew:
             else:
                 self._queue.end(place)
 
-    def _tell_events(self) -> None:
+    def _report_events(self) -> None:
         for _ in range(self._events.qsize()):
             place, event = self._events.get()
             self._queue.note(place, event)
-            self._tell(event)
+            self._report(event)
 
     def _lost(self, place: int, error: Exception) -> None:
         held = self._queue.holds(place)
@@ -99,7 +98,7 @@ class _Crew:
             place, f"it was lost on the Ray cluster ({said})", self._alive_at[place] <= self._alive()
         )
         if failure is not None:
-            self._tell(failure)
+            self._report(failure)
 
     def _alive(self) -> set[str]:
         return {node["NodeID"] for node in self._ray.nodes() if node["Alive"]}

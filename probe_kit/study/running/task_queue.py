@@ -39,7 +39,7 @@ class TaskQueue:
         return self._held.get(place)
 
     def note(self, place: int, event: Event) -> None:
-        """Note what a place told: what is made or given up is not played again there or elsewhere."""
+        """Note an event of a place: what is made or given up is not played again there or elsewhere."""
         if isinstance(event, Moved):
             self._losses[event.model] = 0
         elif place in self._held and (isinstance(event, Made) or event.stage == "episodes"):

@@ -1,0 +1,93 @@
+"""A small study of embedded models: two networks that are captured, a VLM that is asked, probes."""
+
+from pathlib import Path
+
+from probe_kit.study import load_study
+from probe_kit.suite import Suite
+from tests.support.killed_commands import run_files
+
+TEXT = """
+schema = 1
+name = "small"
+out = "{out}"
+
+[suite]
+path = "{suite}"
+categories = ["color"]
+items = 12
+
+[models.first]
+family = "pi0-tiny"
+random_weights = true
+untrained = "second"
+
+[models.second]
+family = "pi0-tiny"
+random_weights = true
+weights_seed = 1
+
+[models.reader]
+family = "vlm-tiny"
+
+[conditions.still]
+no_act = true
+
+[conditions.dark]
+no_act = true
+light_level = 0.7
+
+[asks.p1]
+prompt = "p1"
+
+[[runs]]
+name = "main"
+models = ["first", "second"]
+conditions = ["still"]
+
+[[runs]]
+name = "light"
+models = ["first"]
+conditions = ["dark"]
+
+[[runs]]
+name = "vlms"
+models = ["reader"]
+asks = ["p1"]
+tokens = "pooled"
+
+[probes.main]
+runs = ["main"]
+permutations = 19
+controls = ["untrained", "position"]
+
+[tables.probing]
+kind = "probing"
+runs = ["main"]
+
+[tables.vlms]
+kind = "vlms"
+runs = ["vlms"]
+"""
+EPISODES = 4 * 24
+
+
+def small_study(folder: Path, suite: Suite, out: str | None = None) -> Path:
+    """Its file in `folder`; runs lie in `folder/out` unless `out` says otherwise."""
+    file = folder / "study.toml"
+    file.write_text(TEXT.format(out=out or folder / "out", suite=suite.folder), encoding="utf-8")
+    return file
+
+
+def bytes_of(file: Path) -> dict[str, bytes]:
+    """What its runs hold, without what may differ between two makings."""
+    return {
+        f"{folder.parent.name}/{folder.name}/{key}": content
+        for folder in run_folders(file)
+        for key, content in run_files(folder).items()
+    }
+
+
+def run_folders(file: Path) -> list[Path]:
+    """Where the runs of a study lie."""
+    study = load_study(file)
+    return [Path(cell.location(study.study.folder)) for cell in study.cells]
