@@ -74,6 +74,8 @@ def load_study(name: str | Path) -> LoadedStudy:
         raise UsageError(f"{file}: {error}. The file is TOML 1.0") from error
     except ValidationError as error:
         raise StudyFileError(str(file), text, _mistakes(error)) from None
+    if archive is not None:  # its runs are all it has
+        study = study.model_copy(update={"reuse": schema.ReuseTable()})
     suite, mistakes = planned_suite(study.suite) if archive is None else (_packed_suite(archive), [])
     mistakes += reference_mistakes(study, suite)
     if not mistakes:

@@ -219,6 +219,8 @@ class _Stored:
         return replace(one, state="failed", failure=failure, why=f"{one.why}; {why}" if one.done else why)
 
     def _probes(self, cell: Cell, entry: Entry, run: "Run") -> Iterator[PlannedProbes]:
+        if self._study.archive is not None:  # it keeps the probes, and no ledger
+            return
         for name, table in probes_of(self._study, cell):
             control = control_of(self._study, cell, table)
             beside = None if control is None else self.run(control)
