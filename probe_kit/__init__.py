@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     )
     from probe_kit.retention.report import write_report
     from probe_kit.suite import Suite, build_suite, default_suite, load_suite
-    from probe_kit.train import load_results, train_probes
+    from probe_kit.train import Labels, load_results, train_probes
 
 __all__ = [
     "Act2AnswerEnv",
@@ -55,6 +55,7 @@ __all__ = [
     "IterationMapDisplay",
     "JointPlaces",
     "KnowledgeActionDisplay",
+    "Labels",
     "LayerCurveDisplay",
     "ModelDepthDisplay",
     "ProbeKitError",
@@ -96,6 +97,7 @@ __getattr__, __dir__ = lazy_names(
         "ImageSwap": "intervene",
         "IterationMapDisplay": "retention.displays",
         "KnowledgeActionDisplay": "retention.displays",
+        "Labels": "train",
         "LayerCurveDisplay": "retention.displays",
         "ModelDepthDisplay": "retention.displays",
         "ProbeKitError": "errors",

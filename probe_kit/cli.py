@@ -33,11 +33,12 @@ from probe_kit.retention.known_used_command import stages
 from probe_kit.study.commands import app as study_app
 from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import train
+from probe_kit.train.label_commands import labels
 from probe_kit.train.power_commands import power
 
 ORDER = (
-    "demo", "doctor", "models", "suite", "extract", "ask", "run", "train", "power", "intervene", "retention",
-    "stages", "study", "export", "new-adapter", "check-adapter", "verify",
+    "demo", "doctor", "models", "suite", "extract", "ask", "run", "labels", "train", "power", "intervene",
+    "retention", "stages", "study", "export", "new-adapter", "check-adapter", "verify",
 )  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 
@@ -153,6 +154,7 @@ for command in (
     verify,
     new_adapter,
     check_adapter,
+    labels,
     train,
     power,
     retention,

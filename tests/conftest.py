@@ -210,3 +210,14 @@ def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory)
         "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4), tokens="all"
     )
     return open_run(made_once(tmp_path_factory, "recorded", lambda folder: extract_run(settings, folder)))
+
+
+@pytest.fixture(scope="session")
+def labelled_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a run without a model, four inferences per episode; see `tests.support.labelled_run`."""
+    from tests.support.labelled_run import write_labelled_run
+
+    def make(folder: Path) -> None:
+        write_labelled_run(folder / "run", small_suite)
+
+    return made_once(tmp_path_factory, "labelled", make) / "run"

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from probe_kit.train.choices import BASELINES, INCOMPLETE, TARGETS, Baseline, Incomplete, Target
     from probe_kit.train.data.array_run import ArrayRun
     from probe_kit.train.data.run_reader import RunReader
+    from probe_kit.train.labels.labels import Labels
     from probe_kit.train.probe_sweep import Progress, train_probes
     from probe_kit.train.results.by_call import load_results_by_call
     from probe_kit.train.results.control_scores import BaselineScore, ControlComparison, Controls, UntrainedScore
@@ -34,6 +35,7 @@ __all__ = [
     "Direction",
     "FoldUnit",
     "Incomplete",
+    "Labels",
     "ProbeCurve",
     "ProbeResults",
     "ProbeSettings",
@@ -63,6 +65,7 @@ __getattr__, __dir__ = lazy_names(
         "FoldUnit": "probe_kit.statistics.folds",
         "INCOMPLETE": "choices",
         "Incomplete": "choices",
+        "Labels": "labels.labels",
         "ProbeResults": "results.probe_results",
         "ProbeSettings": "settings",
         "Progress": "probe_sweep",

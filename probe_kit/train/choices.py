@@ -5,6 +5,8 @@ from typing import Literal
 Target = Literal["correct", "chosen", "shuffled"]
 Incomplete = Literal["keep", "drop"]
 Baseline = Literal["position", "instruction", "pixels", "random-features"]
+Task = Literal["binary", "classes", "continuous"]
+LabelControl = Literal["step", "state", "instruction", "pixels", "random-features"]
 
 TARGETS: dict[str, str] = {
     "correct": "side of the correct picture",
@@ -21,3 +23,17 @@ BASELINES: dict[str, str] = {
     "pixels": "the two pictures, left and right, at 32 × 32 pixels; needs the suite",
     "random-features": "random nonlinear features of pictures and words, as wide as the site; needs the suite",
 }
+TASKS: dict[str, str] = {
+    "binary": "one of two values; logistic probe, balanced accuracy",
+    "classes": "one of several values; ridge on class indicators, balanced accuracy",
+    "continuous": "a quantity; ridge, R²",
+}
+"""Tasks of labels of one's own."""
+LABEL_CONTROLS: dict[str, str] = {
+    "step": "the number of the captured inference alone; for labels that change within an episode",
+    "state": "the pose of the hand and the opening of the gripper; needs trajectories",
+    "instruction": "the words of the instruction",
+    "pixels": "the two pictures at 32 × 32 pixels; needs the suite",
+    "random-features": "random nonlinear features of pictures, words and state; needs the suite",
+}
+"""Controls of labels of one's own."""

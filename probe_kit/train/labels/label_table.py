@@ -1,0 +1,220 @@
+"""Tables of labels: CSV, Parquet or a DataFrame, with the line of every cell."""
+
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import isinf, isnan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from probe_kit._system.csv_text import unescaped
+from probe_kit._system.optional_dependencies import require
+from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
+from probe_kit.errors import UsageError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Cell = str | int | float | bool | None
+Kind = Literal["text", "boolean", "integer", "number"]
+
+EPISODE, INFERENCE = "episode_id", "inference"
+"""Key columns of a table: one label per episode, or with both one per captured inference."""
+MOST_BYTES = 1 << 30
+EXACT = 2**53
+"""Integers beyond it have no exact float64."""
+_INTEGER = re.compile(r"[+-]?[0-9]+")
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+_INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
+_ARTICLE = {"text": "text", "boolean": "true or false", "integer": "a number", "number": "a number"}
+
+
+@dataclass(frozen=True)
+class LabelTable:
+    """Some columns of a table of labels, as cells of Python types.
+
+    source: the file, or `DataFrame`. unit: `line` of a file, or `row` where there are no lines. names: all columns
+    of the table. columns: cells of those that were asked for. lines: number of every row in its file.
+    """
+
+    source: str
+    unit: str
+    names: tuple[str, ...]
+    columns: dict[str, list[Cell]]
+    lines: list[int]
+
+    def where(self, row: int, column: str | None = None) -> str:
+        """The place of a cell, as errors name it."""
+        place = f"{self.source}, {self.unit} {self.lines[row]}"
+        return place if column is None else f"{place}, column {terminal_safe(column)!r}"
+
+    def cells(self, column: str) -> list[Cell]:
+        """The cells of one column, of one kind. Raises UsageError for mixed kinds and unusable cells."""
+        cells = self.columns[column]
+        first: tuple[Kind, int] | None = None
+        for row, cell in enumerate(cells):
+            if cell is None:
+                continue
+            kind = self._kind(row, column, cell)
+            if first is None:
+                first = kind, row
+            elif _ARTICLE[kind] != _ARTICLE[first[0]]:
+                raise UsageError(
+                    f"{self.where(row, column)}: {cell!r} is {_ARTICLE[kind]}, and {self.unit} "
+                    f"{self.lines[first[1]]} has {_ARTICLE[first[0]]}; expected one type. Correct one of the two, "
+                    "or leave the cell empty"
+                )
+        return cells
+
+    def texts(self, column: str) -> list[str]:
+        """The cells of one column as names, none of them empty. Raises UsageError."""
+        cells = self.columns[column]
+        for row, cell in enumerate(cells):
+            if cell is None:
+                raise UsageError(f"{self.where(row, column)} is empty; expected a name in every {self.unit}")
+            self._kind(row, column, cell)
+        return [str(cell) for cell in cells]
+
+    def _kind(self, row: int, column: str, cell: Cell) -> Kind:
+        if isinstance(cell, bool):
+            return "boolean"
+        if isinstance(cell, int):
+            if abs(cell) > EXACT:
+                raise UsageError(
+                    f"{self.where(row, column)}: the integer {cell} is beyond 2^53, so it has no exact float64. "
+                    "Write it as text if it is a name, or subtract an offset"
+                )
+            return "integer"
+        if isinstance(cell, float):
+            if isinf(cell):
+                raise UsageError(f"{self.where(row, column)} is infinite; expected a finite number or no entry")
+            return "number"
+        if found := UNSAFE.search(str(cell)):
+            raise UsageError(
+                f"{self.where(row, column)} holds the control or direction character U+{ord(found[0]):04X}; "
+                "expected plain text. Remove it"
+            )
+        return "text"
+
+
+def read_table(table: "Path | str | pd.DataFrame", wanted: Sequence[str]) -> LabelTable:
+    """The key columns and the columns `wanted` of a table. wanted: those that it lacks are left out.
+
+    table: a CSV file in UTF-8, a Parquet file (`.parquet`), or a DataFrame. Raises UsageError for a file that is
+    no such table, or has no column `episode_id`; MissingExtraError for Parquet without pyarrow.
+    """
+    if not isinstance(table, str | Path):
+        return _of_frame(table, "DataFrame", wanted)
+    path = Path(table)
+    _check_file(path)
+    if path.suffix.lower() in (".parquet", ".pq"):
+        return _of_frame(_read_parquet(path), str(path), wanted)
+    return _of_csv(path, wanted)
+
+
+def _check_file(path: Path) -> None:
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror}. Give a CSV or Parquet file") from error
+    if size > MOST_BYTES:
+        raise UsageError(
+            f"{path} has {size / 1e6:,.0f} MB; expected a table of at most {MOST_BYTES / 1e6:,.0f} MB"
+        )
+
+
+def _of_csv(path: Path, wanted: Sequence[str]) -> LabelTable:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            records = _records(file, path)
+            header = next(records, (1, []))[1]
+            names = [unescaped(name.strip()) for name in header]
+            place = _places(names, wanted, str(path))
+            columns: dict[str, list[Cell]] = {name: [] for name in place}
+            lines = []
+            for line, record in records:
+                if len(record) != len(names):
+                    raise UsageError(
+                        f"{path}, line {line} has {len(record)} fields, the heading has {len(names)}. Put a text "
+                        'with commas between "quotes"'
+                    )
+                lines.append(line)
+                for name, position in place.items():
+                    columns[name].append(_parsed(unescaped(record[position].strip()), name))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path} cannot be read as a table: {error}. Give a CSV file in UTF-8") from error
+    return LabelTable(str(path), "line", tuple(names), columns, lines)
+
+
+def _records(file: Any, path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Line number and fields of every record that is not empty."""
+    reader = csv.reader(file, strict=True)
+    before = 0
+    try:
+        for record in reader:
+            if record:
+                yield before + 1, record
+            before = reader.line_num
+    except csv.Error as error:
+        raise UsageError(f"{path}, line {reader.line_num} is no CSV: {error}. Write the table again") from error
+
+
+def _places(names: Sequence[str], wanted: Sequence[str], source: str) -> dict[str, int]:
+    """Position of every column to read. Raises UsageError without the key, and for a name used twice."""
+    if EPISODE not in names:
+        shown = ", ".join(terminal_safe(name) for name in names[:12]) or "no column"
+        raise UsageError(
+            f"{source}, line 1 lacks the key column {EPISODE!r}; it has {shown}. `probe-kit labels RUN` "
+            "writes a table with the keys of a run"
+        )
+    read = [name for name in dict.fromkeys((EPISODE, INFERENCE, *wanted)) if name in names]
+    if twice := [name for name in read if names.count(name) > 1]:
+        raise UsageError(f"{source}, line 1 has the column {terminal_safe(twice[0])!r} twice. Rename one of them")
+    return {name: names.index(name) for name in read}
+
+
+def _parsed(text: str, column: str) -> Cell:
+    """A field of a CSV file as the type that it spells; ids stay text."""
+    if not text:
+        return None
+    if column == EPISODE:
+        return text
+    if _INTEGER.fullmatch(text):
+        return int(text) if len(text) < 40 else float(text)
+    if _NUMBER.fullmatch(text) or _INFINITE.fullmatch(text):
+        return float(text)
+    if text.lower() == "nan":
+        return None
+    return {"true": True, "false": False}.get(text.lower(), text)
+
+
+def _read_parquet(path: Path) -> "pd.DataFrame":
+    parquet = require("pyarrow.parquet", "export")
+    try:
+        frame: pd.DataFrame = parquet.read_table(path).to_pandas()
+    except Exception as error:  # pyarrow raises many kinds for files that are no Parquet
+        raise UsageError(f"{path} is no Parquet file: {error}. Write it again, or give a CSV file") from error
+    return frame
+
+
+def _of_frame(frame: "pd.DataFrame", source: str, wanted: Sequence[str]) -> LabelTable:
+    if any(name is not None for name in frame.index.names):
+        frame = frame.reset_index()
+    names = [str(name) for name in frame.columns]
+    place = _places(names, wanted, source)
+    columns = {name: [_plain(cell) for cell in frame.iloc[:, number].tolist()] for name, number in place.items()}
+    return LabelTable(source, "row", tuple(names), columns, list(range(1, len(frame) + 1)))
+
+
+def _plain(cell: Any) -> Cell:
+    """A cell of a frame as a Python type; whatever means "missing" is None."""
+    import pandas as pd
+
+    if cell is None or cell is pd.NA or cell is pd.NaT or (isinstance(cell, float) and isnan(cell)):
+        return None
+    if isinstance(cell, np.generic):
+        return _plain(cell.item())
+    return cell if isinstance(cell, bool | int | float) else str(cell) or None

@@ -1,0 +1,129 @@
+"""Labels of one's own: what is read, and what is refused with its file and line."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.errors import UsageError
+from probe_kit.train import Labels
+
+HEADING = "episode_id,inference,y,scene\n"
+
+
+def written(folder: Path, text: str) -> Path:
+    file = folder / "labels.csv"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def test_a_csv_a_parquet_file_and_a_frame_of_the_same_column_have_one_hash(tmp_path: Path) -> None:
+    frame = pd.DataFrame({"episode_id": list("bacd"), "inference": [0, 1, 0, 0], "y": [0.1, 1 / 3, np.nan, 2]})
+    frame.to_csv(tmp_path / "labels.csv", index=False)
+    frame.to_parquet(tmp_path / "labels.parquet")
+    read = [Labels.read(source, "y") for source in (frame, tmp_path / "labels.csv", tmp_path / "labels.parquet")]
+    assert len({labels.sha256 for labels in read}) == 1
+    assert {labels.task for labels in read} == {"continuous"}
+    shuffled = Labels.read(frame.iloc[::-1], "y")
+    assert shuffled.sha256 == read[0].sha256, "the order of the rows is no part of a column"
+    other = Labels.read(frame.assign(y=[0.1, 1 / 3, 2.0, 2]), "y")
+    assert other.sha256 != read[0].sha256
+
+
+@pytest.mark.parametrize(
+    ("cells", "asked", "task", "classes"),
+    [
+        (["red", "blue", ""], None, "binary", ("blue", "red")),
+        (["red", "blue", "green"], None, "classes", ("blue", "green", "red")),
+        (["true", "false", "TRUE"], None, "binary", ("False", "True")),
+        (["0", "1", "1.0"], None, "binary", ("0", "1")),
+        (["0.5", "1", "nan"], None, "binary", ("0.5", "1")),
+        (["0.5", "1", "2e-3"], None, "continuous", ()),
+        (["10", "9", "8"], "classes", "classes", ("8", "9", "10")),
+        (["10", "9", "8"], "continuous", "continuous", ()),
+        ([str(number) for number in range(21)], None, "continuous", ()),
+        (["'=SUM(A1)", "x", "'=SUM(A1)"], None, "binary", ("=SUM(A1)", "x")),
+    ],
+)
+def test_the_task_follows_from_the_values_where_they_leave_no_doubt(
+    tmp_path: Path, cells: list[str], asked: str | None, task: str, classes: tuple[str, ...]
+) -> None:
+    rows = "".join(f"e{number},{cell}\n" for number, cell in enumerate(cells))
+    labels = Labels.read(written(tmp_path, "episode_id,y\n" + rows), "y", task=asked)  # type: ignore[arg-type]
+    assert (labels.task, labels.coded.classes, labels.per_step) == (task, classes, False)
+    empty = [cell in ("", "nan") for cell in cells]
+    assert np.isnan(labels.coded.values).tolist() == empty
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("episode,y\na,1\n", "line 1 lacks the key column 'episode_id'; it has episode, y"),
+        ("episode_id,x\na,1\n", "has no column 'y' to decode; it has: x"),
+        ("episode_id,y,y\na,1,2\n", "line 1 has the column 'y' twice"),
+        ("episode_id,y\n", "has no line below its heading"),
+        ("", "lacks the key column"),
+        ("episode_id,y\na,1\nb,red\n", "line 3, column 'y': 'red' is text, and line 2 has a number"),
+        ("episode_id,y\na,1\n\nb,true\n", "line 4, column 'y': True is true or false"),
+        ("episode_id,y\na,1\nb\n", "line 3 has 1 fields, the heading has 2"),
+        ('episode_id,y\na,"1\n', "is no CSV"),
+        ("episode_id,y\na,1\n,2\n", "line 3, column 'episode_id' is empty"),
+        ("episode_id,y\na,9007199254740993\nb,1\n", "line 2, column 'y': the integer 9007199254740993 is beyond"),
+        ("episode_id,y\na,1.5\nb,-inf\n", "line 3, column 'y' is infinite"),
+        (
+            "episode_id,y\na,red\nb,r\u202eed\n",
+            "line 3, column 'y' holds the control or direction character U+202E",
+        ),
+        ("episode_id,y\na,1\nb,2\na,3\n", "line 4: episode 'a' has a label in line 2 already"),
+        (HEADING + "a,0,1,s\na,0,2,s\n", "line 3: episode 'a', inference 0 has a label in line 2 already"),
+        (HEADING + "a,-1,1,s\n", "line 2, column 'inference' is -1; expected the number of a captured"),
+        (HEADING + "a,0.5,1,s\n", "line 2, column 'inference' is 0.5"),
+        (HEADING + "a,inf,1,s\n", "line 2, column 'inference' is inf"),
+        (HEADING + "a,,1,s\n", "line 2, column 'inference' is None"),
+        (HEADING + "a,0,1,s\nb,0,2,\n", "line 3, column 'scene' is empty; expected a name in every line"),
+        ("episode_id,y\na,1\nb,1\n", "has one value, 1; expected two or more"),
+        ("episode_id,y\na,\nb,\n", "has no value; expected two or more"),
+        ("episode_id,y\na,1\nb,2\nc,3\n", "3 integers, from 1 to 3, which can be classes or quantities"),
+    ],
+)
+def test_a_table_that_is_wrong_is_refused_with_its_line(tmp_path: Path, text: str, expected: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        Labels.read(written(tmp_path, text), "y", group_by="scene")
+    assert expected in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("cells", "task", "expected"),
+    [
+        (["red", "blue"], "continuous", "texts such as 'blue'; a continuous label needs numbers"),
+        (["1", "2", "3"], "binary", "has 3 values (1, 2, 3, …); a binary label needs two"),
+        (["1.5", "2", "3"], "classes", "decimals such as 1.5; classes need texts or integers"),
+        (["1", "2"], "ordinal", "task 'ordinal'; expected one of binary, classes, continuous"),
+    ],
+)
+def test_a_task_that_the_values_cannot_have_is_refused(
+    tmp_path: Path, cells: list[str], task: str, expected: str
+) -> None:
+    rows = "".join(f"e{number},{cell}\n" for number, cell in enumerate(cells))
+    with pytest.raises(UsageError) as refused:
+        Labels.read(written(tmp_path, "episode_id,y\n" + rows), "y", task=task)  # type: ignore[arg-type]
+    assert expected in str(refused.value)
+
+
+def test_files_that_are_no_tables_are_refused_by_name(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="cannot be read"):
+        Labels.read(tmp_path / "absent.csv", "y")
+    (tmp_path / "bytes.csv").write_bytes(b"episode_id,y\n\xff\xfe,1\n")
+    with pytest.raises(UsageError, match="Give a CSV file in UTF-8"):
+        Labels.read(tmp_path / "bytes.csv", "y")
+    (tmp_path / "no.parquet").write_bytes(b"PAR1")
+    with pytest.raises(UsageError, match="is no Parquet file"):
+        Labels.read(tmp_path / "no.parquet", "y")
+
+
+def test_a_heading_of_many_thousand_columns_is_read_for_the_few_that_are_asked_for(tmp_path: Path) -> None:
+    heading = "episode_id,y," + ",".join(f"x{number}" for number in range(200_000))
+    rows = "".join(f"\ne{number},{number / 3}" + "," * 200_000 for number in range(3))
+    labels = Labels.read(written(tmp_path, heading + rows), "y")
+    assert labels.coded.values.tolist() == [0, 1 / 3, 2 / 3]
