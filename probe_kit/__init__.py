@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         ReplaySource,
         Steering,
         load_effects,
+        patching,
         run_intervention,
     )
     from probe_kit.retention import retention_table
@@ -75,6 +76,7 @@ __all__ = [
     "load_results",
     "load_suite",
     "open_run",
+    "patching",
     "retention_table",
     "run_intervention",
     "train_probes",
@@ -117,6 +119,7 @@ __getattr__, __dir__ = lazy_names(
         "load_results": "train",
         "load_suite": "suite",
         "open_run": "extract",
+        "patching": "intervene.patching:",
         "retention_table": "retention",
         "train_probes": "train",
         "write_report": "retention.report",

@@ -74,19 +74,24 @@ class ReplaceWith:
 
 @dataclass(frozen=True)
 class ReplaceInSubspace:
-    """With another inference's component within a subspace; the rest stays. basis: (K, D) orthonormal."""
+    """With another inference's component within a subspace; the rest stays. basis: (K, D) orthonormal.
+
+    rest: the other way round, with all but that component, which stays.
+    """
 
     source: "ActivationCache"
     tokens: int
     basis: NDArray[np.float32]
+    rest: bool = False
 
     def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
-        """own + (source − own) P."""
+        """own + (source − own) P; with rest own + (source − own) (1 − P)."""
         import torch
 
         apart = ReplaceWith(self.source, self.tokens)(site, own, where) - own
         directions = torch.tensor(self.basis, device=own.device)
-        found: Tensor = own + (apart @ directions.T) @ directions
+        within = (apart @ directions.T) @ directions
+        found: Tensor = own + (apart - within if self.rest else within)
         return found
 
 

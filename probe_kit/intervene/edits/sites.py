@@ -15,13 +15,14 @@ from probe_kit.hooks.contract.sites import HEADS, KV, KV_STREAM, Site
 from probe_kit.hooks.contract.views import plays
 
 if TYPE_CHECKING:
-    from probe_kit.hooks import Model, Policy, Stream
+    from probe_kit.hooks import Model, Policy, Roles, Stream
 
 TILE_ROLES = ("image.left", "image.right")
 """Roles of the patches that see one of the two pictures; see `tiles`."""
 ALL = "all"
 """The role of every token but padding."""
 RESIDUAL = "residual"
+_POSITIONS = re.compile(r"(?P<first>\d+)(-(?P<last>\d+))?")
 _PATTERN = re.compile(
     r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d+)(\.(?P<quantity>[a-z_]+)(\.(?P<head>\*|\d+))?)?"
     r"(@(?P<first>\d+)(-(?P<last>\d+))?)?"
@@ -181,12 +182,26 @@ def _place(stream: "Stream", name: PlaceName) -> SiteGroup:
 
 def token_mask(policy: "Policy", seen: Observation, stream: str, role: str) -> NDArray[np.bool_]:
     """(T,) the tokens of a stream that play `role`. Raises EmptyRoleError if none does."""
-    roles = policy.token_roles([seen])[stream][0]
+    return mask_of(policy.token_roles([seen])[stream][0], stream, role)
+
+
+def mask_of(roles: "Roles", stream: str, role: str) -> NDArray[np.bool_]:
+    """(T,) the tokens that play `role`, or are at positions such as `7-11`. Raises EmptyRoleError if none does."""
+    if (positions := _POSITIONS.fullmatch(role)) is not None:
+        first, last = int(positions["first"]), int(positions["last"] or positions["first"])
+        if not first <= last < len(roles):
+            raise EmptyRoleError(f"{stream} has no positions {role}; it has 0 to {len(roles) - 1}")
+        return (first <= np.arange(len(roles))) & (np.arange(len(roles)) <= last)
     mask = roles.valid if role == ALL else roles.mask(role)
     if not mask.any():
         there = ", ".join(dict.fromkeys(span.role for span in roles.spans))
         raise EmptyRoleError(f"no token of {stream} has the role {role!r}; there are {there}")
     return np.asarray(mask, bool)
+
+
+def is_positions(role: str) -> bool:
+    """Whether a role is spelled as positions of tokens, such as `7` or `7-11`."""
+    return _POSITIONS.fullmatch(role) is not None
 
 
 def roles_of(policy: "Policy", stream: str, wanted: Sequence[str]) -> list[str]:

@@ -27,10 +27,16 @@ def share_of_swap(outcomes: ConditionOutcomes, moved: NDArray[np.float64], suite
     """
     if IMAGE_SWAP not in outcomes.conditions or min(swap_p_values(outcomes)) >= SIGNIFICANCE:
         return None
-    whole = outcomes.of(IMAGE_SWAP) - outcomes.of(CLEAN)
-    names, group_of = np.unique(outcomes.groups, return_inverse=True)
+    return share_of_whole(moved, outcomes.of(IMAGE_SWAP) - outcomes.of(CLEAN), outcomes.groups, suite)
+
+
+def share_of_whole(
+    moved: NDArray[np.float64], whole: NDArray[np.float64], groups: NDArray[np.str_], suite: str
+) -> SwapShare:
+    """Σ moved · whole / Σ whole² over episodes (E,), with its interval by groups (E,). suite: seeds the draws."""
+    names, group_of = np.unique(groups, return_inverse=True)
     above, below = np.bincount(group_of, moved * whole), np.bincount(group_of, whole**2)
-    times = draw_groups(names.size, units_seed(outcomes.groups, suite))
+    times = draw_groups(names.size, units_seed(groups, suite))
     drawn = (times @ above) / np.maximum(times @ below, np.finfo(float).tiny)
     low, high = np.percentile(drawn, [2.5, 97.5])
     return SwapShare(float(above.sum() / below.sum()), float(low), float(high))

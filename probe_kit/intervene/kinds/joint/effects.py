@@ -109,7 +109,7 @@ class _Category:
         for at, name in enumerate(names):
             alone = self._share(self.outcomes, self._moved(f"{ALONE}|{name}"))
             needed = self._share(self.outcomes, self._moved(EVERY) - self._moved(f"{WITHOUT}|{name}"))
-            finding = _finding_of_cell(alone, needed, every, float(p_fwe[at]))
+            finding = finding_of_cell(alone, needed, every, float(p_fwe[at]))
             rows.append(
                 self._row("cell", name, self.outcomes, alone, needed, float(p[at]), float(p_fwe[at]), finding)
             )
@@ -173,7 +173,8 @@ class _Category:
         return share_of_swap(outcomes, moved, self.suite)
 
 
-def _finding_of_cell(alone: SwapShare | None, needed: SwapShare | None, every: SwapShare | None, p: float) -> str:
+def finding_of_cell(alone: SwapShare | None, needed: SwapShare | None, every: SwapShare | None, p: float) -> str:
+    """What a cell is, from its shares alone and needed, that of all cells, and p of it alone; "n/a" if open."""
     if alone is None or needed is None or every is None:
         return "n/a"
     carries = alone.value >= CARRIES and p < SIGNIFICANCE

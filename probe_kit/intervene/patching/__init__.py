@@ -1,0 +1,79 @@
+"""Activation patching as plain functions: capture, patch and compare, for one observation or for many pairs.
+
+    from probe_kit import patching as pt
+
+    pair = pt.Pair(clean, source, seed=0)
+    cells = pt.find_cells(policy, "backbone.*|all,image", "kv.*|image", "backbone.02.heads.*|image")
+    chunk = pt.patch_cells(policy, pair, cells[3])
+    swept = pt.sweep_cells(policy, pairs, cells, metric)
+
+Nothing is stored; `run_intervention` makes the same patches, stores them, and gives verdicts.
+"""
+
+from typing import TYPE_CHECKING
+
+from probe_kit._system.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from probe_kit.hooks.capturing.head_outputs import project_heads
+    from probe_kit.hooks.capturing.logit_lens import logit_lens
+    from probe_kit.intervene.kinds.joint.cells import Cell, all_but
+    from probe_kit.intervene.patching.cells import find_cells
+    from probe_kit.intervene.patching.inference import HookPoint, run_with_cache, run_with_hooks
+    from probe_kit.intervene.patching.pairs import Pair, find_pairs
+    from probe_kit.intervene.patching.patch import patch_cells
+    from probe_kit.intervene.patching.patterns import AttentionPattern, attention_patterns
+    from probe_kit.intervene.patching.sets import (
+        MinimalCells,
+        compare_alone_and_without,
+        find_minimal_cells,
+    )
+    from probe_kit.intervene.patching.sweep import Sweep, sweep_cells
+    from probe_kit.intervene.replay.session import open_session
+
+__all__ = [
+    "AttentionPattern",
+    "Cell",
+    "HookPoint",
+    "MinimalCells",
+    "Pair",
+    "Sweep",
+    "all_but",
+    "attention_patterns",
+    "compare_alone_and_without",
+    "find_cells",
+    "find_minimal_cells",
+    "find_pairs",
+    "logit_lens",
+    "open_session",
+    "patch_cells",
+    "project_heads",
+    "run_with_cache",
+    "run_with_hooks",
+    "sweep_cells",
+]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "AttentionPattern": "patterns",
+        "Cell": "probe_kit.intervene.kinds.joint.cells",
+        "HookPoint": "inference",
+        "MinimalCells": "sets",
+        "Pair": "pairs",
+        "Sweep": "sweep",
+        "all_but": "probe_kit.intervene.kinds.joint.cells",
+        "attention_patterns": "patterns",
+        "compare_alone_and_without": "sets",
+        "find_cells": "cells",
+        "find_minimal_cells": "sets",
+        "find_pairs": "pairs",
+        "logit_lens": "probe_kit.hooks.capturing.logit_lens",
+        "open_session": "probe_kit.intervene.replay.session",
+        "patch_cells": "patch",
+        "project_heads": "probe_kit.hooks.capturing.head_outputs",
+        "run_with_cache": "inference",
+        "run_with_hooks": "inference",
+        "sweep_cells": "sweep",
+    },
+)

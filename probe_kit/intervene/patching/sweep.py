@@ -1,0 +1,160 @@
+"""A sweep: every cell patched alone, or every set of cells together, in every pair, and what it moves."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.intervene.edits.sites import PlaceName
+from probe_kit.intervene.kinds.joint.cells import Cell
+from probe_kit.intervene.kinds.swap_shares import SwapShare, share_of_whole
+from probe_kit.intervene.patching.inference import Given, infer, run_with_cache
+from probe_kit.intervene.patching.pairs import Pair, groups_and_items
+from probe_kit.intervene.patching.patch import Basis, Cells, infer_patched, together
+from probe_kit.statistics.paired_signs import paired_greater_p
+from probe_kit.statistics.sign_flips import max_t
+from probe_kit.statistics.significance import SIGNIFICANCE
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from probe_kit.hooks import Model
+
+Metric = Callable[[Any, Given], float]
+"""From the output of an inference and what was given to it to a number, such as metres to the left."""
+_DRAWS = "patching"
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What K sets of cells move in E pairs.
+
+    cells: the sets. groups, items: (E,) of the pairs. toward: (E,) ±1, see `Pair`. clean, source: (E,) the metric
+    of both inferences; patched: (K, E) of those with a set of cells patched.
+    """
+
+    cells: tuple[tuple[Cell, ...], ...]
+    groups: NDArray[np.str_]
+    items: NDArray[np.str_]
+    toward: NDArray[np.float64]
+    clean: NDArray[np.float64]
+    source: NDArray[np.float64]
+    patched: NDArray[np.float64]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the sets: their cells, joined by +."""
+        return tuple(" + ".join(map(str, own)) for own in self.cells)
+
+    @property
+    def whole(self) -> NDArray[np.float64]:
+        """(E,) by how much the source differs from the clean inference."""
+        return self.source - self.clean
+
+    @cached_property
+    def source_p(self) -> float:
+        """That the source moves the metric toward where it should: exact sign test, by items and by groups."""
+        return paired_greater_p(self.toward * self.whole, self.items, self.groups)
+
+    @cached_property
+    def shares(self) -> tuple[SwapShare | None, ...]:
+        """Per set its share of the source's effect with a 95 % interval by groups; see `table`."""
+        if self.source_p >= SIGNIFICANCE:
+            return (None,) * len(self.cells)
+        return tuple(share_of_whole(own - self.clean, self.whole, self.groups, _DRAWS) for own in self.patched)
+
+    @cached_property
+    def table(self) -> "pd.DataFrame":
+        """One row per set of cells.
+
+        share, low, high: Σ moved · whole / Σ whole² over pairs, 1 for all that the source does, with its 95 %
+        interval by groups; NaN where the source itself is not significant, as with four groups or fewer: it
+        would be a ratio of noise. moved: mean of the metric toward `Pair.toward`, in its unit. p, p_fwe:
+        that it moves there, by sign flips of whole groups; p_fwe against all sets of the sweep (max-T).
+        """
+        import pandas as pd
+
+        moved = self.toward * (self.patched - self.clean)
+        seed = derive_seed(_DRAWS, "sign flips", *np.unique(self.groups).tolist())
+        _, p, p_fwe = max_t(moved, self.items, self.groups, seed)
+        shares = [(np.nan,) * 3 if own is None else tuple(own) for own in self.shares]
+        return pd.DataFrame(
+            {
+                "cells": self.names,
+                **dict(zip(("share", "low", "high"), np.array(shares).T, strict=True)),
+                "moved": moved.mean(axis=1),
+                "p": p,
+                "p_fwe": p_fwe,
+                "n_pairs": self.clean.size,
+                "n_groups": np.unique(self.groups).size,
+            }
+        )
+
+    def heatmap(self, column: str = "share") -> "Figure":
+        """Cells by layer and role, coloured by a column of the table.
+
+        Raises UsageError for sets of several cells, or without any number in the column.
+        """
+        from matplotlib.figure import Figure
+
+        if any(len(own) > 1 for own in self.cells):
+            raise UsageError("a heatmap shows single cells; this sweep has sets of several, use its table")
+        values = self.table[column].to_numpy(float)
+        if np.isnan(values).all():
+            raise UsageError(
+                f"no cell has a {column}: p of the source itself is {self.source_p:.2g}; take 'moved'"
+            )
+        places = sorted({own[0].place.name for own in self.cells}, key=lambda name: _order(PlaceName.parse(name)))
+        roles = list(dict.fromkeys(own[0].role for own in self.cells))
+        grid = np.full((len(roles), len(places)), np.nan)
+        for (cell,), value in zip(self.cells, values, strict=True):
+            grid[roles.index(cell.role), places.index(cell.place.name)] = value
+        figure = Figure(figsize=(2 + 0.4 * len(places), 1.5 + 0.4 * len(roles)), layout="constrained")
+        axes = figure.add_subplot()
+        image = axes.imshow(grid, aspect="auto", cmap="viridis")
+        axes.set_xticks(range(len(places)), places, rotation=90)
+        axes.set_yticks(range(len(roles)), roles)
+        figure.colorbar(image, label=column)
+        return figure
+
+
+def sweep_cells(
+    model: "Model",
+    pairs: Sequence[Pair],
+    cells: Sequence[Cells],
+    metric: Metric,
+    *,
+    along: Basis | None = None,
+    rest: bool = False,
+) -> Sweep:
+    """Patch every cell, or every set of cells, of `cells` in every pair; one inference each, and two per pair.
+
+    metric: of an output and what was given, such as `session.lateral_displacement`; of the same inference as the
+    patch. along, rest: see `patch_cells`. Raises UsageError without pairs, and what `patch_cells` raises.
+    """
+    sets = tuple(together(own) for own in cells)
+    if not pairs or not sets:
+        raise UsageError(f"a sweep of {len(sets)} sets of cells in {len(pairs)} pairs; give at least one of both")
+    places = list(dict.fromkeys(cell.place.name for own in sets for cell in own))
+    clean, moved = np.empty(len(pairs)), np.empty(len(pairs))
+    patched = np.empty((len(sets), len(pairs)))
+    for column, pair in enumerate(pairs):
+        output, source = run_with_cache(model, pair.source, pair.seed, places)
+        moved[column] = metric(output, pair.source)
+        clean[column] = metric(infer(model, pair.clean, pair.seed), pair.clean)
+        for row, own in enumerate(sets):
+            output = infer_patched(model, pair, own, source, along, rest)
+            patched[row, column] = metric(output, pair.clean)
+    groups, items = groups_and_items(pairs)
+    toward = np.array([float(np.sign(pair.toward)) for pair in pairs])
+    return Sweep(sets, np.array(groups), np.array(items), toward, clean, moved, patched)
+
+
+def _order(name: PlaceName) -> tuple[object, ...]:
+    return name.stream, *name.depth
