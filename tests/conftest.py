@@ -113,6 +113,11 @@ def golden_pi0() -> Path:
 
 
 @pytest.fixture(scope="session")
+def golden_pi05() -> Path:
+    return _golden("pi05")
+
+
+@pytest.fixture(scope="session")
 def golden_smolvla() -> Path:
     return _golden("smolvla")
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 ENTRY_POINTS = "probe_kit.policies"
 FOLDERS = (
     "pi0",
+    "pi05",
     "smolvla",
     "openvla",
     "spatialvla",

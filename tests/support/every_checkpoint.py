@@ -8,6 +8,7 @@ from tests.support import (
     internvla_checkpoints,
     magma_checkpoints,
     pi0_checkpoints,
+    pi05_checkpoints,
     prismatic_checkpoints,
     smolvla_checkpoints,
     spatialvla_checkpoints,
@@ -18,6 +19,7 @@ from tests.support import (
 _BYTES = {"tokenizer": "bytes"}
 WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "pi0": (pi0_checkpoints.write_intact, {}),
+    "pi05": (pi05_checkpoints.write_pi05, {}),
     "smolvla": (smolvla_checkpoints.write_smolvla, {}),
     "openvla": (prismatic_checkpoints.write_checkpoint, _BYTES),
     "prismatic": (prismatic_checkpoints.write_checkpoint, _BYTES),

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.numpy import save_file as save_arrays
 from safetensors.torch import save_file
 from tokenizers import Tokenizer
 from tokenizers.models import WordLevel
@@ -14,6 +13,7 @@ from tokenizers.pre_tokenizers import Sequence, Split
 
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.lerobot.smolvla import build_smolvla
+from tests.support.lerobot_units import write_units
 
 SPECIAL = [
     "<pad>", "<eos>", "<bos>", "<unk>", "<fake_token_around_image>", "<image>", "<end_of_utterance>",
@@ -35,8 +35,10 @@ def write_smolvla(folder: Path, cameras: tuple[str, ...] = ("top",), seed: int =
     initialise(network, seed)
     tensors = {name: tensor.clone().contiguous() for name, tensor in network.state_dict().items()}
     save_file(tensors, folder / "model.safetensors")
-    for kind, feature, size in (("pre", "observation.state", 8), ("post", "action", 7)):
-        _write_units(folder, kind, feature, size)
+    for feature, size in (("observation.state", 8), ("action", 7)):
+        rng = np.random.default_rng(size)
+        mean, deviation = rng.normal(0, 0.1, size), rng.uniform(0.5, 2, size)
+        write_units(folder, feature, "MEAN_STD", {"mean": mean, "std": deviation})
     return folder
 
 
@@ -108,19 +110,6 @@ def _write_vlm(folder: Path) -> None:
             "vision_config": vision,
         },
     )
-
-
-def _write_units(folder: Path, kind: str, feature: str, size: int) -> None:
-    name = f"policy_{kind}processor"
-    step = "normalizer" if kind == "pre" else "unnormalizer"
-    state = f"{name}_step_0_{step}_processor.safetensors"
-    rng = np.random.default_rng(size)
-    values = {f"{feature}.mean": rng.normal(0, 0.1, size), f"{feature}.std": rng.uniform(0.5, 2, size)}
-    save_arrays({key: value.astype(np.float32) for key, value in values.items()}, folder / state)
-    modes = {"VISUAL": "IDENTITY", "STATE": "MEAN_STD", "ACTION": "MEAN_STD"}
-    config = {"eps": 1e-8, "features": {}, "norm_map": modes}
-    steps = [{"registry_name": f"{step}_processor", "config": config, "state_file": state}]
-    _write(folder / f"{name}.json", {"name": name, "steps": steps})
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any, cast
 
 import torch
@@ -82,7 +83,7 @@ def build_pi0(config: PI0Config, size: Pi0Size | None = None, device: str = "cpu
     embedding scale and the rotary frequencies are buffers no checkpoint holds.
     """
     config.device = device
-    with _resized(size), torch.device(device):
+    with resized(modeling_pi0, size), torch.device(device):
         policy = PI0Policy(config)
     policy.eval()
     return cast(PI0Policy, policy)
@@ -94,21 +95,22 @@ def full_size_pi0() -> PI0Policy:
 
 
 @contextmanager
-def _resized(size: Pi0Size | None) -> Iterator[None]:
+def resized(module: ModuleType, size: Pi0Size | None) -> Iterator[None]:
+    """Inside, lerobot's module of pi0 or pi0.5 builds networks of this size; None for the released one."""
     if size is None:
         yield
         return
     replacements: dict[str, Callable[..., Any]] = {
         "get_gemma_config": lambda variant: size.vlm if variant == "gemma_2b" else size.expert,
-        "PaliGemmaForConditionalGenerationWithPiGemma": _sized_paligemma(size),
-        "PiGemmaForCausalLM": _sized_expert(size),
+        "PaliGemmaForConditionalGenerationWithPiGemma": _sized_paligemma(module, size),
+        "PiGemmaForCausalLM": _sized_expert(module, size),
     }
-    with replaced(modeling_pi0, replacements):
+    with replaced(module, replacements):
         yield
 
 
-def _sized_paligemma(size: Pi0Size) -> Callable[..., Any]:
-    real = modeling_pi0.PaliGemmaForConditionalGenerationWithPiGemma
+def _sized_paligemma(module: Any, size: Pi0Size) -> Callable[..., Any]:
+    real = module.PaliGemmaForConditionalGenerationWithPiGemma
 
     def build(config: Any) -> Any:
         config._vocab_size = size.vocab_size
@@ -125,8 +127,8 @@ def _sized_paligemma(size: Pi0Size) -> Callable[..., Any]:
     return build
 
 
-def _sized_expert(size: Pi0Size) -> Callable[..., Any]:
-    real = modeling_pi0.PiGemmaForCausalLM
+def _sized_expert(module: Any, size: Pi0Size) -> Callable[..., Any]:
+    real = module.PiGemmaForCausalLM
 
     def build(config: Any) -> Any:
         config.vocab_size = size.vocab_size

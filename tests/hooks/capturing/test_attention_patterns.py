@@ -109,7 +109,7 @@ def test_patterns_of_fused_attention_are_those_of_transformers_eager_attention(
         torch.testing.assert_close(patterns[site], expected.float(), rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("family", ["pi0", "smolvla", "openvla", "spatialvla", "magma", "xiaomi-r0"])
+@pytest.mark.parametrize("family", ["pi0", "pi05", "smolvla", "openvla", "spatialvla", "magma", "xiaomi-r0"])
 def test_the_acting_streams_patterns_on_the_prompt_are_its_recorded_attention(family: str, tmp_path: Path) -> None:
     """Each family records that in code of its own."""
     write, options = WRITERS[family]

@@ -61,7 +61,12 @@ class Pi0(EvaluatedPi0):
         sizes = [place / "dims.json" for place in (folder, folder.parent) if (place / "dims.json").is_file()]
         if not sizes:
             _check_small_weights(folder)
-        network: nn.Module = build_pi0(config, Pi0Size.from_file(sizes[0]) if sizes else None)
+        return cls.network_of(config, Pi0Size.from_file(sizes[0]) if sizes else None)
+
+    @classmethod
+    def network_of(cls, config: Any, size: Pi0Size | None) -> nn.Module:
+        """lerobot's policy of this size; None for the released one."""
+        network: nn.Module = build_pi0(config, size)
         return network
 
     @classmethod

@@ -319,8 +319,8 @@ class LerobotFlow(Policy):
         state: (B, numbers) as the network reads them; None for that of the observations.
         """
         device = self.config.device
-        tokens, mask = self.tokenise([o.instruction for o in seen])
         numbers = self.state(seen) if state is None else state
+        tokens, mask = self.tokenise([o.instruction for o in seen], numbers)
         return {
             **{f"{IMAGES}{camera}": self._pictures(camera, seen) for camera in self.shown},
             STATE: torch.from_numpy(numbers).to(device),
@@ -357,12 +357,23 @@ class LerobotFlow(Policy):
         rows = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         return torch.stack(rows).to(self.config.device)
 
-    def tokenise(self, instructions: Sequence[str]) -> tuple[Tensor, Tensor]:
-        """(B, tokenizer_max_length) ids and mask; never truncates and never drops a word."""
-        length = self.config.tokenizer_max_length
-        lines = [text if text.endswith("\n") else f"{text}\n" for text in instructions]
-        rows = [self.tokenizer(line)["input_ids"] for line in lines]
-        for text, row in zip(instructions, rows, strict=True):
+    def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
+        """The text that is read, per instruction. state: (B, numbers) as the network reads them."""
+        del state
+        return [text if text.endswith("\n") else f"{text}\n" for text in instructions]
+
+    def tokenise(
+        self, instructions: Sequence[str], state: NDArray[np.float32] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """(B, tokenizer_max_length) ids and mask; never truncates and never drops a word.
+
+        state: (B, numbers) as the network reads them, for prompts that hold it; None for zeros.
+        """
+        if state is None:
+            state = np.zeros((len(instructions), self._state_numbers), np.float32)
+        prompts, length = self.prompts(instructions, state), self.config.tokenizer_max_length
+        rows = [self.tokenizer(text)["input_ids"] for text in prompts]
+        for text, row in zip(prompts, rows, strict=True):
             if len(row) > length:
                 raise InstructionError(
                     f"{text!r} is {len(row)} tokens; this checkpoint reads {length}. Shorten it"
@@ -442,23 +453,25 @@ class LerobotFlow(Policy):
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Prefix and suffix as the family packs them."""
-        return self.packed_roles(*self.tokenise([o.instruction for o in seen]))
+        state = None if self.zero_filled_inputs() else self.state(seen)
+        return self.packed_roles(*self.tokenise([o.instruction for o in seen], state))
 
     def packed_roles(self, tokens: Tensor, mask: Tensor) -> dict[str, list[Roles]]:
         """The roles for instructions as (B, tokenizer_max_length) ids and mask."""
         suffix = Roles.from_labels(self.suffix_labels())
-        special = torch.isin(tokens, torch.tensor(self.tokenizer.all_special_ids))
         language = [
-            [
-                PADDING if not valid else "special" if marker else "language"
-                for valid, marker in zip(row, markers, strict=True)
-            ]
-            for row, markers in zip(mask.tolist(), special.tolist(), strict=True)
+            self.text_labels(row, valid) for row, valid in zip(tokens.tolist(), mask.tolist(), strict=True)
         ]
         return {
             "backbone": [Roles.from_labels(self.prefix_labels(row)) for row in language],
             "expert": [suffix] * len(language),
         }
+
+    def text_labels(self, ids: Sequence[int], valid: Sequence[bool]) -> list[str]:
+        """The role of every position of a prompt."""
+        special = frozenset(self.tokenizer.all_special_ids)
+        labels = ["special" if one in special else "language" for one in ids]
+        return [label if kept else PADDING for label, kept in zip(labels, valid, strict=True)]
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each instruction, without padding."""

@@ -1,0 +1,56 @@
+"""pi0.5 through lerobot."""
+
+from probe_kit.hooks.contract.card import SourceWeights
+from probe_kit.hooks.contract.declared import backbone, expert
+from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.state_layout import OPENNESS
+from probe_kit.hooks.families.shared.capabilities import FLOW
+from probe_kit.hooks.families.shared.lerobot.evaluation import PICTURES
+from probe_kit.hooks.family import Family
+
+FAMILIES = (
+    Family(
+        "pi05",
+        "pi0.5 (PaliGemma 3B + 300M flow-matching expert with adaptive norms) through lerobot",
+        "lerobot/pi05_base",
+        "probe_kit.hooks.families.pi05.adapter:load_pi05",
+        streams="backbone 19 layers, expert 19 layers x 10 iterations",
+        embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
+        hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
+        notes=(
+            "Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated. The base can be captured without "
+            "acting (--no-act); to act it needs a fine-tune for end-effector deltas. The prompt holds the state "
+            "as digits"
+        ),
+        verifier="probe_kit.hooks.families.pi05.verify:verify_pi05",
+        config_types=("pi05",),
+        source="paligemma",
+        source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
+        words="probe_kit.hooks.families.pi05.adapter:check_pi05_words",
+        declared={
+            "": (
+                backbone(19, 2048, 968, "state", camera="base_0_rgb"),
+                expert(19, 1024, 10, 50, ("action",)),
+            )
+        },
+        full_size="probe_kit.models.lerobot.pi05:full_size_pi05",
+        options=(
+            Option(
+                "statistics",
+                str,
+                "File with p01 and p99 of action and proprio, or bridge (shipped), where the checkpoint has none; "
+                "none: its numbers are metres and radians.",
+                "the checkpoint's",
+            ),
+            Option(
+                "picture",
+                str,
+                "How pictures come to the network's resolution.",
+                "as the checkpoint's layout implies",
+                PICTURES,
+            ),
+            Option("openness", str, "release: as Act2Answer's evaluation has it.", "measured", OPENNESS),
+        ),
+        interventions=FLOW,
+    ),
+)

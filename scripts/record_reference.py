@@ -1,0 +1,200 @@
+"""Record a golden reference of pi0 or pi0.5: what lerobot's own code puts out for a tiny checkpoint.
+
+    uv run python scripts/record_reference.py CHECKPOINT FOLDER --cameras base
+
+Nothing of probe_kit's hooks or adapters is used. lerobot's policy is built, filled and called as it is, and the
+streams come from lerobot's own blocks, called one after the other. The script fails unless the actions of those
+calls equal those of `predict_action_chunk`. `probe-kit verify FAMILY FOLDER` compares the adapter with it.
+"""
+
+import argparse
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import lerobot
+import numpy as np
+import torch
+import transformers
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.pi0 import modeling_pi0
+from lerobot.policies.pi05 import modeling_pi05
+from safetensors.torch import load_file
+from torch import Tensor
+from transformers import AutoTokenizer
+
+from probe_kit.models.lerobot.pi0 import Pi0Size, resized
+
+MODULES: dict[str, Any] = {"pi0": modeling_pi0, "pi05": modeling_pi05}
+POLICIES: dict[str, Callable[[Any], Any]] = {"pi0": modeling_pi0.PI0Policy, "pi05": modeling_pi05.PI05Policy}
+TASKS = ("put the cube on the red shape", "put the cube on the star")
+EMBEDDING = "model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
+HEAD = "model.paligemma_with_expert.paligemma.lm_head.weight"
+
+
+def lerobots_policy(checkpoint: Path) -> Any:
+    """lerobot's policy with the checkpoint's weights, through torch's strict loading alone."""
+    config: Any = PreTrainedConfig.from_pretrained(checkpoint)
+    config.compile_model, config.device = False, "cpu"
+    with resized(MODULES[config.type], Pi0Size.from_file(checkpoint / "dims.json")):
+        policy = POLICIES[config.type](config)
+    tensors = load_file(checkpoint / "model.safetensors")
+    tensors.setdefault(EMBEDDING, tensors[HEAD])
+    lacking = policy.load_state_dict(tensors, strict=False)
+    unused = {f"model.paligemma_with_expert.{part}.lm_head.weight" for part in ("paligemma", "gemma_expert")}
+    if lacking.unexpected_keys or set(lacking.missing_keys) - unused:
+        raise SystemExit(f"other tensors than the network's: {lacking}")
+    return policy.eval()
+
+
+def stack(model: Any, entering: Tensor, mask: Tensor, positions: Tensor, **further: Any) -> tuple[Tensor, Tensor]:
+    """(L + 1, B, T, D) entering each block and the norm, and (B, T, D) behind the norm."""
+    model.config._attn_implementation = "eager"
+    condition = further.get("adarms_cond")
+    rotary, stream, found = model.rotary_emb(entering, positions), entering, [entering.clone()]
+    for block in model.layers:
+        stream = block(stream, attention_mask=mask, position_ids=positions, position_embeddings=rotary, **further)
+        found.append(stream.clone())
+    return torch.stack(found), model.norm(stream, condition)[0]
+
+
+def record(policy: Any, batch: dict[str, Tensor], noise: Tensor) -> dict[str, np.ndarray]:
+    """Every quantity of one inference; see `hooks.families.shared.lerobot.verify` for names and shapes."""
+    model, joint = policy.model, policy.model.paligemma_with_expert
+    module = MODULES[policy.config.type]
+    state = [policy.prepare_state(batch)] if policy.config.type == "pi0" else []
+    images, image_masks = policy._preprocess_images(batch)
+    tokens, token_mask = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
+    found: dict[str, Tensor] = {"prep_images": torch.stack(images), "prep_image_masks": torch.stack(image_masks)}
+    if state:
+        found["prep_state"] = state[0]
+    found["vision_resid"] = torch.stack([vision_streams(joint, image) for image in images])
+
+    embedded, pad, attends = model.embed_prefix(images, image_masks, tokens, token_mask)
+    positions = torch.cumsum(pad, dim=1) - 1
+    mask = module.prepare_attention_masks_4d(module.make_att_2d_masks(pad, attends))
+    cache = transformers.DynamicCache()
+    found |= {"prefix_embs": embedded.clone(), "prefix_pad": pad, "prefix_position_ids": positions}
+    found["backbone_resid"], found["backbone_final_norm"] = stack(
+        joint.paligemma.model.language_model, embedded, mask, positions, past_key_values=cache
+    )
+
+    steps, moved = policy.config.num_inference_steps, noise
+    columns: dict[str, list[Tensor]] = {
+        "expert_resid": [],
+        "expert_final_norm": [],
+        "velocity": [],
+        "x_t": [noise],
+    }
+    for step in range(steps):
+        time = torch.full((len(noise),), 1 - step / steps)
+        suffix, suffix_pad, suffix_attends, condition = model.embed_suffix(*state, moved, time)
+        before = pad[:, None, :].expand(len(pad), suffix.shape[1], pad.shape[1])
+        seen = torch.cat([before, module.make_att_2d_masks(suffix_pad, suffix_attends)], dim=2)
+        places = pad.sum(-1)[:, None] + torch.cumsum(suffix_pad, dim=1) - 1
+        further = {} if condition is None else {"adarms_cond": condition}
+        resid, normed = stack(
+            joint.gemma_expert.model, suffix, module.prepare_attention_masks_4d(seen), places,
+            past_key_values=module.clone_past_key_values(cache), **further,
+        )  # fmt: skip
+        velocity = model.action_out_proj(normed[:, -policy.config.chunk_size :])
+        moved = moved - velocity / steps
+        for name, value in zip(columns, (resid, normed, velocity, moved), strict=True):
+            columns[name].append(value)
+    found |= {name: torch.stack(values) for name, values in columns.items()}
+    found["actions_padded"] = moved
+    found["actions"] = policy.predict_action_chunk(batch, noise=noise)
+    apart = float((found["actions"] - moved[..., : found["actions"].shape[-1]]).abs().max())
+    if apart > 1e-6:
+        raise SystemExit(f"lerobot's blocks, called one by one, give actions that are off by {apart:.3g}")
+    return {name: value.detach().numpy() for name, value in found.items()}
+
+
+def vision_streams(joint: Any, image: Tensor) -> Tensor:
+    """(L + 1, B, N, D): the embeddings, then what each block of the tower puts out."""
+    tower = joint.paligemma.model.vision_tower.vision_model
+    stream, found = tower.embeddings(image), []
+    for block in tower.encoder.layers:
+        found.append(stream)
+        stream = block(stream, attention_mask=None)
+    return torch.stack([*found, stream])
+
+
+def prompts(policy: Any, state: np.ndarray) -> list[str]:
+    """The tasks as lerobot's processor words them."""
+    if policy.config.type == "pi0":
+        return [f"{task}\n" for task in TASKS]
+    from lerobot.lerobot_types import TransitionKey
+    from lerobot.policies.pi05.processor_pi05 import Pi05PrepareStateTokenizerProcessorStep
+
+    worded = Pi05PrepareStateTokenizerProcessorStep()(
+        {
+            TransitionKey.OBSERVATION: {"observation.state": torch.from_numpy(state)},
+            TransitionKey.COMPLEMENTARY_DATA: {"task": list(TASKS)},
+        }
+    )
+    return list(worded[TransitionKey.COMPLEMENTARY_DATA]["task"])
+
+
+def quantiles(checkpoint: Path, pipeline: str, feature: str) -> tuple[np.ndarray, np.ndarray]:
+    """q01 and q99 of a feature."""
+    (file,) = checkpoint.glob(f"policy_{pipeline}_step_*.safetensors")
+    values = load_file(file)
+    return values[f"{feature}.q01"].numpy(), values[f"{feature}.q99"].numpy()
+
+
+def main() -> None:
+    """Write `reference.npz`, the checkpoint and a README of one paragraph."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--cameras", nargs="+", default=["base"])
+    parser.add_argument("--seed", type=int, default=0)
+    chosen = parser.parse_args()
+    policy, rng = lerobots_policy(chosen.checkpoint), np.random.default_rng(chosen.seed)
+    low, high = quantiles(chosen.checkpoint, "preprocessor", "observation.state")
+    raw = rng.uniform(low, high, (len(TASKS), len(low))).astype(np.float32)
+    state = (2 * (raw - low) / (high - low) - 1).astype(np.float32)
+    config, names = policy.config, [f"observation.images.{name}" for name in chosen.cameras]
+    shapes = [config.input_features[name].shape for name in names]
+    pictures = [rng.uniform(0, 1, (len(TASKS), *shape)).astype(np.float32) for shape in shapes]
+    text = AutoTokenizer.from_pretrained(chosen.checkpoint)(
+        prompts(policy, state), padding="max_length", max_length=config.tokenizer_max_length, return_tensors="pt"
+    )
+    mask = text["attention_mask"].bool()
+    batch = {
+        **{name: torch.from_numpy(picture) for name, picture in zip(names, pictures, strict=True)},
+        "observation.state": torch.from_numpy(state),
+        "observation.language.tokens": text["input_ids"],
+        "observation.language.attention_mask": mask,
+    }
+    noise = torch.randn(
+        (len(TASKS), config.chunk_size, config.max_action_dim),
+        generator=torch.Generator().manual_seed(chosen.seed),
+    )
+    with torch.inference_mode():
+        found = record(policy, batch, noise)
+    least, most = quantiles(chosen.checkpoint, "postprocessor", "action")
+    found["actions_unnormalized"] = (found["actions"] + 1) / 2 * (most - least) + least
+    found |= {"in_raw_state": raw, "in_state": state, "in_noise": noise.numpy(), "in_lang_mask": mask.numpy()}
+    found["in_lang_tokens"] = text["input_ids"].numpy()
+    found |= {f"in_image_{name}": picture for name, picture in zip(chosen.cameras, pictures, strict=True)}
+    chosen.folder.mkdir(parents=True, exist_ok=True)
+    shutil.copytree(chosen.checkpoint, chosen.folder / "checkpoint", dirs_exist_ok=True)
+    np.savez_compressed(chosen.folder / "reference.npz", **found)
+    versions = {
+        "torch": torch.__version__,
+        "transformers": transformers.__version__,
+        "lerobot": lerobot.__version__,
+    }
+    (chosen.folder / "README.md").write_text(
+        f"# Golden reference: {config.type}\n\nRecorded by `scripts/record_reference.py` with lerobot's own "
+        f"blocks, called one by one; random weights. {json.dumps(versions)}\n",
+        encoding="utf-8",
+    )
+
+
+if __name__ == "__main__":
+    main()
