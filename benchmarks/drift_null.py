@@ -54,7 +54,7 @@ def random_run(folder: Path, table: pd.DataFrame, generator: np.random.Generator
         features[Site("backbone", layer), "mean"] = values
         values = 0.9 * values + np.sqrt(1 - 0.81) * generator.standard_normal(values.shape)
     run = ArrayRun(folder, "random", "null@1#000000000000", table, features)
-    train_probes(run, permutations=PERMUTATIONS, jobs=1)
+    train_probes(run, permutations=PERMUTATIONS, controls=(), jobs=1)
     return run
 
 

@@ -8,7 +8,7 @@ import typer
 
 from probe_kit._terminal.console import counter, err, marked, out, print_json, print_text, progress, say
 from probe_kit._terminal.options import AsJson, EnvWorkers, Partial, RayAddress, speed_option
-from probe_kit.errors import UsageError
+from probe_kit.errors import NoProbesError, UsageError
 from probe_kit.study.planning.plan_lines import print_plan
 from probe_kit.train.command_options import Jobs
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from probe_kit.retention.columns.text_table import TextTable
     from probe_kit.study import Failure, StudyPlan
     from probe_kit.study.running.model_task import Event
+    from probe_kit.study.tables.named_table import NamedTable
 
 HELP = """Run a whole study from one file: models × conditions × categories.
 
@@ -174,7 +175,14 @@ def table(
     from probe_kit.study.tables.formats import markdown_text, table_json
 
     study = load_study(file)
-    made = {one: make_table(study, one, partial) for one in ([name] if name else study.study.tables)}
+    made: dict[str, NamedTable] = {}
+    for one in [name] if name else study.study.tables:
+        try:
+            made[one] = make_table(study, one, partial)
+        except (UsageError, NoProbesError) as error:
+            if name or not partial:
+                raise
+            say(marked("[red]no table {}: {}[/]", one, error))
     if style == "json":
         found = {one: table_json(own) for one, own in made.items()}
         print_json(found[name] if name else found)

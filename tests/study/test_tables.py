@@ -1,18 +1,22 @@
 """Named tables from runs whose outcomes are known."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.retention.formats.latex import latex_table
 from probe_kit.statistics.paired_tests import holm
+from probe_kit.study import LoadedStudy
 from probe_kit.study.tables.compared import difference_table, stages_table
 from probe_kit.study.tables.rates import score_table, success_table, vlm_table
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
@@ -130,3 +134,23 @@ def test_a_rate_whose_interval_and_range_of_guessing_disagree_is_marked() -> Non
     assert shown["Emotion"].endswith(" *")
     assert not shown["Color"].endswith("*")
     assert "disagree about 50 %" in made.text.note
+
+
+def test_without_a_name_all_tables_are_printed_and_their_tests_are_counted(
+    played: LoadedStudy, tmp_path: Path
+) -> None:
+    run = CliRunner()
+    shown = run.invoke(app, ["study", "table", str(played.file)])
+    assert shown.exit_code == 0, shown.output
+    for title in ("Success rate %", "Success rate % by side and layout", "Normalised score", "light"):
+        assert title in shown.stdout
+    assert "4 tables with 0 tests" in shown.stderr, "two items are too few for any"
+    found = json.loads(run.invoke(app, ["study", "table", str(played.file), "--format", "json"]).stdout)
+    assert list(found) == ["main", "sides", "score", "light"]
+    file = tmp_path / "drift.toml"
+    drift = '[drift.one]\npairs = [["expert", "idle"]]\n[tables.drift]\nkind = "drift"\ndrift = "one"\n'
+    file.write_text(f"{played.file.read_text(encoding='utf-8')}{drift}", encoding="utf-8")
+    partly = run.invoke(app, ["study", "table", str(file), "--partial"])
+    assert partly.exit_code == 0
+    assert "no table drift: " in partly.stderr
+    assert run.invoke(app, ["study", "table", str(file)]).exit_code != 0

@@ -183,7 +183,8 @@ def _drift(
             if before is not None and after is not None and before.cell.seed == after.cell.seed:
                 sides = (before.probed.in_wording(), after.probed.in_wording())
                 shown = set(before.run.items["category"])
-                each = measure_drift(*sides, table.view, labels)
+                named = {one.place: labels[one.place] for one in (before, after)}
+                each = measure_drift(*sides, table.view, named)
                 found[labels[before.place], labels[after.place]] = [one for one in each if one.category in shown]
     return drift_table(found, name, table.view)
 

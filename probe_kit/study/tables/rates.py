@@ -6,7 +6,7 @@ from itertools import groupby
 from statistics import fmean
 
 from probe_kit.retention.behaviour.success_rate import Regime, normalised_score
-from probe_kit.retention.columns.text import percent, retention_value, with_limits
+from probe_kit.retention.columns.text import percent, published_value, retention_value, with_limits
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
@@ -166,7 +166,7 @@ def probing_table(table: RetentionTable) -> NamedTable:
             percent(row.backbone.score),
             percent(row.action.score),
             retention_value(row),
-            _scored(row.retention.published),
+            published_value(row),
         )
         for row in rows
     )
