@@ -8,7 +8,7 @@ import typer
 
 from probe_kit._terminal.console import counter, err, marked, out, print_json, print_text, progress, say
 from probe_kit._terminal.options import AsJson, EnvWorkers, Partial, RayAddress, speed_option
-from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.study.planning.plan_lines import print_plan
 from probe_kit.train.command_options import Jobs
 
@@ -179,7 +179,7 @@ def table(
     for one in [name] if name else study.study.tables:
         try:
             made[one] = make_table(study, one, partial)
-        except (UsageError, NoProbesError) as error:
+        except ProbeKitError as error:
             if name or not partial:
                 raise
             say(marked("[red]no table {}: {}[/]", one, error))

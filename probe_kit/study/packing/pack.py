@@ -5,7 +5,7 @@ import tempfile
 from pathlib import Path
 
 import probe_kit.version
-from probe_kit.errors import NoProbesError, ProbeKitError, RunIncompleteError, UsageError
+from probe_kit.errors import ProbeKitError, RunIncompleteError, UsageError
 from probe_kit.extract import copy_run
 from probe_kit.retention.formats.latex import latex_table
 from probe_kit.study.archive import PACK_FILE, RUNS, STUDY_FILE, TABLES, Pack, write_sums, write_zip
@@ -76,7 +76,7 @@ def _write_tables(study: LoadedStudy, folder: Path, partial: bool) -> dict[str, 
     for name in study.study.tables:
         try:
             made = make_table(study, name, partial)
-        except (UsageError, NoProbesError) as error:
+        except ProbeKitError as error:
             if not partial:
                 raise
             missing[f"table {name}"] = str(error)
