@@ -226,13 +226,18 @@ def pack(
     out_file: Annotated[Path, typer.Option("--out", metavar="PATH", help="Zip file (*.zip), or a folder.")],
     directions: Annotated[bool, typer.Option("--directions", help="With the weights of probes.")] = False,
     pictures: Annotated[bool, typer.Option("--pictures", help="With frames and videos.")] = False,
+    trajectories: Annotated[
+        bool, typer.Option("--trajectories", help="With what happened step by step, for other outcome rules.")
+    ] = False,
     partial: Partial = False,
 ) -> None:
     """Pack runs without activations, and all tables; `study table PATH` prints them from the archive alone."""
     from probe_kit.study import load_study, pack_study
+    from probe_kit.study.packing.pack import EXTRAS
 
+    asked = dict(zip(EXTRAS, (pictures, trajectories, directions), strict=True))
     with err.status("packing"):
-        made = pack_study(load_study(file), out_file, partial, directions, pictures)
+        made = pack_study(load_study(file), out_file, partial, [name for name in EXTRAS if asked[name]])
     out.print(f"{out_file}: {len(made.keys)} runs, without {', '.join(made.left_out)}", soft_wrap=True)
     for name, reason in made.missing.items():
         out.print(f"not packed: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)

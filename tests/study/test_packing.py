@@ -9,7 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.errors import RunDamagedError, UsageError
+from probe_kit.errors import NoTrajectoryError, RunDamagedError, UsageError
+from probe_kit.extract import open_run, verify_run
+from probe_kit.retention import retention_table
 from probe_kit.study import LoadedStudy, load_study, make_table, pack_study, plan_study
 from probe_kit.study.tables.formats import table_of_record, table_record
 
@@ -46,12 +48,30 @@ def test_an_archive_holds_no_picture_no_activation_and_no_name_of_this_machine(
     assert not [name for name in names if name.endswith((".png", ".jpg", ".gif", ".mp4"))]
     assert not [name for name in names if "/c/" in name and "/data.zarr/" in name and "pooled" in name]
     assert {name.split("/")[0] for name in names} == {"study.toml", "pack.json", "runs", "tables", "SHA256SUMS"}
+    assert not [name for name in names if "/trajectory/c/" in name]
     assert {f"tables/{name}.{end}" for name in played.study.tables for end in ("json", "md", "tex")} <= set(names)
 
 
 def test_the_same_study_gives_the_same_bytes(played: LoadedStudy, archive: Path, tmp_path: Path) -> None:
     pack_study(played, tmp_path / "again.zip")
     assert (tmp_path / "again.zip").read_bytes() == archive.read_bytes()
+
+
+def test_an_archive_without_trajectories_judges_by_their_absence_and_with_them_as_before(
+    played: LoadedStudy, archive: Path, tmp_path: Path
+) -> None:
+    pack_study(played, tmp_path / "pack", extras=["trajectories"])
+    rates = []
+    for study in (played, load_study(tmp_path / "pack")):
+        run = open_run(study.cells[0].location(study.study.folder))
+        rates.append(retention_table([run], rule="box").means[0].success.sr)
+    assert rates[0] == rates[1] is not None
+    bare = load_study(archive)
+    run = open_run(bare.cells[0].location(bare.study.folder))
+    assert verify_run(run.location, deep=True).ok
+    assert retention_table([run], rule="box").means[0].success.sr is None
+    with pytest.raises(NoTrajectoryError, match="is a copy without them"):
+        run.trajectory(0)
 
 
 def test_what_was_changed_or_lost_is_named(played: LoadedStudy, tmp_path: Path) -> None:
@@ -82,7 +102,7 @@ def test_missing_runs_are_refused_or_named(played: LoadedStudy, tmp_path: Path) 
     assert not (tmp_path / "a.zip").exists()
     made = run.invoke(app, ["study", "pack", str(file), "--out", str(tmp_path / "a.zip"), "--partial"])
     assert made.exit_code == 0, made.output
-    assert "2 runs, without activations, pictures, probe directions" in made.stdout
+    assert "2 runs, without activations, pictures, trajectories, directions" in made.stdout
     assert "not packed: idle/dark: " in made.stdout
     assert run.invoke(app, ["study", "table", str(tmp_path / "a.zip"), "main"]).exit_code == 0
     assert run.invoke(app, ["study", "run", str(tmp_path / "a.zip")]).exit_code == 2

@@ -10,6 +10,7 @@ from probe_kit.extract.run_layout import (
     PROBE_DIRECTIONS,
     PROBES,
     RUN_FILE,
+    TRAJECTORY,
 )
 from probe_kit.extract.store.format.left_out import is_left_out, left_out_record
 from probe_kit.extract.store.integrity.orphans import known_keys
@@ -24,19 +25,21 @@ def copy_run(
     pictures: bool = False,
     allow_partial: bool = False,
     directions: bool = True,
+    trajectories: bool = True,
 ) -> Run:
     """Copy the run at `path` to `out` without its activations, and open the copy.
 
     The copy holds plan, outcomes, trajectories, probes, interventions and certificates, byte for byte: every table
     can be made of it. Its identity, stamp and settings are those of the run. `column` and `tokens` raise
     ActivationsLeftOutError, and nothing can be added to it. pictures: copy frames and videos too. directions: copy
-    the weights of probes, without which `ProbeResults.direction` raises RunDamagedError.
+    the weights of probes, without which `ProbeResults.direction` raises RunDamagedError. trajectories: copy what
+    happened step by step, without which only the rule `disc` judges the last step.
     Raises UsageError if anything lies at `out`, and what `open_run` raises.
     """
     run, there = open_run(path, allow_partial), locate(out)
     if there.keys(""):
         raise UsageError(f"{there} is not empty; choose another place for the copy")
-    arrays = set(run.root.arrays)
+    arrays = {*run.root.arrays, *(() if trajectories else (TRAJECTORY,))}
     commits = {commit["episode"]: commit for commit in run.commits()}
     for key in sorted({*known_keys(run.root, commits, None, run.stamp)} - {RUN_FILE}):
         inside = key.removeprefix(f"{DATA}/")

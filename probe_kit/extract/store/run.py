@@ -374,8 +374,10 @@ class Run:
     def has_trajectories(self) -> bool:
         """Whether episodes keep what happened in them step by step.
 
-        Runs made before it was stored do not, nor those whose model did not act.
+        Runs made before it was stored do not, nor those whose model did not act, nor copies without it.
         """
+        if TRAJECTORY in self.root.left_out:
+            return False
         return has_trajectories(self.root) and all(map(names_trajectory, self._commits.values()))
 
     @cached_property
@@ -383,8 +385,8 @@ class Run:
         """What happened in every episode, in the order of `episodes`. Raises NoTrajectoryError without any."""
         if not self.has_trajectories:
             raise NoTrajectoryError(
-                f"{self.location} keeps no trajectories; it was made before they were stored. Extract it again to "
-                "have them"
+                f"{self.location} keeps no trajectories; it was made before they were stored, or is a copy "
+                "without them. Extract it again to have them"
             )
         rows = Rows(open_array(self.data, TRAJECTORY), self._numbers)
         return Trajectories(rows, self.episodes["steps"].astype(int).tolist(), str(self.location))

@@ -2,7 +2,9 @@
 
 import json
 import tempfile
+from collections.abc import Collection
 from pathlib import Path
+from typing import Literal, get_args
 
 import probe_kit.version
 from probe_kit.errors import ProbeKitError, RunIncompleteError, UsageError
@@ -14,33 +16,33 @@ from probe_kit.study.tables.formats import markdown_text, table_record
 from probe_kit.study.tables.make import make_table
 from probe_kit.study.tables.stored_runs import stored_location
 
-ACTIVATIONS, PICTURES, DIRECTIONS = "activations", "pictures", "probe directions"
+Extra = Literal["pictures", "trajectories", "directions"]
+EXTRAS: tuple[Extra, ...] = get_args(Extra)
+"""What an archive holds on request: frames and videos, what happened step by step, the weights of probes."""
 
 
-def pack_study(
-    study: LoadedStudy, out: Path, partial: bool = False, directions: bool = False, pictures: bool = False
-) -> Pack:
+def pack_study(study: LoadedStudy, out: Path, partial: bool = False, extras: Collection[Extra] = ()) -> Pack:
     """Write the archive of a study to `out`: a zip file if it ends in `.zip`, else a folder.
 
-    Every table of the file can be printed from it alone. directions: with the weights of probes. pictures: with
-    frames and videos. partial: leave out runs and tables that are missing; `pack.json` names them and the reason.
+    Every table of the file can be printed from it alone. Other outcome rules than `disc` need trajectories.
+    partial: leave out runs and tables that are missing; `pack.json` names them and the reason. extras: see EXTRAS.
     Raises UsageError where anything lies at `out`, and RunIncompleteError for missing runs.
     """
     if out.exists():
         raise UsageError(f"{out} exists; choose another --out or remove it")
     if out.suffix != ".zip":
-        return _pack(study, out, partial, directions, pictures)
+        return _pack(study, out, partial, extras)
     out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}-") as draft:
         folder = Path(draft) / "pack"
-        found = _pack(study, folder, partial, directions, pictures)
+        found = _pack(study, folder, partial, extras)
         whole = Path(draft) / out.name
         write_zip(folder, whole)
         whole.rename(out)
     return found
 
 
-def _pack(study: LoadedStudy, folder: Path, partial: bool, directions: bool, pictures: bool) -> Pack:
+def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Extra]) -> Pack:
     missing = {cell.name: cell.unavailable for cell in study.cells if cell.unavailable}
     keys: dict[str, str] = {}
     for cell in study.cells:
@@ -48,7 +50,10 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, directions: bool, pic
             continue
         try:
             copy_run(
-                stored_location(study, cell), cell.location(str(folder / RUNS)), pictures, partial, directions
+                stored_location(study, cell),
+                cell.location(str(folder / RUNS)),
+                allow_partial=partial,
+                **{extra: extra in extras for extra in EXTRAS},
             )
             keys[cell.name] = cell.key
         except ProbeKitError as error:
@@ -59,9 +64,8 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, directions: bool, pic
                 ) from error
             missing[cell.name] = str(error)
     missing |= _write_tables(study, folder / TABLES, partial)
-    left = {ACTIVATIONS: False, PICTURES: pictures, DIRECTIONS: directions}
     suite = {"identity": study.suite.identity, "items": dict(study.suite.items)}
-    left_out = [name for name, there in left.items() if not there]
+    left_out = ["activations", *(extra for extra in EXTRAS if extra not in extras)]
     pack = Pack(study.study.name, probe_kit.version.__version__, suite, keys, missing, left_out)
     (folder / STUDY_FILE).write_bytes(study.file.read_bytes())
     (folder / PACK_FILE).write_text(pack.to_json(), encoding="utf-8")
