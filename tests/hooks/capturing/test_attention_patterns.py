@@ -109,6 +109,23 @@ def test_patterns_of_fused_attention_are_those_of_transformers_eager_attention(
         torch.testing.assert_close(patterns[site], expected.float(), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("family", ["pi0-tiny", "vlm-tiny"])
+def test_patterns_of_half_precision_are_those_of_the_same_weights_in_full(family: str) -> None:
+    """Each is checked with the values of its own call, within what half precision rounds."""
+    half, full = load_model(family, dtype="bfloat16"), load_model(family, dtype="float32")
+    (seen,) = examples_for(half, "Put the cube on the red shape")
+    sites = half.streams["backbone"].sites("heads")
+    found = []
+    for model in (half, full):
+        plain = infer(model, seen)
+        with capture_patterns(model, sites) as patterns:
+            np.testing.assert_array_equal(infer(model, seen), plain)
+        found.append(patterns)
+    for site in sites:
+        assert found[0][site].dtype == torch.float32
+        torch.testing.assert_close(found[0][site], found[1][site], rtol=0, atol=0.05)
+
+
 @pytest.mark.parametrize("family", ["pi0", "pi05", "smolvla", "openvla", "spatialvla", "magma", "xiaomi-r0"])
 def test_the_acting_streams_patterns_on_the_prompt_are_its_recorded_attention(family: str, tmp_path: Path) -> None:
     """Each family records that in code of its own."""
