@@ -9,7 +9,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +52,8 @@ class Pi0(EvaluatedPi0):
     config_type = "pi0"
     unread = tuple(f"model.paligemma_with_expert.{part}.lm_head.weight" for part in ("paligemma", "gemma_expert"))
 
-    other_roles = ("language", "special")
-    suffix_roles = ("state", "action")
+    other_roles: ClassVar[tuple[str, ...]] = ("language", "special")
+    suffix_roles: ClassVar[tuple[str, ...]] = ("state", "action")
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> nn.Module:

@@ -58,7 +58,8 @@ class Pi05(Pi0):
     @classmethod
     def network_of(cls, config: Any, size: Pi0Size | None) -> nn.Module:
         """lerobot's policy of this size."""
-        return build_pi05(config, size)
+        network: nn.Module = build_pi05(config, size)
+        return network
 
     @classmethod
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -86,9 +87,10 @@ class Pi05(Pi0):
             for one, kept, piece in zip(ids, valid, self.tokenizer.convert_ids_to_tokens(list(ids)), strict=True)
         ]
         ends = np.cumsum([len(piece) for piece in pieces])
-        found = _PROMPT.search("".join(pieces))
         labels = ["special" if kept else PADDING for kept in valid]
-        for role in ("language", "state") if found is not None else ():
+        if (found := _PROMPT.search("".join(pieces))) is None:
+            return labels
+        for role in ("language", "state"):
             first, last = found.span(role)
             for position, (piece, end) in enumerate(zip(pieces, ends, strict=True)):
                 if piece and end - len(piece) < last and end > first:
