@@ -56,7 +56,10 @@ def run(
     slots: Annotated[
         int,
         speed_option(
-            "--slots", min=0, max=1024, help="Number of processes with one model each. 0: use this process."
+            "--slots",
+            min=0,
+            max=1024,
+            help="Processes with one model each, also for probes. 0: use this process.",
         ),
     ] = 0,
     ray: RayAddress = None,
@@ -92,13 +95,15 @@ def run(
     if dry_run:
         return
     failed = _played(plan, slots=slots, ray=ray, env_workers=env_workers, retry_failed=retry_failed)
-    if not no_probes:
-        failed += _probed(plan_study(study, only), jobs)
-    after = plan_study(study, only)
-    print_plan(after)
+    if plan.totals()["missing"]:
+        plan = plan_study(study, only)
+    if plan.totals()["unprobed"] and not no_probes:
+        failed += _probed(plan, jobs or slots or None)
+        plan = plan_study(study, only)
+    print_plan(plan)
     for failure in failed:
         say(marked("[red]{}[/]", failure))
-    if failed or after.totals()["missing"]:
+    if failed or plan.totals()["missing"]:
         raise typer.Exit(UNFINISHED)
 
 

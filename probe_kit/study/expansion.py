@@ -1,7 +1,7 @@
 """Expansion of a study file into its cells."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,7 @@ def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]
             mistakes.append(Mistake(member.path, f"{said}; give both blocks the same tokens"))
         else:
             found[place] = replace(known, selections={**known.selections, member.block.name: selection})
-    mistakes += _same_settings(list(found.values()))
+    mistakes += [*_same_settings(list(found.values())), *_without_control(study, list(found.values()))]
     return list(found.values()), list(dict.fromkeys(mistakes))
 
 
@@ -164,3 +164,26 @@ def _same_settings(cells: list[Cell]) -> list[Mistake]:
                 said = f"is the same as {other.way!r} for {cell.model!r}: all values are equal"
                 found.append(Mistake((home, cell.way), f"{said}. Leave one out, or exclude it for this model"))
     return found
+
+
+def control_of(study: Study, cells: Sequence[Cell], cell: Cell) -> Cell | None:
+    """The run of a policy's untrained network that its probes are compared with; None without such a network.
+
+    It is in the same condition, or else of the same scene and seed: whether a network then acts changes nothing in
+    what was captured before.
+    """
+    own = [one for one in cells if one.model == study.models[cell.model].untrained and one.seed == cell.seed]
+    same = (one for one in own if one.way == cell.way)
+    alike = (one for one in own if one.asks == cell.asks and one.settings.scene == cell.settings.scene)
+    return next(same, None) or next(alike, None)
+
+
+def _without_control(study: Study, cells: list[Cell]) -> Iterator[Mistake]:
+    """Probes that are to be compared with an untrained network that is played in other scenes alone."""
+    for name, table in study.probes.items():
+        for cell in cells if "untrained" in table.controls else ():
+            model = study.models[cell.model]
+            probed = any(block in table.runs for block in cell.selections) and not cell.unavailable
+            if probed and model.untrained is not None and control_of(study, cells, cell) is None:
+                said = f"{model.untrained!r}, the control of {cell.name}, has no run in the same scene"
+                yield Mistake(("probes", name, "controls"), f"{said}; play it so, or capture it so with no_act")

@@ -6,6 +6,7 @@ import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.study import LoadedStudy, StudyFileError, load_study, plan_study
+from probe_kit.study.expansion import control_of
 from probe_kit.study.places import line_of
 from probe_kit.suite import Suite
 from tests.study.broken_files import BASE, ELSEWHERE, MISTAKES
@@ -145,6 +146,34 @@ def test_a_byte_of_a_checkpoint_makes_other_runs_of_its_model(tmp_path: Path) ->
     assert {name for name in before if after[name] != before[name]} == {"base/plain", "base/dark"}
 
 
+CAPTURED = """
+[conditions.captured]
+no_act = true
+{scene}
+
+[[runs]]
+name = "captured"
+models = ["random", "random-state"]
+conditions = ["captured"]
+"""
+
+
+def test_a_control_is_in_the_same_condition_or_captured_in_the_same_scene(tmp_path: Path) -> None:
+    study = load_study(written(tmp_path))
+    cells = {cell.name: cell for cell in study.cells}
+    assert control_of(study.study, study.cells, cells["base/plain"]) == cells["random/plain"]
+    assert control_of(study.study, study.cells, cells["random/plain"]) is None
+    main = 'models = ["base", "state", "random", "random-state"]'
+    others = (main, 'models = ["base", "state"]'), ('controls = ["', 'controls = ["untrained", "')
+    alike = written(tmp_path, changed(others[0]) + CAPTURED.format(scene=""))
+    study = load_study(alike)
+    cells = {cell.name: cell for cell in study.cells}
+    assert control_of(study.study, study.cells, cells["state/plain"]) == cells["random-state/captured"]
+    elsewhere = written(tmp_path, changed(others[0]) + CAPTURED.format(scene="light_level = 0.5"))
+    with pytest.raises(StudyFileError, match="'random', the control of base/plain, has no run in the same scene"):
+        load_study(elsewhere)
+
+
 def test_seeds_and_wordings_multiply_episodes(tmp_path: Path) -> None:
     text = changed(
         ("light_level = 0.7", 'light_level = 0.7\nwordings = ["knowledge", "named"]'),
@@ -188,7 +217,7 @@ def test_the_embedded_study_needs_no_download(tmp_path: Path, monkeypatch: pytes
     study = load_study("embedded")
     assert all(cell.settings.checkpoint is None for cell in study.cells)
     assert {cell.model for cell in study.cells} == set(study.study.models)
-    assert plan_study(study).totals()["episodes"] == 1344
+    assert plan_study(study).totals()["episodes"] == 1536
 
 
 def test_paths_are_relative_to_the_working_directory_also_in_studies_of_the_package(

@@ -13,7 +13,7 @@ from probe_kit.study.mistakes import unknown
 from probe_kit.study.planning.cost import Cost, Work, cost_of
 from probe_kit.study.planning.planned_probes import (
     PlannedProbes,
-    control_of,
+    control_cell,
     planned_probes,
     probes_of,
     what_decides,
@@ -222,7 +222,7 @@ class _Stored:
         if self._study.archive is not None:  # it keeps the probes, and no ledger
             return
         for name, table in probes_of(self._study, cell):
-            control = control_of(self._study, cell, table)
+            control = control_cell(self._study, cell, table)
             beside = None if control is None else self.run(control)
             ready = control is None or beside is not None
             known = what_decides(table, cell, run, beside) if ready else None

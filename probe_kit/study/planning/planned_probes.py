@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from probe_kit.study.cells import Cell
+from probe_kit.study.expansion import control_of
 from probe_kit.study.ledger import Entry, settings_changed
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable
@@ -31,13 +32,9 @@ def probes_of(study: LoadedStudy, cell: Cell) -> Iterator[tuple[str, ProbesTable
             yield name, table
 
 
-def control_of(study: LoadedStudy, cell: Cell, table: ProbesTable) -> Cell | None:
-    """The untrained network in the same condition; None without one, such as for that network itself."""
-    if "untrained" not in table.controls:
-        return None
-    name = study.study.models[cell.model].untrained
-    same = (one for one in study.cells if (one.model, one.way, one.seed) == (name, cell.way, cell.seed))
-    return next(same, None)
+def control_cell(study: LoadedStudy, cell: Cell, table: ProbesTable) -> Cell | None:
+    """The run of the untrained network; None where the table asks for no such control, or the model has none."""
+    return control_of(study.study, study.cells, cell) if "untrained" in table.controls else None
 
 
 def what_decides(table: ProbesTable, cell: Cell, run: "Run", control: "Run | None") -> dict[str, Any]:

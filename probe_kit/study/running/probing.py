@@ -7,7 +7,7 @@ from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError
 from probe_kit.study.cells import Cell
 from probe_kit.study.ledger import Failure, Ledger, Probed, now
 from probe_kit.study.planning.plan import StudyPlan
-from probe_kit.study.planning.planned_probes import control_of, probes_of, what_decides
+from probe_kit.study.planning.planned_probes import control_cell, probes_of, what_decides
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable
 from probe_kit.study.tables.stored_runs import of_blocks, open_cell
@@ -52,7 +52,7 @@ def _fit(
     study: LoadedStudy, table: ProbesTable, cell: Cell, progress: Progress | None, jobs: int | None
 ) -> Probed:
     own = _opened(study, table, cell)
-    control = control_of(study, cell, table)
+    control = control_cell(study, cell, table)
     beside = None if control is None else _opened(study, table, control, of=cell)
     baselines = tuple(name for name in table.controls if name != "untrained")
 

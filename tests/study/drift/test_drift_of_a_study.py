@@ -59,7 +59,7 @@ def test_a_file_names_pairs_and_an_archive_prints_their_table_without_activation
     file.write_text(TEXT.format(out=tmp_path / "out"), encoding="utf-8")
     study = load_study(file)
     assert conduct_study(plan_study(study)) == []
-    assert fit_probes(study) == []
+    assert fit_probes(plan_study(study)) == []
     made = make_table(study, "drift")
     assert [cells[:2] for cells in made.text.cells] == [
         ("early → base", "Color"), ("early → base", "Counting"),
