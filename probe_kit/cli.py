@@ -35,10 +35,11 @@ from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import train
 from probe_kit.train.label_commands import labels
 from probe_kit.train.power_commands import power
+from probe_kit.view.commands import view
 
 ORDER = (
     "demo", "doctor", "models", "suite", "extract", "ask", "run", "labels", "train", "power", "intervene",
-    "retention", "stages", "study", "export", "new-adapter", "check-adapter", "verify",
+    "retention", "stages", "view", "study", "export", "new-adapter", "check-adapter", "verify",
 )  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 
@@ -159,6 +160,7 @@ for command in (
     power,
     retention,
     stages,
+    view,
     doctor,
 ):
     app.command()(command)

@@ -142,6 +142,7 @@ def test_a_command_is_accepted_as_it_is_typed(
 LOOKED_FOR = {
     "extract": "accepted so far",
     "ask": "accepted so far",
+    "view": "Make one with",
     "train": "Make one with|AWS_ACCESS_KEY_ID",
     "intervene": "Make one with",
     "retention": "Make one with",

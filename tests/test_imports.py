@@ -24,6 +24,7 @@ FOLDERS = {
     "train": BASE | {"suite", "hooks", "extract", "statistics"},
     "intervene": BASE | {"suite", "env", "hooks", "extract", "train", "statistics"},
     "retention": BASE | {"suite", "env", "hooks", "extract", "train", "intervene", "statistics"},
+    "view": BASE | {"suite", "env", "hooks", "extract", "train", "intervene", "retention", "statistics"},
     "study": BASE | {"suite", "env", "hooks", "extract", "train", "intervene", "retention", "statistics"},
 }
 """What a folder may import; what is not named here, such as `cli` and `demo`, stands on top."""

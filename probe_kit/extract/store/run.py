@@ -20,12 +20,13 @@ from probe_kit.errors import (
     UnknownSiteError,
     UsageError,
 )
-from probe_kit.extract.run_layout import DATA, PROVENANCE, SCHEMA_VERSION, TRAJECTORY, StoredStream
+from probe_kit.extract.run_layout import DATA, PROVENANCE, TRAJECTORY, StoredStream
 from probe_kit.extract.store.certificates import read_certificate
 from probe_kit.extract.store.format.arrays import open_array
 from probe_kit.extract.store.format.checking import CheckedStore
 from probe_kit.extract.store.format.columns import Columns, find_columns
 from probe_kit.extract.store.format.commits import (
+    WITH_CONTROL_STEPS,
     Commit,
     committed_sums,
     read_commits,
@@ -357,7 +358,7 @@ class Run:
         nothing moves (`ask`, or without acting) has one inference, at step 0.
         Raises UsageError for a run of schema 3, which does not hold them.
         """
-        if self.root.schema < SCHEMA_VERSION:
+        if self.root.schema < WITH_CONTROL_STEPS:
             raise UsageError(
                 f"{self.location} has schema {self.root.schema}, which does not hold the control steps of "
                 "inferences. Extract it again to have them"

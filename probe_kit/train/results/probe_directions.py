@@ -1,6 +1,6 @@
 """Probe directions in a site's raw features, for steering."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import BinaryIO
 
@@ -68,11 +68,18 @@ class StoredDirections(Mapping[Place, Direction]):
         return self._bundle.open(self._name)
 
     def __getitem__(self, place: Place) -> Direction:
-        name = "/".join(map(str, place))
+        return self.read([place])[place]
+
+    def read(self, places: Iterable[Place]) -> dict[Place, Direction]:
+        """Several directions in one opening of the file. Raises KeyError for a place that was not probed."""
+        found = {}
         with self._open() as file, np.load(file, allow_pickle=False) as arrays:
-            if f"{name}/weights" not in arrays:
-                raise KeyError(place)
-            return Direction(**{part: arrays[f"{name}/{part}"] for part in Direction.__annotations__})
+            for place in places:
+                name = "/".join(map(str, place))
+                if f"{name}/weights" not in arrays:
+                    raise KeyError(place)
+                found[place] = Direction(**{part: arrays[f"{name}/{part}"] for part in Direction.__annotations__})
+        return found
 
     def __iter__(self) -> Iterator[Place]:
         with self._open() as file, np.load(file, allow_pickle=False) as arrays:
@@ -82,3 +89,10 @@ class StoredDirections(Mapping[Place, Direction]):
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
+
+
+def read_directions(directions: Mapping[Place, Direction], places: Iterable[Place]) -> dict[Place, Direction]:
+    """The directions of `places`, stored ones in one opening of their file. Raises KeyError for unknown places."""
+    if isinstance(directions, StoredDirections):
+        return directions.read(places)
+    return {place: directions[place] for place in places}

@@ -32,7 +32,7 @@ _PARTS = {
     "provenance": str,
     "objects": dict,
 }
-_WITH_CONTROL_STEPS = 4
+WITH_CONTROL_STEPS = 4
 """The first schema whose commits hold the control step of every inference."""
 _WITH_PLANS = 5
 """The first schema whose commits name the plan record that added their episode."""
@@ -90,7 +90,7 @@ def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
     name = f"{root.location}/{key}"
     commit = read_record(raw, name, redo(number))
     expect(commit, _PARTS, name, redo(number))
-    if root.schema >= _WITH_CONTROL_STEPS:
+    if root.schema >= WITH_CONTROL_STEPS:
         expect(commit, {"control_steps": list}, name, redo(number))
     commit["outcome"] = in_current_words(commit["outcome"], "outcome")
     planned = root.planned.get(number)

@@ -1,0 +1,36 @@
+// The page: which run and view are shown, light or dark, and the keys.
+"use strict";
+function toggleTheme() {
+  const root = document.documentElement, now = root.dataset.theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+  root.dataset.theme = now === "dark" ? "light" : "dark";
+  try { localStorage.setItem("probe_kit theme", root.dataset.theme); } catch { /* a browser may refuse to remember */ }
+}
+try { const chosen = localStorage.getItem("probe_kit theme"); if (chosen) document.documentElement.dataset.theme = chosen; } catch { /* likewise */ }
+
+const VIEW = { overview: Overview, map: Maps, episodes: Episodes, compare: Compare };
+const HELP = [["← →", "step back and forward"], ["space", "play and pause"], ["Home End", "first and last step"], ["j k", "next and previous episode"], ["/", "search"], [`1 … ${Object.keys(VIEWS).length}`, "views"], ["?", "these keys"]];
+const CLEARED = { ep: undefined, t: undefined, category: undefined, outcome: undefined, layout: undefined, case: undefined, words: undefined, site: undefined };
+
+function App() {
+  const place = usePlace(), [[index], trouble] = useLoaded("index"), help = useRef(null);
+  const known = index?.schema === SCHEMA && index.runs.length > 0, key = known ? (index.runs.find((r) => r.key === place.run) ?? index.runs[0]).key : null;
+  const [[run, episodes], lost] = useLoaded(key && `${key}/run`, key && `${key}/episodes`);
+  useKeys((e) => {
+    if (e.key === "?") help.current?.showModal();
+    const view = Object.keys(VIEWS)[Number(e.key) - 1];
+    if (view && !help.current?.open) go({ view });
+  });
+  useEffect(() => { if (run) document.title = `${VIEWS[place.view]} · ${run.label} · probe_kit`; }, [run, place.view]);
+  if (index && !known) return html`<p class="trouble" role="alert">The data have schema ${String(index.schema)}; this page reads schema ${SCHEMA}. Export the runs again.</p>`;
+  if (trouble || lost) return html`<p class="trouble" role="alert">The data of this page cannot be read: ${trouble ?? lost}</p>`;
+  if (!run || !episodes) return html`<p class="loading">Loading the run …</p>`;
+  const list = listOf(run.key), View = VIEW[place.view];
+  return html`<header class="bar"><a class="brand" href="#/overview">probe_kit</a>
+      <label class="run"><span class="sr">Run</span><select value=${run.key} onChange=${(e) => go({ ...CLEARED, run: e.target.value })}>${index.runs.map((r) => html`<option value=${r.key}>${r.label} (${r.key}, ${r.episodes})</option>`)}</select></label>
+      ${run.random_weights && html`<span class="random">RANDOM WEIGHTS</span>`}
+      <nav aria-label="Views">${Object.entries(VIEWS).map(([view, words]) => html`<a href=${link({ view })} aria-current=${view === place.view ? "page" : null}>${view === "map" ? html`<span class="wide-only">${words}</span><span class="narrow-only">Map</span>` : words}</a>`)}</nav>
+      <button type="button" class="plain" onClick=${toggleTheme} aria-label="Light or dark">◐</button><button type="button" class="plain" onClick=${() => help.current.showModal()} aria-label="Keys">?</button></header>
+    <main id="main">${list.length ? html`<${View} key=${`${run.key} ${place.view}`} run=${run} runs=${index.runs} list=${list} place=${place} />` : html`<p class="empty">No episode is committed yet.</p>`}</main>
+    <dialog ref=${help} onClick=${(e) => e.target === e.currentTarget && e.currentTarget.close()}><h2>Keys</h2><dl class="keys">${HELP.map(([keys, words]) => html`<dt><kbd>${keys}</kbd></dt><dd>${words}</dd>`)}</dl><form method="dialog"><button>Close</button></form></dialog>`;
+}
+render(html`<${App} />`, document.getElementById("app"));

@@ -1,0 +1,87 @@
+"""The payloads of a page by name: what `--export` writes and the server sends."""
+
+import re
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any
+
+from probe_kit.extract import Run
+from probe_kit.extract.store.thumbnails import read_thumbnail
+from probe_kit.hashing import sha256_json
+from probe_kit.view.payloads.coding import payload_script
+from probe_kit.view.payloads.episode_payload import episode_payload
+from probe_kit.view.payloads.episodes_payload import episodes_payload
+from probe_kit.view.payloads.run_payload import run_payload
+from probe_kit.view.payloads.site_map_payload import site_map_payload
+from probe_kit.view.viewed_run import view_runs
+
+SCHEMA = 1
+"""Of the payloads; the page refuses another one."""
+_NUMBER = re.compile(r"[0-9]{5,8}")
+
+
+class Catalogue:
+    """The payloads of some runs. Names are looked up and never joined to a path.
+
+    index                   the runs of the page
+    RUN/run                 settings, streams, sites, certificate, rows of the table
+    RUN/episodes            one column per property of the episodes
+    RUN/map/CATEGORY        scores by site, and held-out log-odds of the category's episodes
+    RUN/e/NNNNN             one episode
+    """
+
+    def __init__(self, runs: Sequence[Run]) -> None:
+        self.runs = {viewed.key: viewed for viewed in view_runs(runs)}
+
+    def names(self, categories: Collection[str] | None = None) -> Iterator[str]:
+        """All names in the order of export. categories: whose episodes and maps are named, all by default."""
+        yield "index"
+        for key, viewed in self.runs.items():
+            yield from (f"{key}/run", f"{key}/episodes")
+            chosen = [name for name in viewed.probed_categories if categories is None or name in categories]
+            yield from (f"{key}/map/{category}" for category in chosen)
+            yield from (f"{key}/e/{number:05d}" for number in self.numbers(key, categories))
+
+    def numbers(self, key: str, categories: Collection[str] | None = None) -> list[int]:
+        """Numbers of the episodes of a run."""
+        viewed = self.runs[key]
+        named = zip(viewed.position_of, viewed.run.episodes["category"], strict=True)
+        return [number for number, category in named if categories is None or category in categories]
+
+    def script(self, name: str) -> bytes:
+        """The payload of this name as a script. Raises KeyError for any other name."""
+        places = tuple(place for viewed in self.runs.values() for place in viewed.places)
+        return payload_script(name, self._payload(name), places)
+
+    def stamp(self, name: str) -> str:
+        """A hash that changes with the commits and probes that a payload is made of. Raises KeyError."""
+        parts = name.split("/")
+        shown = [self.runs[parts[0]]] if parts[0] in self.runs else list(self.runs.values())
+        keys = [sorted(other.key for other in viewed.refitted.values()) for viewed in shown]
+        return sha256_json([SCHEMA, name, [viewed.run.stamp for viewed in shown], keys])
+
+    def picture(self, key: str, number: int) -> bytes | None:
+        """The committed frames of an episode, None without any. Raises KeyError; RunDamagedError if changed."""
+        viewed = self.runs[key]
+        _ = viewed.position_of[number]
+        return read_thumbnail(viewed.run.location, number)
+
+    def _payload(self, name: str) -> Any:
+        if name == "index":
+            return self._index()
+        match name.split("/"):
+            case [key, "run"]:
+                return run_payload(self.runs[key], list(self.runs.values()))
+            case [key, "episodes"]:
+                return episodes_payload(self.runs[key])
+            case [key, "map", category]:
+                return site_map_payload(self.runs[key], category)
+            case [key, "e", number] if _NUMBER.fullmatch(number):
+                return episode_payload(self.runs[key], int(number))
+        raise KeyError(name)
+
+    def _index(self) -> dict[str, Any]:
+        runs = [
+            {"key": key, "label": viewed.run.label, "episodes": len(viewed.run.episodes)}
+            for key, viewed in self.runs.items()
+        ]
+        return {"schema": SCHEMA, "runs": runs}

@@ -1,0 +1,75 @@
+"""Export of the viewer: a folder of static files that opens without a server and without a network."""
+
+import shutil
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from probe_kit._system.drafts import draft_of
+from probe_kit.errors import UnknownCategoryError, UsageError
+from probe_kit.extract import Run
+from probe_kit.view.catalogue import Catalogue
+from probe_kit.view.page_files import page_files
+
+_MARK = "This folder was exported by probe_kit."
+README = f"""{_MARK}
+Open index.html in a browser; it needs no server and no network.
+It holds pictures, instructions and settings of the runs it was made from.
+"""
+
+
+def write_viewer(
+    runs: Sequence[Run],
+    folder: Path | str,
+    *,
+    frames: bool = True,
+    categories: Collection[str] | None = None,
+) -> Path:
+    """Write the viewer of `runs` to `folder`, whole or not at all, and return its `index.html`.
+
+    The same runs give the same bytes. frames: with the pictures of the episodes. categories: whose episodes and
+    maps are written, all by default. Raises UsageError without runs, or for a folder that holds anything but a
+    former export, and UnknownCategoryError for a category that no run has.
+    """
+    folder = Path(folder)
+    _check_folder(folder)
+    catalogue = Catalogue(runs)
+    known = {name: None for viewed in catalogue.runs.values() for name in viewed.categories}
+    if strange := [name for name in categories or () if name not in known]:
+        raise UnknownCategoryError(f"no run has the category {strange[0]!r}; they have {', '.join(known)}")
+    with draft_of(folder) as draft:
+        draft.mkdir()
+        _write(catalogue, draft, frames, categories)
+        if folder.exists():
+            shutil.rmtree(folder)
+        draft.replace(folder)
+    return folder / "index.html"
+
+
+def _check_folder(folder: Path) -> None:
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is a file; give a folder")
+    names = sorted(entry.name for entry in folder.iterdir())
+    readme = folder / "README"
+    ours = readme.is_file() and readme.read_text(encoding="utf-8", errors="replace").startswith(_MARK)
+    if names and not (ours and set(names) <= {"README", "app", "data", "index.html"}):
+        raise UsageError(f"{folder} holds {names[0]} and is no former export. Give an empty or a new folder")
+
+
+def _write(catalogue: Catalogue, folder: Path, frames: bool, categories: Collection[str] | None) -> None:
+    (folder / "README").write_text(README, encoding="utf-8", newline="\n")
+    for name, content in page_files().items():
+        _put(folder / name, content)
+    for name in catalogue.names(categories):
+        _put(folder / "data" / f"{name}.js", catalogue.script(name))
+    for key in catalogue.runs if frames else ():
+        for number in catalogue.numbers(key, categories):
+            picture = catalogue.picture(key, number)
+            if picture is not None:
+                _put(folder / "data" / key / "f" / f"{number:05d}.webp", picture)
+
+
+def _put(path: Path, content: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)

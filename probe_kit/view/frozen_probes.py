@@ -1,0 +1,135 @@
+"""Probes of one inference applied to every captured inference of an episode, held out by fold."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.extract import Run
+from probe_kit.extract.store.format.rows import Rows
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.train.data.samples import is_token_view
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_directions import Direction, read_directions
+from probe_kit.train.results.probe_results import ProbeResults
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EpisodeLogOdds:
+    """values: (K, S) log-odds that the correct side is the answer, by captured inference and site.
+
+    held_out: whether no probe that gave them was trained on the episode's item. NaN where the probe's view is one
+    of tokens, or the activations are left out, and the inference is a later one.
+    """
+
+    values: Values
+    held_out: bool
+
+
+@dataclass(frozen=True)
+class _StreamProbes:
+    """The probes of one stream. places: of its sites among all. weights: (S, F, D). intercepts: (S, F)."""
+
+    places: list[int]
+    at: tuple[list[int], ...]
+    view: int
+    weights: Values
+    intercepts: Values
+
+
+class FrozenProbes:
+    """The probes of one category in one view, and the log-odds that they give to episodes of `run`.
+
+    An episode takes the probe of the fold that tests its item. One whose item no fold tests takes the mean of the
+    folds' log-odds, and is then not held out in the sense of the scores.
+    """
+
+    def __init__(self, run: Run, results: ProbeResults, category: str, view: str) -> None:
+        self.run, self.curve = run, results.curves[category, view]
+        self._results, self._category, self._view = results, category, view
+        self._fold_of = dict(zip(self.curve.items.tolist(), self.curve.fold_of.tolist(), strict=True))
+        self._place_of = {name: place for place, name in enumerate(self.curve.episodes.tolist())}
+
+    @property
+    def sites(self) -> Sequence[Site]:
+        """S of them, as in the curve."""
+        return self.curve.sites
+
+    def decisions(self, episode: str, side_correct: str) -> Values:
+        """(S,) stored out-of-fold log-odds toward the correct side; NaN for an episode without any."""
+        place = self._place_of.get(episode)
+        if place is None:
+            return np.full(len(self.sites), np.nan)
+        return np.asarray(self.curve.decisions[:, place] * toward(side_correct))
+
+    def log_odds(self, position: int) -> EpisodeLogOdds:
+        """Of the episode in row `position` of `run.episodes`, at every captured inference that it reached."""
+        row = self.run.episodes.iloc[position]
+        side, item = str(row["side_correct"]), str(row["item_id"])
+        calls = sum(bool(reached[position]) for reached in self._reached)
+        found = np.full((calls, len(self.sites)), np.nan)
+        fold = self._fold_of.get(item)
+        if not self._reads_activations:
+            found[:1] = self.decisions(str(row["episode_id"]), side)
+            return EpisodeLogOdds(found, fold is not None)
+        for stream, probes in self._streams.items():
+            features = self._rows[stream][position][:calls]
+            index: tuple[Any, ...] = (slice(None), *probes.at, probes.view)
+            own = features[index].astype(np.float64)
+            if fold is None:
+                values = (np.einsum("ksd,sfd->ksf", own, probes.weights) + probes.intercepts).mean(axis=-1)
+            else:
+                values = np.einsum("ksd,sd->ks", own, probes.weights[:, fold]) + probes.intercepts[:, fold]
+            found[:, probes.places] = values * toward(side)
+        return EpisodeLogOdds(found, fold is not None)
+
+    @property
+    def _reads_activations(self) -> bool:
+        left_out = any(f"{site.stream}/pooled" in self.run.root.left_out for site in self.sites)
+        return not (left_out or is_token_view(self._view))
+
+    @cached_property
+    def _reached(self) -> list[NDArray[np.bool_]]:
+        return [self.run.reached(call) for call in range(self.run.captured_calls)]
+
+    @cached_property
+    def _rows(self) -> dict[str, Rows]:
+        return {stream: self.run.rows(stream) for stream in self._streams}
+
+    @cached_property
+    def _streams(self) -> dict[str, _StreamProbes]:
+        names = [(self._category, self._view, site) for site in self.sites]
+        directions = read_directions(self._results.directions, names)
+        found = {}
+        for stream in dict.fromkeys(site.stream for site in self.sites):
+            places = [place for place, site in enumerate(self.sites) if site.stream == stream]
+            own = [directions[names[place]] for place in places]
+            found[stream] = self._stacked(stream, places, own)
+        return found
+
+    def _stacked(self, stream: str, places: list[int], directions: list[Direction]) -> _StreamProbes:
+        stored = self.run.stored(stream)
+        indices = [stored.at(self.sites[place]) for place in places]
+        return _StreamProbes(
+            places,
+            tuple(list(axis) for axis in zip(*indices, strict=True)),
+            stored.views.index(resolve_view(self._view, stored.views)),
+            np.stack([direction.weights.astype(np.float64) for direction in directions]),
+            np.stack([np.asarray(direction.intercepts, np.float64) for direction in directions]),
+        )
+
+
+def toward(side_correct: str) -> float:
+    """What turns a log-odds of `left` into one of the correct side."""
+    return 1.0 if side_correct == "left" else -1.0
+
+
+def decisions_toward_correct(curve: ProbeCurve, places: Sequence[int], sides: Sequence[str]) -> Values:
+    """(S, E) held-out log-odds of some episodes of the curve, the correct side up; sides: (E,) the correct."""
+    return np.asarray(curve.decisions[:, places] * np.array([toward(side) for side in sides]))

@@ -1,0 +1,117 @@
+"""The payload of one episode: paths, actions, events, outcomes, and log-odds of every site at every inference."""
+
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from probe_kit.env.scoring.events import EVENTS, Events
+from probe_kit.env.scoring.rules import RULES, judge, rule_of
+from probe_kit.env.scoring.trajectory import Trajectory
+from probe_kit.extract.run_layout import CAPTURE_ONLY
+from probe_kit.extract.store.thumbnails import read_thumbnail
+from probe_kit.view.frozen_probes import toward
+from probe_kit.view.payloads.coding import pack_floats, pack_log_odds
+from probe_kit.view.viewed_run import ViewedRun
+
+_STILL = 1e-4
+"""Metres a tile may move and still be drawn where it began."""
+_ANSWERS = ("question", "answer", "said", "parse", "outcome_text", "outcome_logits", "outcome_debiased")
+"""Columns of a VLM run that say what was asked and answered."""
+
+
+def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
+    """The episode of this number. Raises KeyError if it is not committed.
+
+    `inferences`: control step of every inference, of which the first K were captured.
+    `log_odds` and `refitted`: packed (K, S) by captured inference and site. The first are of the probes of one
+    inference, the second of the probes that were fitted to each inference.
+    """
+    run, position = viewed.run, viewed.position_of[number]
+    row = {str(name): value for name, value in run.episodes.iloc[position].to_dict().items()}
+    probes = viewed.probes.get(str(row["category"]))
+    found = None if probes is None else probes.log_odds(position)
+    calls = sum(bool(viewed.run.reached(call)[position]) for call in range(run.captured_calls))
+    trajectory = run.trajectory(position) if run.has_trajectories else None
+    return {
+        "number": number,
+        "frames": _frames(viewed, number, row),
+        "inferences": _inference_steps(viewed, position, calls),
+        "log_odds": None if found is None else pack_log_odds(found.values),
+        "refitted": None if found is None else _refitted(viewed, row, calls),
+        "held_out": found is None or found.held_out,
+        "trajectory": None if trajectory is None else _trajectory(trajectory),
+        "events": {} if trajectory is None else _events(trajectory),
+        "outcomes": {} if trajectory is None else _outcomes(viewed, trajectory, row),
+        "instruction_tokens": len(run.instruction_ids(position) or ()),
+        "answers": {name: str(row[name]) for name in _ANSWERS if name in row and viewed.answers},
+    }
+
+
+def _inference_steps(viewed: ViewedRun, position: int, calls: int) -> list[int]:
+    """The control step of every inference; of old runs that of the first alone is known, if it was captured."""
+    if not viewed.has_control_steps:
+        return [0][:calls]
+    own = viewed.run.control_steps[position]
+    return [int(step) for step in own[own >= 0]]
+
+
+def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
+    """Log-odds of the probes of each inference, None where only one inference was probed."""
+    category, view = str(row["category"]), viewed.view
+    if len(viewed.refitted) < 2:
+        return None
+    found = np.full((calls, len(viewed.sites)), np.nan)
+    for call, results in viewed.refitted.items():
+        curve = results.curves.get((category, str(view)))
+        places = [] if curve is None else np.flatnonzero(curve.episodes == row["episode_id"]).tolist()
+        if curve is not None and places and call < calls:
+            sign = toward(str(row["side_correct"]))
+            found[call] = curve.decisions[:, places[0]] * sign
+    return pack_log_odds(found)
+
+
+def _frames(viewed: ViewedRun, number: int, row: dict[str, Any]) -> dict[str, Any] | None:
+    """How the episode's picture is divided: `count` frames of one size in `columns`; None without a picture."""
+    picture = read_thumbnail(viewed.run.location, number)
+    if picture is None:
+        return None
+    width, height = Image.open(BytesIO(picture)).size
+    count = 1 if viewed.answers or row["outcome"] == CAPTURE_ONLY else 2
+    return {"count": count, "columns": count, "width": width // count, "height": height, "all": False}
+
+
+def _trajectory(trajectory: Trajectory) -> dict[str, Any]:
+    return {
+        "frames": len(trajectory),
+        "tool": pack_floats(trajectory.tool[:, :3]),
+        "cube": pack_floats(trajectory.cube[:, :3]),
+        "opening": pack_floats(trajectory.opening),
+        "commanded": pack_floats(trajectory.commanded[:, :3]),
+        "executed": pack_floats(trajectory.executed[:, :3]),
+        "tiles": {
+            "left": pack_floats(_moved(trajectory.tile_left[:, :2])),
+            "right": pack_floats(_moved(trajectory.tile_right[:, :2])),
+        },
+    }
+
+
+def _moved(places: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(T + 1, 2) middles of a tile, or its first one alone where it stays."""
+    return places if np.abs(places - places[0]).max() > _STILL else places[:1]
+
+
+def _events(trajectory: Trajectory) -> dict[str, int | None]:
+    found = Events.of(trajectory)
+    return {name: found.frame(name) for name in EVENTS}
+
+
+def _outcomes(viewed: ViewedRun, trajectory: Trajectory, row: dict[str, Any]) -> dict[str, str]:
+    """The outcome under every rule at the last step."""
+    scene = viewed.run.settings["scene"]
+    return {
+        name: judge(trajectory, rule_of(name, scene), row["side_correct"], 1, scene["max_steps"]).outcome
+        for name in RULES
+    }

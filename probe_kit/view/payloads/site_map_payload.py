@@ -1,0 +1,91 @@
+"""The payload of a layer × iteration map: scores of every site of one category, and its episodes' log-odds."""
+
+from collections.abc import Hashable, Mapping
+from typing import Any
+
+import pandas as pd
+
+from probe_kit.retention.columns.text import p_text, percent, with_limits
+from probe_kit.suite.categories import category_of
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.view.frozen_probes import decisions_toward_correct
+from probe_kit.view.payloads.coding import pack_log_odds, rounded
+from probe_kit.view.viewed_run import ViewedRun
+
+NULL_SHARE = 0.95
+"""Share of accuracies under label permutation that lie below the quantile that is shown."""
+HEADINGS = (
+    "accuracy % [95 %]",
+    "p of this site",
+    "p, family-wise",
+    "permuted labels, 95 % below %",
+    "random labels %",
+    "verdict",
+)
+
+
+def site_map_payload(viewed: ViewedRun, category: str) -> dict[str, Any]:
+    """Scores by site, spelt as in the tables; log-odds (S, E) packed, toward the correct side.
+
+    `rows`: the place of each of the E episodes among those of the run. `refitted`: the same scores of probes that
+    were fitted to later inferences, by inference. Raises KeyError for a category without probes.
+    """
+    results, curve = viewed.results, viewed.curve(category)
+    if results is None or curve is None:
+        raise KeyError(category)
+    scores = _scores(results, category, viewed.view)
+    positions = {str(name): place for place, name in enumerate(viewed.run.episodes["episode_id"])}
+    shown = [place for place, name in enumerate(curve.episodes.tolist()) if name in positions]
+    rows = [positions[name] for name in curve.episodes[shown].tolist()]
+    every = viewed.run.episodes["side_correct"].astype(str).tolist()
+    sides = [every[row] for row in rows]
+    quantiles = pd.DataFrame(curve.null.T).quantile(NULL_SHARE).tolist() if curve.null.shape[1] else []
+    return {
+        "category": category,
+        "title": category_of(category).title,
+        "view": viewed.view,
+        "n": int(scores["n"].iloc[0]),
+        "items": int(scores["items"].iloc[0]),
+        "groups": int(scores["groups"].iloc[0]),
+        "headings": HEADINGS,
+        "cells": [
+            _cells(row, quantiles[place] if quantiles else None)
+            for place, row in enumerate(scores.to_dict("records"))
+        ],
+        **_shades(scores),
+        "rows": rows,
+        "log_odds": pack_log_odds(decisions_toward_correct(curve, shown, sides)),
+        "refitted": {
+            str(call): _shades(_scores(other, category, viewed.view))
+            for call, other in viewed.refitted.items()
+            if call != results.settings.call and (category, viewed.view) in other.curves
+        },
+    }
+
+
+def _scores(results: ProbeResults, category: str, view: str | None) -> pd.DataFrame:
+    scores = results.scores
+    return scores[(scores["category"] == category) & (scores["view"] == view)]
+
+
+def _shades(scores: pd.DataFrame) -> dict[str, Any]:
+    return {
+        "accuracy": [rounded(value) for value in scores["accuracy"]],
+        "signal": [bool(value) for value in scores["signal"]],
+    }
+
+
+def _cells(row: Mapping[Hashable, Any], quantile: float | None) -> list[str]:
+    limits = _or_none(row["ci_low"]), _or_none(row["ci_high"])
+    return [
+        with_limits(percent(_or_none(row["accuracy"])), limits, percent),
+        p_text(_or_none(row["p"])),
+        p_text(_or_none(row["p_fwe"])),
+        percent(quantile),
+        percent(_or_none(row["control_accuracy"])),
+        "signal" if row["signal"] else "no signal shown",
+    ]
+
+
+def _or_none(value: float) -> float | None:
+    return None if value != value else float(value)

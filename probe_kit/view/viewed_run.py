@@ -1,0 +1,128 @@
+"""A run as the viewer shows it: its rows of the retention table, its probes, and a name for addresses."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from probe_kit.errors import UsageError
+from probe_kit.extract import Run
+from probe_kit.extract.store.format.commits import WITH_CONTROL_STEPS
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.retention import RetentionRow, RetentionTable, retention_table
+from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.train.results.by_call import load_results_by_call
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.view.frozen_probes import FrozenProbes
+
+_UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+@dataclass(frozen=True)
+class ViewedRun:
+    """A run, opened in one wording. key: its name in addresses and folders, unique among the runs of a page."""
+
+    key: str
+    run: Run
+
+    @cached_property
+    def table(self) -> RetentionTable:
+        """The retention table of this run alone."""
+        return retention_table([self.run])
+
+    @property
+    def places(self) -> tuple[str, str]:
+        """What the run is called on this machine, which no page shows."""
+        return self.run.location.address, str(self.run.location)
+
+    @property
+    def results(self) -> ProbeResults | None:
+        """The probes of the table; None without any."""
+        return self.table.results.get(str(self.run.location))
+
+    @property
+    def view(self) -> str | None:
+        """The view whose probes are shown: the first one that was probed."""
+        return None if self.results is None else self.results.settings.views[0]
+
+    @property
+    def has_control_steps(self) -> bool:
+        """Whether the run holds the control step of every inference."""
+        return self.run.root.schema >= WITH_CONTROL_STEPS
+
+    @property
+    def answers(self) -> bool:
+        """Whether the model was asked and did not act."""
+        return ask_of(self.run) is not None
+
+    @cached_property
+    def rows(self) -> dict[str, RetentionRow]:
+        """The table's row of every category, in the view that is shown."""
+        return {row.category: row for row in self.table.rows if row.view in (None, self.view)}
+
+    @property
+    def mean(self) -> RetentionRow:
+        """The table's mean over the categories."""
+        return next(row for row in self.table.means if row.view in (None, self.view))
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """In the order of the episodes."""
+        return tuple(dict.fromkeys(self.run.episodes["category"].astype(str)))
+
+    @property
+    def probed_categories(self) -> tuple[str, ...]:
+        """Those that have probes in the view that is shown."""
+        return tuple(category for category in self.categories if self.curve(category) is not None)
+
+    def curve(self, category: str) -> ProbeCurve | None:
+        """The probes of a category, None without any."""
+        if self.results is None or self.view is None:
+            return None
+        return self.results.curves.get((category, self.view))
+
+    @property
+    def sites(self) -> tuple[Site, ...]:
+        """All probed sites, the same in every category; none without probes."""
+        return next((curve.sites for name in self.categories if (curve := self.curve(name)) is not None), ())
+
+    @cached_property
+    def refitted(self) -> Mapping[int, ProbeResults]:
+        """By captured inference, the probes that were fitted to that inference with otherwise equal settings."""
+        return {} if self.results is None else load_results_by_call(self.run, self.results)
+
+    @cached_property
+    def probes(self) -> dict[str, FrozenProbes]:
+        """By category, the probes of the table's inference."""
+        results, view = self.results, self.view
+        if results is None or view is None:
+            return {}
+        return {name: FrozenProbes(self.run, results, name, view) for name in self.probed_categories}
+
+    @cached_property
+    def position_of(self) -> dict[int, int]:
+        """Row in `run.episodes` by the episode's number."""
+        return {int(number): position for position, number in enumerate(self.run.episodes["episode"])}
+
+
+def view_runs(runs: Sequence[Run]) -> list[ViewedRun]:
+    """The runs as the viewer shows them: of several wordings the first, as in `retention_table`.
+
+    Raises UsageError without runs, or if one is given twice.
+    """
+    if not runs:
+        raise UsageError("the viewer needs at least one run")
+    places = [run.location.address for run in runs]
+    if doubles := [place for at, place in enumerate(places) if place in places[:at]]:
+        raise UsageError(f"{doubles[0]} is given twice. Leave one out")
+    keys: list[str] = []
+    for run in runs:
+        keys.append(_key(run.location.name, keys))
+    return [ViewedRun(key, run.in_wording()) for key, run in zip(keys, runs, strict=True)]
+
+
+def _key(name: str, others: Sequence[str]) -> str:
+    plain = _UNSAFE.sub("-", name).strip(".-") or "run"
+    numbered = (plain if count == 1 else f"{plain}-{count}" for count in range(1, len(others) + 2))
+    return next(key for key in numbered if key.lower() not in {other.lower() for other in others})
