@@ -73,7 +73,7 @@ def test_every_command_and_option_stands_on_the_page_of_commands(site: Path) -> 
         if hasattr(command, "commands"):
             todo += [(f"{name} {child}", found) for child, found in command.commands.items()]
             continue
-        until_next = rf"^{name}\W*$(.*?)(?=^probe-kit [a-z -]+\W*$|\Z)"
+        until_next = rf"^{name}\W*$(.*?)(?=^probe-kit [a-z -]+¶$|\Z)"
         (section,) = re.findall(until_next, shown, re.MULTILINE | re.DOTALL)
         for parameter in command.params:
             option = parameter.opts[-1] if parameter.param_type_name == "option" else parameter.name.upper()
