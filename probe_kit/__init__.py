@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Site, capture, load_policy
     from probe_kit.intervene import (
         AttentionReadout,
+        AttributionPatching,
         ClosedLoop,
         ConceptErasure,
         ImageSwap,
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Act2AnswerEnv",
     "AttentionReadout",
+    "AttributionPatching",
     "ClosedLoop",
     "ConceptErasure",
     "ExtractSettings",
@@ -90,6 +92,7 @@ __getattr__, __dir__ = lazy_names(
         "Steering": "intervene",
         "ConceptErasure": "intervene",
         "Interchange": "intervene",
+        "AttributionPatching": "intervene",
         "JointPlaces": "intervene",
         "AttentionReadout": "intervene",
         "ClosedLoop": "intervene",

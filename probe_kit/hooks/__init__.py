@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks.capturing.attention_patterns import attended_roles, capture_patterns
     from probe_kit.hooks.capturing.capture_context import capture, edit
     from probe_kit.hooks.capturing.edit_engine import apply_edits
+    from probe_kit.hooks.capturing.gradients import gradients_at
     from probe_kit.hooks.capturing.head_outputs import project_heads
     from probe_kit.hooks.capturing.logit_lens import LogitLens, logit_lens
     from probe_kit.hooks.checkpoints.weights import load_weights, read_weights
@@ -52,6 +53,7 @@ __all__ = [
     "capture_attention",
     "capture_patterns",
     "edit",
+    "gradients_at",
     "known_families",
     "load_model",
     "load_policy",
@@ -85,6 +87,7 @@ __getattr__, __dir__ = lazy_names(
         "Tap": "contract.model",
         "ActivationCache": "capturing.activation_cache",
         "apply_edits": "capturing.edit_engine",
+        "gradients_at": "capturing.gradients",
         "capture": "capturing.capture_context",
         "edit": "capturing.capture_context",
         "Roles": "contract.roles",

@@ -10,6 +10,8 @@ from probe_kit._system.lazy import lazy_names
 if TYPE_CHECKING:
     from probe_kit.intervene.kinds.attention.attention_mass import AttentionRow, AttentionShares, stored_attention
     from probe_kit.intervene.kinds.attention.intervention import AttentionReadout
+    from probe_kit.intervene.kinds.attribution.effects import AttributionEffect
+    from probe_kit.intervene.kinds.attribution.intervention import AttributionPatching
     from probe_kit.intervene.kinds.closed_loop.effects import ClosedLoopEffect
     from probe_kit.intervene.kinds.closed_loop.intervention import ClosedLoop
     from probe_kit.intervene.kinds.erase.effects import ErasureEffect
@@ -41,6 +43,8 @@ __all__ = [
     "AttentionReadout",
     "AttentionRow",
     "AttentionShares",
+    "AttributionEffect",
+    "AttributionPatching",
     "Behaviour",
     "ClosedLoop",
     "ClosedLoopEffect",
@@ -84,6 +88,8 @@ __getattr__, __dir__ = lazy_names(
         "stored_site_effects": "results.site_maps",
         "PatchEffect": "kinds.site_effects",
         "Steering": "kinds.steer.intervention",
+        "AttributionEffect": "kinds.attribution.effects",
+        "AttributionPatching": "kinds.attribution.intervention",
         "Interchange": "kinds.interchange.intervention",
         "ConditionOutcomes": "store.answers",
         "AttentionRow": "kinds.attention.attention_mass",

@@ -185,7 +185,7 @@ class _Network(nn.Module):
 class WiredPolicy(Policy):
     """Acts by the wiring that the instruction names: `wiring:item`."""
 
-    interventions: ClassVar[Interventions] = Interventions(prompt_kv=True, unread=("backbone",))
+    interventions: ClassVar[Interventions] = Interventions(prompt_kv=True, unread=("backbone",), gradients=True)
     role_names: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "backbone": ("image.primary", "language", "state"), "expert": ("state", "action"),
     }  # fmt: skip
@@ -208,7 +208,15 @@ class WiredPolicy(Policy):
         chunks = np.zeros((len(seen), CHUNK, 7), np.float32)
         with torch.inference_mode():
             for row, (observation, seed) in enumerate(zip(seen, seeds, strict=True)):
-                chunks[row, :, 1] = self._lateral(observation, seed) / CHUNK
+                chunks[row, :, 1] = float(self._lateral(observation, seed)) / CHUNK
+        return chunks
+
+    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
+        """The same with a graph; what decides by a sign has no slope."""
+        self.check(seen, seeds)
+        lateral = torch.stack([self._lateral(one, seed) for one, seed in zip(seen, seeds, strict=True)])
+        chunks = torch.zeros(len(seen), CHUNK, 7)
+        chunks[:, :, 1] = lateral[:, None] / CHUNK
         return chunks
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
@@ -232,14 +240,14 @@ class WiredPolicy(Policy):
             return Tap(block.norm, fires)
         return Tap(getattr(block, site.quantity), fires, "output")
 
-    def _lateral(self, observation: Observation, seed: int) -> float:
+    def _lateral(self, observation: Observation, seed: int) -> Tensor:
         name, _, item = observation.instruction.partition(":")
         wiring, answer, other = WIRINGS[name], _sign(observation, 0), _sign(observation, 1)
         noise = torch.randn(9, generator=torch.Generator().manual_seed(seed))
         values = self.network.values(_embedded(name, item, answer, other), wiring)
         is_first, is_rare = bool(observation.state[0] < 0.01), int(item) % 8 < 2
         action = self.network.act(Inference(values, noise, answer, is_first, is_rare), wiring)
-        return float(action) * METRES + 0.004 * float(noise[7])
+        return action * METRES + 0.004 * noise[7]
 
 
 def _sign(observation: Observation, colour: int) -> float:

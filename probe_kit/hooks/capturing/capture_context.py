@@ -27,7 +27,8 @@ __all__ = ["ActivationCache", "EditFunction", "Reduce", "capture", "edit"]
 
 Reduce = Callable[[Site, Tensor], Tensor]
 EditFunction = Callable[[Tensor], Tensor]
-Handle = Callable[[Site, Tap, Tensor], None]
+Handle = Callable[[Site, Tap, Tensor], Tensor | None]
+"""Receives what passes at a site; of an output, what it returns passes on in its place."""
 _captured_now: WeakSet[Model] = WeakSet()
 
 
@@ -132,12 +133,15 @@ class _CountingHook:
             )
         self._fire(keywords[self.tap.argument])
 
-    def _fire(self, passing: Any) -> None:
+    def _fire(self, passing: Any) -> Any:
         site = self.at_fire.get(self.count - self.tap.first)
         self.count += 1
-        if site is not None:
-            activation = passing[0] if isinstance(passing, tuple) else passing
-            self.handle(site, self.tap, activation)
+        if site is None:
+            return None
+        if not isinstance(passing, tuple):
+            return self.handle(site, self.tap, passing)
+        instead = self.handle(site, self.tap, passing[0])
+        return None if instead is None else (instead, *passing[1:])
 
     def check_count(self) -> None:
         expected = self.tap.first + self.tap.fires

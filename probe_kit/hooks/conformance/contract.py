@@ -7,6 +7,7 @@ from probe_kit.hooks.conformance import (
     answering,
     batches,
     editing,
+    gradients,
     heads,
     interventions,
     loading,
@@ -16,5 +17,5 @@ from probe_kit.hooks.conformance import (
 from probe_kit.hooks.conformance.check import Check, checks_of
 
 MODEL_CHECKS: Sequence[Check] = checks_of(sites, editing, heads, batches, token_roles, loading)
-POLICY_CHECKS: Sequence[Check] = (*MODEL_CHECKS, *checks_of(acting, interventions))
+POLICY_CHECKS: Sequence[Check] = (*MODEL_CHECKS, *checks_of(acting, interventions, gradients))
 ANSWER_CHECKS: Sequence[Check] = (*MODEL_CHECKS, *checks_of(answering))

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 
-InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles"]
+InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles", "gradients"]
 Readout = Literal["first-chunk", "per-step"]
 """first-chunk: lateral displacement by the first inference's actions, none of them executed.
 per-step: its sum over every inference of the unedited episode; only the clean actions are executed."""
@@ -16,6 +16,7 @@ ASKED_AS: Mapping[InterventionKind, tuple[str, tuple[str, ...]]] = MappingProxyT
         "swap": ("--kind", ("image-swap", "instruction-swap")),
         "edit": ("--kind", ("interchange", "joint", "steer", "closed-loop", "erase")),
         "attention": ("--kind", ("attention",)),
+        "gradients": ("--kind", ("attribution",)),
         "kv": ("--sites", ("kv.*",)),
         "tiles": ("--roles", ("image.left", "image.right")),
     }
@@ -25,6 +26,8 @@ _UNDECLARED = {
     "kv": "its adapter declares no `kv` stream. Patch residual sites instead, or declare `Model.prompt_kv`",
     "attention": "its adapter gives no attention. Patch `kv` or single roles instead: what a patch "
     "moves is read, whatever attention weighs",
+    "gradients": "its adapter has no differentiable inference. Patch exactly: `--kind interchange`, or "
+    "`--kind joint`, which halves large sets",
     "tiles": "its adapter does not say which picture token comes of which patch. Patch all of `image`, or "
     "declare `Model.patch_order`",
 }
@@ -45,6 +48,7 @@ class Interventions:
     prompt's own pass already chooses the first token.
     attention: whether it records the acting stream's attention to every token of the prompt.
     tiles: whether it says which of the picture's tokens come of which patches, see `Model.patch_order`.
+    gradients: whether `Policy.differentiable` gives its actions with a graph.
     readout: `first-chunk` where the first chunk shows where the hand will go; `per-step` where an inference gives
     one action in discrete bins. Conditions are then evaluated at every call of an unedited episode, not executed.
     instead: for what is not supported, why and what to do.
@@ -57,6 +61,7 @@ class Interventions:
     first_affected_token: int = 0
     attention: bool = False
     tiles: bool = False
+    gradients: bool = False
     readout: Readout = "first-chunk"
     instead: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -66,7 +71,7 @@ class Interventions:
 
     def supports(self, kind: InterventionKind) -> bool:
         """Whether `kind` can be asked for."""
-        own = {"kv": self.prompt_kv, "attention": self.attention, "tiles": self.tiles}
+        own = {"kv": self.prompt_kv, "attention": self.attention, "tiles": self.tiles, "gradients": self.gradients}
         return own.get(kind, True)
 
     def asked_as(self) -> dict[str, list[str]]:

@@ -250,6 +250,19 @@ class Policy(Model):
             f"{type(self).__name__} declares attention and does not implement `record_attention`"
         )
 
+    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
+        """The actions of `act` with a graph behind them: (B, chunk, 7) in metres and radians, as float32.
+
+        For `hooks.gradients_at`. Weights need no gradient, no module is compiled, attention is eager, and numbers
+        equal those of `act` to 1e-5 in float32. A number without a slope, such as a gripper that is open or
+        closed, has gradient zero. Raises UnsupportedInterventionError.
+        """
+        del seen, seeds
+        self.interventions.check("gradients", self.card.family)
+        raise NotImplementedError(
+            f"{type(self).__name__} declares gradients and does not implement `differentiable`"
+        )
+
     @abstractmethod
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation.

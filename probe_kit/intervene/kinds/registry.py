@@ -16,6 +16,7 @@ _ENTRIES = (
     "probe_kit.intervene.kinds.instruction_swap.kind",
     "probe_kit.intervene.kinds.interchange.kind",
     "probe_kit.intervene.kinds.joint.kind",
+    "probe_kit.intervene.kinds.attribution.kind",
     "probe_kit.intervene.kinds.steer.kind",
     "probe_kit.intervene.kinds.closed_loop.kind",
     "probe_kit.intervene.kinds.erase.kind",

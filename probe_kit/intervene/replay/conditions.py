@@ -20,24 +20,28 @@ from probe_kit.intervene.store.settings import InterventionSettings
 class ConditionContext:
     """One question on the bench, with what its conditions share.
 
-    memo: what one condition computed and another needs as well, by its name.
+    memo: what one condition computed and another needs as well, by its name. clean: (chunk, 7) of the first
+    condition, empty before that was played.
     """
 
     session: ReplaySession
     replay_input: ReplayInput
     memo: dict[Any, Any] = field(default_factory=dict)
+    clean: Chunk = field(default_factory=lambda: np.zeros((0, 7), np.float32))
 
 
 @dataclass(frozen=True)
 class ConditionResult:
     """The actions (chunk, 7) of one inference, and what was changed in it, if anything.
 
-    mass: (B, I, H, R) the attention shares of it, if recorded; see `AttentionShares`.
+    mass: (B, I, H, R) the attention shares of it, if recorded; see `AttentionShares`. estimated: metres of lateral
+    displacement that an estimate adds to the chunk's, without an inference that makes them.
     """
 
     chunk: Chunk
     edit_log: EditLog | None = None
     mass: NDArray[np.float32] | None = None
+    estimated: float = 0.0
 
 
 class Condition(Protocol):
@@ -186,11 +190,12 @@ def replay(
     attention_records: list[AttentionRecord] = []
     for column, replay_input in enumerate(replay_inputs):
         context = ConditionContext(session, replay_input)
-        plain = conditions[0].play(context).chunk
+        plain = context.clean = conditions[0].play(context).chunk
         found.replay_error[column] = session.replay_error(replay_input, plain)
         for number, condition in enumerate(conditions):
             played = condition.play(context) if number else ConditionResult(plain)
-            found.displacement[number, column] = session.lateral_displacement(played.chunk, replay_input.seen)
+            moved = session.lateral_displacement(played.chunk, replay_input.seen) + played.estimated
+            found.displacement[number, column] = moved
             found.max_action_change[number, column] = float(np.abs(played.chunk - plain).max())
             if played.edit_log is not None:
                 found.edit_log[number, column] = played.edit_log.row()

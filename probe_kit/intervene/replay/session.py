@@ -31,6 +31,8 @@ from probe_kit.suite.items import Episode, Item, Layout, Side
 from probe_kit.train.data.run_suite import suite_of
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from probe_kit.hooks import Policy
 
 Chunk = NDArray[np.float32]
@@ -195,6 +197,10 @@ class ReplaySession:
         """Where the chunk would bring the hand, in metres from the middle between the tiles; left is positive."""
         end = np.asarray(seen.state[:2], np.float64) + chunk[:, :2].astype(np.float64).sum(axis=0)
         return self.lateral_offset(end)
+
+    def lateral_motion(self, chunk: "Tensor") -> "Tensor":
+        """How far a chunk (chunk, 7) moves the hand, in metres; left is positive. Keeps the graph behind it."""
+        return (chunk[:, :2].sum(dim=0) * chunk.new_tensor(self._across)).sum()
 
     def lateral_offset(self, point: NDArray[np.float64]) -> float:
         """How far a point (2,) is from the middle between the tiles, in metres; left is positive."""

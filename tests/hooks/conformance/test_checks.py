@@ -26,7 +26,7 @@ from probe_kit.hooks.conformance.examples import examples_for
 from probe_kit.hooks.conformance.subject import AnswerSubject, ContractSettings, PolicySubject, Subject
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.testing import AdapterContract, AnswerModelContract
-from tests.support.encoder_vla.policy import STEPS, WIDTH, EncoderPolicy, EncoderVLA, load, write_checkpoint
+from tests.support.encoder_vla.policy import CHUNK, STEPS, WIDTH, EncoderPolicy, EncoderVLA, load, write_checkpoint
 from tests.support.position_models import PositionModel, always, likes
 
 CHECKS = {own.name: own for own in (*POLICY_CHECKS, *ANSWER_CHECKS)}
@@ -254,6 +254,63 @@ def test_a_model_whose_lens_leaves_the_norm_out_fails_its_check(
     monkeypatch.setattr(type(vlm), "unembedding", property(lambda _: broken))
     with pytest.raises(CheckFailedError, match=r"logits of the last layer of answer differ .*; change: Correct"):
         own(subject)
+
+
+# -- gradients -------------------------------------------------------------------------------------------------
+
+
+class Sloped(EncoderPolicy):
+    """Gives its actions with a graph too. shift: of their values. doubled: whether gradients are."""
+
+    interventions = dataclasses.replace(EncoderPolicy.interventions, gradients=True)
+    shift, doubled = 0.0, False
+
+    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
+        image = torch.stack([torch.from_numpy(one.image).permute(2, 0, 1) / 255 for one in seen])
+        state = torch.from_numpy(np.stack([one.state for one in seen]))
+        noise = [torch.randn(CHUNK, 7, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+        raw = self.network(image, self._letters(seen), state, torch.stack(noise))
+        actions = torch.cat([0.02 * raw[..., :6], raw[..., 6:].sigmoid()], -1) + self.shift
+        return 2 * actions - actions.detach() if self.doubled else actions
+
+
+class Shifted(Sloped):
+    shift = 1e-3
+
+
+class Doubled(Sloped):
+    doubled = True
+
+
+class Promising(EncoderPolicy):
+    """Declares gradients and gives none."""
+
+    interventions = Sloped.interventions
+
+
+@pytest.mark.parametrize(
+    ("broken", "name", "said"),
+    [
+        (Shifted, "actions_with_a_graph_are_the_actions", "actions with a graph are off by 0.001"),
+        (Doubled, "gradients_at_sites_are_central_differences", "a gradient of"),
+    ],
+)
+def test_gradients_that_are_not_those_of_the_actions_fail_their_check(
+    broken: type[EncoderPolicy], name: str, said: str, sound: EncoderPolicy, checkpoint: Path, tmp_path: Path
+) -> None:
+    CHECKS[name](PolicySubject(ContractSettings(), Given(Sloped(sound.network, sound.card), checkpoint, tmp_path)))
+    bad = PolicySubject(ContractSettings(), Given(broken(sound.network, sound.card), checkpoint, tmp_path))
+    with pytest.raises(CheckFailedError, match=re.escape(said)):
+        CHECKS[name](bad)
+
+
+def test_gradients_are_declared_or_refused_by_name(sound: EncoderPolicy, checkpoint: Path, tmp_path: Path) -> None:
+    name = "actions_with_a_graph_are_the_actions"
+    with pytest.raises(SkipTest, match="declares no gradients"):
+        CHECKS[name](PolicySubject(ContractSettings(), Given(sound, checkpoint, tmp_path)))
+    promising = Promising(sound.network, sound.card)
+    with pytest.raises(NotImplementedError, match="does not implement `differentiable`"):
+        CHECKS[name](PolicySubject(ContractSettings(), Given(promising, checkpoint, tmp_path)))
 
 
 # -- loading ---------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ FLOW = Interventions(
     prompt_kv=True,
     attention=True,
     tiles=True,
+    gradients=True,
 )
 """An action expert reads the backbone's keys and values, at every flow-matching step, and nothing else of it."""
 

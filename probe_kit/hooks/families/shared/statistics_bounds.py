@@ -44,6 +44,12 @@ class Bounds:
         metres[..., -1] = values[..., -1] > _OPEN
         return metres
 
+    def slope(self, numbers: int) -> NDArray[np.float32]:
+        """(D,) of `restore`; 0 of the gripper, which is open or closed."""
+        found = np.asarray((self.high - self.low) / 2, np.float32) * np.ones(numbers, np.float32)
+        found[-1] = 0
+        return found
+
 
 @dataclass(frozen=True)
 class StatisticsFile:

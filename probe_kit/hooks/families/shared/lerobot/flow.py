@@ -4,10 +4,11 @@ Never lerobot's own `from_pretrained`: it returns partly or fully random models 
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
+from probe_kit.hooks.capturing.gradients import frozen
 from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, content_hashes, side_files
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.hooks.contract.card import ModelCard
@@ -259,6 +261,19 @@ class LerobotFlow(Policy):
         chunk = self.infer(self.batch(seen), self.noise(seeds))
         return self.action_units.restore(chunk.float().cpu().numpy())
 
+    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
+        """The actions of `act`, bit for bit, with a graph of the whole flow; see the contract."""
+        self.check(seen, seeds)
+        if (reason := self._action_misfit()) is not None:
+            raise CheckpointError(reason)
+        batch, noise = self.batch(seen), self.noise(seeds)
+        with frozen(self.network), _with_graph(self.network.model):
+            chunk: Tensor = undecorated(self.network.predict_action_chunk)(batch, noise=noise)
+            own = chunk.float()
+            metres = torch.from_numpy(self.action_units.restore(own.detach().cpu().numpy())).to(own.device)
+            slope = torch.from_numpy(self.action_units.slope(own.shape[-1])).to(own.device)
+            return metres + slope * (own - own.detach())
+
     def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """(B, chunk, action numbers) as the network puts them out, without units."""
         self.check(seen, seeds)
@@ -486,3 +501,19 @@ def _problem(read: Callable[[], object]) -> str | None:
     except CheckpointError as error:
         return str(error)
     return None
+
+
+def undecorated(method: Callable[..., Any]) -> Callable[..., Any]:
+    """A bound method without the decorator that turns gradients off; itself if it has none."""
+    inner = getattr(getattr(method, "__func__", method), "__wrapped__", None)
+    return method if inner is None else partial(inner, getattr(method, "__self__", None))
+
+
+@contextmanager
+def _with_graph(model: Any) -> Iterator[None]:
+    """lerobot's sampling of a flow, without the decorator of its own."""
+    model.sample_actions = undecorated(model.sample_actions)
+    try:
+        yield
+    finally:
+        del model.sample_actions

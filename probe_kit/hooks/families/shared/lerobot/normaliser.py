@@ -38,6 +38,9 @@ class Units(Protocol):
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Network output to physical units; (..., D)."""
 
+    def slope(self, numbers: int) -> NDArray[np.float32]:
+        """(D,) by how much `restore` changes per unit of the network's output; 0 for a number that jumps."""
+
 
 @dataclass(frozen=True)
 class Normaliser:
@@ -77,6 +80,12 @@ class Normaliser:
             return np.asarray(values * self.high + self.low, np.float32)
         span = np.where(self.high == self.low, self.eps, self.high - self.low)
         return np.asarray((values + 1) / 2 * span + self.low, np.float32)
+
+    def slope(self, numbers: int) -> NDArray[np.float32]:
+        """(D,) of `restore`, which is a line in each of the D numbers."""
+        ends = (np.full((1, numbers), value, np.float32) for value in (0, 1))
+        low, high = (self.restore(values)[0] for values in ends)
+        return np.asarray(high - low, np.float32)
 
 
 def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Normaliser:

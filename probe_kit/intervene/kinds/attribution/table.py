@@ -1,0 +1,101 @@
+"""A screen by gradients, as a table and sentences for a terminal."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from probe_kit.intervene.kinds.attribution.effects import AGREEMENT, AttributionEffect, worst_anchor
+from probe_kit.intervene.kinds.base import TableContext
+from probe_kit.suite.categories import category_of
+
+if TYPE_CHECKING:
+    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
+
+_LEGEND = (
+    "estimate: share of the image swap by gradients; exact: with these tokens patched; anchor: all of a place, "
+    f"patched exactly; a screen that misses an anchor by more than a factor of {AGREEMENT:.0f} is void and shows "
+    "no order; drawn: chosen at random from the rest; p: of the exact patch, max-T over those of the "
+    "category; a screen enters no verdict"
+)
+NAMED = 3
+"""Cells that a sentence names."""
+
+
+def attribution_table(rows: Sequence[AttributionEffect], context: TableContext) -> "ResponsiveTable":
+    """One line per category and cell."""
+    from probe_kit._terminal.responsive_table import Part, ResponsiveTable
+
+    void = [_void(own) for own in _screens(rows).values() if own[0].finding == "void"]
+    return ResponsiveTable(
+        title="; ".join([f"Which places to patch? {context.subject}, gradients", *dict.fromkeys(void)]),
+        caption=_LEGEND,
+        name="category · cell",
+        names=tuple(f"{row.category} · {row.name}" for row in rows),
+        styles=tuple("bold" if row.is_anchor else "" for row in rows),
+        parts=(
+            Part(
+                "Share of the image swap",
+                ("rank", "estimate [95 %]", "exact [95 %]", "p", "chosen"),
+                tuple(_cells(row) for row in rows),
+            ),
+        ),
+    )
+
+
+def attribution_sentences(rows: Sequence[AttributionEffect], _: TableContext) -> list[str]:
+    """One per category: whether the screen holds, and what it puts first."""
+    found: dict[str, list[str]] = {}
+    for (category, stream), own in _screens(rows).items():
+        found.setdefault(category, []).append(f"{stream}: {_finding(own)}")
+    return [f"{category_of(name).title}: {'; '.join(said)}." for name, said in found.items()]
+
+
+def _screens(rows: Sequence[AttributionEffect]) -> dict[tuple[str, str], list[AttributionEffect]]:
+    """By category and stream."""
+    found: dict[tuple[str, str], list[AttributionEffect]] = {}
+    for row in rows:
+        found.setdefault((row.category, row.stream), []).append(row)
+    return found
+
+
+def _finding(rows: Sequence[AttributionEffect]) -> str:
+    worst = worst_anchor(rows)
+    if worst is None:
+        return "the swap moves nothing through any of it, so that there is no order"
+    if worst.finding == "void":
+        return f"{_void(rows)}; no order is shown"
+    named = [_named(row) for row in rows if row.rank is not None and row.rank <= NAMED]
+    drawn = [abs(row.exact) for row in rows if row.is_drawn and row.exact is not None]
+    missed = f"; of {len(drawn)} drawn cells the largest exact effect is {max(drawn):.2f}" if drawn else ""
+    return f"{_compared(worst)}; first {', '.join(named)}{missed}"
+
+
+def _void(rows: Sequence[AttributionEffect]) -> str:
+    worst = worst_anchor(rows)
+    assert worst is not None
+    return f"screen void: {_compared(worst)}"
+
+
+def _compared(anchor: AttributionEffect) -> str:
+    return f"gradients give {anchor.estimate:.2f} where the patch gives {anchor.exact:.2f} ({anchor.name})"
+
+
+def _named(row: AttributionEffect) -> str:
+    exact = "" if row.exact is None else f", exact {row.exact:.2f}"
+    return f"{row.name} {row.estimate:.2f}{exact}"
+
+
+def _cells(row: AttributionEffect) -> "tuple[Cell, ...]":
+    from probe_kit._terminal.responsive_table import Cell
+
+    chosen = "anchor" if row.is_anchor else "drawn" if row.is_drawn else "top" if row.exact is not None else ""
+    texts = (
+        "–" if row.rank is None else str(row.rank), _share(row.estimate, row.estimate_ci),
+        _share(row.exact, row.exact_ci), "–" if row.p_fwe is None else f"{row.p_fwe:.2g}", chosen,
+    )  # fmt: skip
+    return tuple(map(Cell, texts))
+
+
+def _share(value: float | None, limits: tuple[float, float] | None) -> str:
+    if value is None or limits is None:
+        return "–"
+    return f"{value:.2f} [{limits[0]:.2f}, {limits[1]:.2f}]"

@@ -1,0 +1,149 @@
+"""A screen by gradients: where it orders places, where it is void, and what it never enters.
+
+On policies whose wiring is written down. A mean that is read linearly has its effect as its gradient; a majority
+of signs has no slope anywhere, although the joint effect is the whole.
+"""
+
+from typing import Any
+
+import pytest
+
+from probe_kit.errors import UnsupportedInterventionError, UsageError
+from probe_kit.extract import Run
+from probe_kit.hooks import Policy, Site, gradients_at
+from probe_kit.intervene import (
+    AttributionEffect,
+    AttributionPatching,
+    ReplaySource,
+    load_effects,
+    run_intervention,
+)
+from probe_kit.intervene.kinds.attribution.effects import EXACT, measured_attribution
+from probe_kit.intervene.kinds.attribution.table import attribution_sentences, attribution_table
+from probe_kit.intervene.kinds.base import Measurement, TableContext
+from probe_kit.intervene.results.results import verdicts_of
+from tests.intervene.wirings import WiredSession, outcomes_of, replay_inputs
+
+SUITE = "suite@1#0123456789ab"
+ROLES = ("image", "language", "state")
+
+
+@pytest.fixture(scope="module")
+def wired() -> WiredSession:
+    return WiredSession()
+
+
+def screened(session: WiredSession, name: str, **options: Any) -> Measurement:
+    asked = AttributionPatching(categories=(name,), roles=ROLES, **options)
+    conditions = asked.conditions(session)
+    outcomes = outcomes_of(session, [name], conditions[2:])
+    entries = asked.certificate_entries(conditions, None)  # type: ignore[arg-type]
+    return Measurement(outcomes, SUITE, asked.parameters() | {"kind": asked.kind}, entries, lambda _: b"")
+
+
+def by_name(rows: list[AttributionEffect]) -> dict[str, AttributionEffect]:
+    return {row.name: row for row in rows}
+
+
+def test_what_is_read_linearly_is_ranked_first_and_its_estimate_is_the_effect(wired: WiredSession) -> None:
+    found = screened(wired, "copied")
+    rows = by_name(measured_attribution(found))
+    first, anchor = rows["kv.01 language"], rows["kv.* all"]
+    assert (first.rank, first.finding) == (1, "anchored")
+    assert first.estimate == pytest.approx(1.0, abs=0.02)
+    assert first.exact == pytest.approx(1.0, abs=0.02)
+    assert (anchor.is_anchor, anchor.rank) == (True, None)
+    assert anchor.estimate == pytest.approx(anchor.exact, abs=0.02)
+    assert rows["backbone.01 language"].estimate == pytest.approx(1.0, abs=0.02)
+    assert all(abs(row.estimate or 0) < 0.02 for row in rows.values() if row.place in ("kv.00", "kv.02"))
+    (sentence,) = attribution_sentences(list(rows.values()), context(found))
+    assert sentence.startswith("Copied: kv: gradients give 1.0")
+    assert "first kv.01 language 1.0" in sentence
+
+
+@pytest.mark.parametrize("name", ["blocks", "roles"])
+def test_a_screen_is_void_where_a_decision_has_no_slope(wired: WiredSession, name: str) -> None:
+    """All of `kv` carries everything, and no gradient shows it."""
+    found = screened(wired, name)
+    rows = measured_attribution(found)
+    kv = [row for row in rows if row.stream == "kv"]
+    assert {row.finding for row in kv} == {"void"}
+    assert {row.rank for row in kv} == {None}
+    assert (kv[0].name, kv[0].estimate) == ("kv.* all", 0.0)
+    assert kv[0].exact == pytest.approx(1.0, abs=0.02)
+    (sentence,) = attribution_sentences(rows, context(found))
+    said = "screen void: gradients give 0.00 where the patch gives 1.00 (kv.* all)"
+    assert f"kv: {said}; no order is shown" in sentence
+    assert said in str(attribution_table(rows, context(found)).title)
+
+
+def test_nothing_is_ordered_where_the_swap_moves_nothing(wired: WiredSession) -> None:
+    rows = measured_attribution(screened(wired, "noise"))
+    assert {(row.finding, row.rank, row.estimate) for row in rows} == {("n/a", None, None)}
+    assert "there is no order" in attribution_sentences(rows, context(screened(wired, "noise")))[0]
+
+
+def test_the_largest_estimates_and_drawn_cells_are_patched_exactly(wired: WiredSession) -> None:
+    found = screened(wired, "copied", sites=("kv.*",), top=1, controls=2)
+    rows = by_name(measured_attribution(found))
+    exact = {name for name, row in rows.items() if row.exact is not None and not row.is_anchor}
+    drawn = {name for name, row in rows.items() if row.is_drawn}
+    assert exact == {"kv.01 language", *drawn}
+    assert len(drawn) == 2
+    assert found.certificate["attribution"]["drawn"] == sorted(
+        f"{EXACT}|{name.replace(' ', '|')}" for name in drawn
+    )
+    (sentence,) = attribution_sentences(list(rows.values()), context(found))
+    assert sentence.endswith("; of 2 drawn cells the largest exact effect is 0.00.")
+
+
+def test_both_ends_are_the_mean_of_two_gradients(wired: WiredSession) -> None:
+    """Where the action is linear they are one."""
+    clean, both = (
+        by_name(measured_attribution(screened(wired, "marks", ends=ends))) for ends in ("clean", "both")
+    )
+    assert clean["kv.00 image"].estimate == pytest.approx(both["kv.00 image"].estimate)
+
+
+def test_a_gradient_at_kv_is_of_what_the_acting_part_reads_alone(wired: WiredSession) -> None:
+    """The block's own reading of the same tokens, and the other tapped sites, do not count."""
+    one, at = replay_inputs("copied")[0], Site("kv", 0, "values")
+    others = [Site("backbone", layer) for layer in range(4)]
+    for sites in ([at], [*others, at]):
+        _, slopes = gradients_at(wired.policy, [one.seen], [one.seed], sites, lambda chunks: chunks[0, :, 1].sum())
+        assert not slopes[at].any(), "block 0 is not read by the acting part"
+    assert slopes[others[0]].any()
+
+
+def test_what_cannot_be_screened_is_refused_with_what_to_do() -> None:
+    with pytest.raises(UsageError, match="share no token"):
+        AttributionPatching(roles=("all",))
+    with pytest.raises(UsageError, match="leave --readout out"):
+        AttributionPatching(readout="per-step")
+    with pytest.raises(UsageError, match="expected clean or both"):
+        AttributionPatching(ends="middle")  # type: ignore[arg-type]
+
+
+def test_a_screen_is_stored_with_the_run_and_enters_no_verdict(
+    copy: Run, source: ReplaySource, twin: Policy
+) -> None:
+    before = verdicts_of(copy)
+    asked = AttributionPatching(categories=("color",), items=1, sites=("kv.*", "backbone.01"))
+    found = run_intervention(copy, asked, source, load=lambda *_: twin)
+    assert load_effects(copy, kind="attribution").to_csv() == found.to_csv()
+    assert {row.place for row in found.effects} == {"kv.*", "kv.00", "kv.01", "kv.02", "backbone.01"}
+    assert verdicts_of(copy) == before
+    assert found.certificate["edits"][f"{EXACT}|kv.02|image"]["fires"] > 0
+
+
+def test_a_family_without_gradients_is_refused_before_anything_is_loaded() -> None:
+    from probe_kit.hooks.registry import find_family
+
+    asked = AttributionPatching()
+    assert "gradients" in asked.required_capabilities
+    with pytest.raises(UnsupportedInterventionError, match=r"openvla does not support.*--kind interchange"):
+        find_family("openvla").check_intervention("gradients")
+
+
+def context(found: Measurement) -> TableContext:
+    return TableContext(found, "wired", {})
