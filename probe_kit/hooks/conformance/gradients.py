@@ -1,6 +1,7 @@
 """Checks of actions with a graph: they are the actions, and their gradients are central differences."""
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -76,7 +77,7 @@ def _difference(subject: PolicySubject, site: Site, direction: Tensor, step: flo
     """(metric at + step − metric at − step) / (2 · step)."""
     values = []
     for sign in (1.0, -1.0):
-        with edit(subject.policy, {site: lambda own, sign=sign: own + (sign * step * direction).to(own.dtype)}):
+        with edit(subject.policy, {site: partial(torch.add, sign * step * direction)}):
             values.append(float(_lateral(torch.from_numpy(subject.run(subject.one)).double())))
     return (values[0] - values[1]) / (2 * step)
 

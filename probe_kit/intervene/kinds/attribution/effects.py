@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hashing import derive_seed
-from probe_kit.intervene.edits.sites import ALL
+from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.edits.sites import ALL, RESIDUAL, PlaceName
 from probe_kit.intervene.kinds.base import Measurement
 from probe_kit.intervene.kinds.site_effects import LOCALISATION_SHARE
 from probe_kit.intervene.kinds.swap_shares import SwapShare, share_of_swap
@@ -17,6 +18,8 @@ from probe_kit.statistics.sign_flips import max_t
 
 EXACT, ESTIMATE = "exact", "estimate"
 """How the names of conditions begin: `exact|kv.02|image`."""
+EVERY_BLOCK = f"{KV_STREAM}.*"
+"""The anchor that is all of `kv`."""
 AGREEMENT = 3.0
 """Factor within which an anchor's estimate must lie of its exact effect."""
 
@@ -25,12 +28,12 @@ AGREEMENT = 3.0
 class AttributionEffect:
     """One cell in one category.
 
-    place, role: of its tokens. is_anchor: all of a place, patched exactly to test the screen. is_drawn: patched
+    place, role: of its tokens. is_anchor: a complete cut, patched exactly to test the screen. is_drawn: patched
     exactly although its estimate was not among the largest. estimate, exact: shares of the image swap with 95 %
     intervals by groups, None where the swap itself is not significant or no exact patch was made. p_fwe: of the
-    exact patch, one-sided, max-T over those of the category. rank: by estimate among the cells of its stream, 1
-    for the largest; None in a void screen. finding: of the screen of its stream: `anchored`, `void`, or `n/a`
-    where no anchor carries the effect.
+    exact patch, one-sided, max-T over those of the category. rank: by estimate among the cells of its kind, 1 for
+    the largest; None in a void screen. finding: of the category's screen: `anchored`, `void`, or `n/a` where no
+    anchor carries the effect.
     """
 
     category: str
@@ -55,9 +58,9 @@ class AttributionEffect:
         return f"{self.place} {self.role}"
 
     @property
-    def stream(self) -> str:
-        """Of its place."""
-        return self.place.partition(".")[0]
+    def kind(self) -> str:
+        """Of cells that are ordered among themselves."""
+        return "" if self.is_anchor else kind_of_place(self.place)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values."""
@@ -65,7 +68,7 @@ class AttributionEffect:
 
 
 def measured_attribution(measurement: Measurement) -> list[AttributionEffect]:
-    """By category and stream the anchors, then the cells: by rank, or as they lie in a void screen."""
+    """By category the anchors, then the cells of each kind: by rank, or as they lie in a void screen."""
     drawn = measurement.certificate.get(Anchored.ENTRY, {}).get("drawn", [])
     return [
         row
@@ -93,11 +96,7 @@ class Anchored:
         toward = np.array([-self.outcomes.correct_sign * self._moved(name) for name in exact])
         seed = derive_seed("sign flips", self.suite, self.category)
         p_fwe = dict(zip(exact, max_t(toward, self.outcomes.items, self.outcomes.groups, seed)[2], strict=True))
-        found: list[AttributionEffect] = []
-        for stream in dict.fromkeys(name.partition(".")[0] for name in names):
-            own = [self._row(name, p_fwe) for name in names if name.partition(".")[0] == stream]
-            found += _ordered(own)
-        return found
+        return _ordered([self._row(name, p_fwe) for name in names])
 
     def _row(self, name: str, p_fwe: Mapping[str, float]) -> AttributionEffect:
         place, _, role = name.partition("|")
@@ -147,12 +146,22 @@ def _agreement(row: AttributionEffect) -> float:
 
 
 def _ordered(rows: Sequence[AttributionEffect]) -> list[AttributionEffect]:
-    """Of one stream, with rank and finding."""
+    """Of one category, with rank and finding."""
     worst = worst_anchor(rows)
     finding = "n/a" if worst is None else "anchored" if _agreement(worst) * AGREEMENT >= 1 else "void"
-    anchors = [replace(row, finding=finding) for row in rows if row.is_anchor]
-    cells = [replace(row, finding=finding) for row in rows if not row.is_anchor]
-    if finding == "anchored":
-        cells = sorted(cells, key=lambda row: -abs(row.estimate or 0.0))
-        cells = [replace(row, rank=at + 1) for at, row in enumerate(cells)]
-    return anchors + cells
+    rows = [replace(row, finding=finding) for row in rows]
+    found = [row for row in rows if row.is_anchor]
+    for kind in dict.fromkeys(row.kind for row in rows if not row.is_anchor):
+        cells = [row for row in rows if row.kind == kind]
+        if finding == "anchored":
+            cells = sorted(cells, key=lambda row: -abs(row.estimate or 0.0))
+            cells = [replace(row, rank=at + 1) for at, row in enumerate(cells)]
+        found += cells
+    return found
+
+
+def kind_of_place(name: str) -> str:
+    """What a place can be compared with: `kv`, `backbone`, `backbone heads`, `expert iterations`."""
+    place = PlaceName.parse(name)
+    further = [place.quantity * (place.quantity != RESIDUAL), "iterations" * (place.iterations is not None)]
+    return " ".join(filter(None, (place.stream, *further)))

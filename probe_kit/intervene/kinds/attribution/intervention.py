@@ -13,7 +13,13 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.edits.sites import ALL, SiteGroup, resolve_sites, roles_of
-from probe_kit.intervene.kinds.attribution.effects import ESTIMATE, EXACT, Anchored
+from probe_kit.intervene.kinds.attribution.effects import (
+    ESTIMATE,
+    EVERY_BLOCK,
+    EXACT,
+    Anchored,
+    kind_of_place,
+)
 from probe_kit.intervene.kinds.attribution.screen import (
     ENDS,
     Ends,
@@ -36,7 +42,7 @@ from probe_kit.intervene.store.settings import FIRST_CHUNK, items_of
 
 SITES, ROLES = (f"{KV_STREAM}.*", "backbone.*"), ("image", "language", "state")
 TOP = 20
-"""Cells of each stream and category with the largest estimates, that are patched exactly; as many are drawn."""
+"""Cells of each kind and category with the largest estimates, that are patched exactly; as many are drawn."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +56,9 @@ class DrawnCells(CleanRun):
 class AttributionPatching(Intervention):
     """An estimate for every cell, from one backward pass per episode, and exact patches of some of them.
 
-    sites, roles: of the cells. ends: where gradients are taken, see `Ends`. top: cells of each stream with the
-    largest estimates that are patched exactly; controls: so many more, drawn from the rest with `seed`. All of
-    `kv`, and all tokens of every other place, are patched exactly too: these are the anchors.
+    sites, roles: of the cells. ends: where gradients are taken, see `Ends`. top: cells of each kind with the
+    largest estimates that are patched exactly; controls: so many more, drawn from the rest with `seed`. The
+    anchors are patched exactly too: all of `kv`, and all tokens of each layer of the backbone with a cell.
     """
 
     sites: tuple[str, ...] = SITES
@@ -147,18 +153,19 @@ class AttributionPatching(Intervention):
     def _chosen(
         self, cells: Sequence[Cell], shares: dict[str, NDArray[np.float64]], skipped: int
     ) -> tuple[list[Cell], list[Cell]]:
-        """Those with the largest estimates of any category, by stream, and those that are drawn from the rest."""
+        """Those with the largest estimates of any category, by kind, and those that are drawn from the rest."""
         top: list[Cell] = []
         drawn: list[Cell] = []
-        for stream in dict.fromkeys(cell.place.stream for cell in cells):
-            own = [at for at, cell in enumerate(cells) if cell.place.stream == stream]
+        kinds = [kind_of_place(cell.place.name) for cell in cells]
+        for kind in dict.fromkeys(kinds):
+            own = [at for at, other in enumerate(kinds) if other == kind]
             best = {
                 at
                 for values in shares.values()
                 for at in sorted(own, key=lambda at: -abs(values[skipped + at]))[: self.top]
             }
             rest = [at for at in own if at not in best]
-            draw = np.random.default_rng(derive_seed("attribution", self.seed, stream))
+            draw = np.random.default_rng(derive_seed("attribution", self.seed, kind))
             top += [cells[at] for at in sorted(best)]
             drawn += [cells[at] for at in sorted(draw.permutation(rest)[: self.controls].tolist())]
         return top, drawn
@@ -180,10 +187,13 @@ def name_of(part: str, cell: Cell) -> str:
 
 
 def _anchors(session: ReplaySession, places: Sequence[SiteGroup]) -> list[Cell]:
-    """All of `kv` if any of it is screened, and all tokens of every other place."""
-    whole = [Cell(place, ALL) for place in places if place.stream != KV_STREAM]
-    if any(place.stream == KV_STREAM for place in places):
+    """Complete cuts: all of `kv`, and all tokens of every layer of the backbone in which a place lies."""
+    streams = {name: stream for name, stream in session.policy.streams.items() if stream.part == "backbone"}
+    layers = [f"{place.stream}.{place.sites[0].layer:02d}" for place in places if place.stream in streams]
+    whole = [place for name in dict.fromkeys(layers) for place in resolve_sites(name, session.policy)]
+    if session.policy.prompt_kv is not None:
         blocks = resolve_sites(f"{KV_STREAM}.*", session.policy)
-        every = SiteGroup(f"{KV_STREAM}.*", tuple(site for block in blocks for site in block.sites))
-        whole.insert(0, Cell(every, ALL))
-    return whole
+        whole.insert(0, SiteGroup(EVERY_BLOCK, tuple(site for block in blocks for site in block.sites)))
+    elif not whole:
+        whole = resolve_sites(f"{next(iter(streams))}.00", session.policy)
+    return [Cell(place, ALL) for place in whole]

@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.intervene.edits.sites import SiteGroup
 from probe_kit.intervene.kinds.joint.cells import Cell
 from probe_kit.intervene.replay.conditions import ConditionContext, ConditionResult
 from probe_kit.intervene.replay.image_tokens import role_token_mask
 from probe_kit.intervene.replay.session import ReplayInput, ReplaySession
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from probe_kit.hooks import ActivationCache, Observation
 
 Ends = Literal["clean", "both"]
@@ -73,13 +76,21 @@ def estimate_patches(
         site: (source[site].float() - own[site].float())[0] * sum(one[site][0] for one in taken) / len(taken)
         for site in sites
     }
-    by_token = {site: one.sum(dim=-1).double().cpu().numpy() for site, one in products.items()}
     memo: dict[Any, Any] = {}
     found = np.zeros(len(cells))
     for at, cell in enumerate(cells):
         tokens = role_token_mask(session.policy, replay_input, cell.place.stream, cell.role, memo)
-        found[at] = sum(float(by_token[site][tokens].sum()) for site in cell.place.sites)
+        found[at] = sum(float(_of_head(products[site], cell.place)[tokens].sum()) for site in cell.place.sites)
     return EpisodeEstimates(replay_input.category, swapped - clean, found)
+
+
+def _of_head(product: "Tensor", place: SiteGroup) -> NDArray[np.float64]:
+    """(T, D) of all features, or of those of the place's head."""
+    if place.head is not None:
+        width = product.shape[-1] // place.heads
+        product = product[:, place.head * width : (place.head + 1) * width]
+    features: NDArray[np.float64] = product.double().cpu().numpy()
+    return features
 
 
 def shares_by_category(found: Sequence[EpisodeEstimates]) -> dict[str, NDArray[np.float64]]:

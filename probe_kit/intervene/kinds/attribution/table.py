@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
 
 _LEGEND = (
-    "estimate: share of the image swap by gradients; exact: with these tokens patched; anchor: all of a place, "
+    "estimate: share of the image swap by gradients; exact: with these tokens patched; anchor: a complete cut, "
     f"patched exactly; a screen that misses an anchor by more than a factor of {AGREEMENT:.0f} is void and shows "
     "no order; drawn: chosen at random from the rest; p: of the exact patch, max-T over those of the "
     "category; a screen enters no verdict"
@@ -24,7 +24,7 @@ def attribution_table(rows: Sequence[AttributionEffect], context: TableContext) 
     """One line per category and cell."""
     from probe_kit._terminal.responsive_table import Part, ResponsiveTable
 
-    void = [_void(own) for own in _screens(rows).values() if own[0].finding == "void"]
+    void = [f"{own[0].category}: {_void(own)}" for own in _by_category(rows).values() if own[0].finding == "void"]
     return ResponsiveTable(
         title="; ".join([f"Which places to patch? {context.subject}, gradients", *dict.fromkeys(void)]),
         caption=_LEGEND,
@@ -43,30 +43,34 @@ def attribution_table(rows: Sequence[AttributionEffect], context: TableContext) 
 
 def attribution_sentences(rows: Sequence[AttributionEffect], _: TableContext) -> list[str]:
     """One per category: whether the screen holds, and what it puts first."""
-    found: dict[str, list[str]] = {}
-    for (category, stream), own in _screens(rows).items():
-        found.setdefault(category, []).append(f"{stream}: {_finding(own)}")
-    return [f"{category_of(name).title}: {'; '.join(said)}." for name, said in found.items()]
+    return [f"{category_of(name).title}: {_finding(own)}." for name, own in _by_category(rows).items()]
 
 
-def _screens(rows: Sequence[AttributionEffect]) -> dict[tuple[str, str], list[AttributionEffect]]:
-    """By category and stream."""
-    found: dict[tuple[str, str], list[AttributionEffect]] = {}
+def _by_category(rows: Sequence[AttributionEffect]) -> dict[str, list[AttributionEffect]]:
+    found: dict[str, list[AttributionEffect]] = {}
     for row in rows:
-        found.setdefault((row.category, row.stream), []).append(row)
+        found.setdefault(row.category, []).append(row)
     return found
 
 
 def _finding(rows: Sequence[AttributionEffect]) -> str:
     worst = worst_anchor(rows)
     if worst is None:
-        return "the swap moves nothing through any of it, so that there is no order"
+        return "no anchor carries the effect of the image swap, so that there is no order"
     if worst.finding == "void":
         return f"{_void(rows)}; no order is shown"
-    named = [_named(row) for row in rows if row.rank is not None and row.rank <= NAMED]
+    firsts = [
+        _first([row for row in rows if row.kind == kind]) for kind in dict.fromkeys(row.kind for row in rows)
+    ]
     drawn = [abs(row.exact) for row in rows if row.is_drawn and row.exact is not None]
-    missed = f"; of {len(drawn)} drawn cells the largest exact effect is {max(drawn):.2f}" if drawn else ""
-    return f"{_compared(worst)}; first {', '.join(named)}{missed}"
+    missed = [f"of {len(drawn)} drawn cells the largest exact effect is {max(drawn):.2f}"] if drawn else []
+    return "; ".join([_compared(worst), *filter(None, firsts), *missed])
+
+
+def _first(rows: Sequence[AttributionEffect]) -> str:
+    """The largest estimates of one kind; empty for the anchors, which have no rank."""
+    named = [_named(row) for row in rows if row.rank is not None and row.rank <= NAMED]
+    return f"first of {rows[0].kind}: {', '.join(named)}" if named else ""
 
 
 def _void(rows: Sequence[AttributionEffect]) -> str:
@@ -87,7 +91,7 @@ def _named(row: AttributionEffect) -> str:
 def _cells(row: AttributionEffect) -> "tuple[Cell, ...]":
     from probe_kit._terminal.responsive_table import Cell
 
-    chosen = "anchor" if row.is_anchor else "drawn" if row.is_drawn else "top" if row.exact is not None else ""
+    chosen = "anchor" if row.is_anchor else "drawn" if row.is_drawn else "top" if row.p_fwe is not None else ""
     texts = (
         "–" if row.rank is None else str(row.rank), _share(row.estimate, row.estimate_ci),
         _share(row.exact, row.exact_ci), "–" if row.p_fwe is None else f"{row.p_fwe:.2g}", chosen,

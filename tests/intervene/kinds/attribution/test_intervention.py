@@ -18,7 +18,11 @@ from probe_kit.intervene import (
     load_effects,
     run_intervention,
 )
-from probe_kit.intervene.kinds.attribution.effects import EXACT, measured_attribution
+from probe_kit.intervene.kinds.attribution.effects import (
+    EXACT,
+    kind_of_place,
+    measured_attribution,
+)
 from probe_kit.intervene.kinds.attribution.table import attribution_sentences, attribution_table
 from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.results.results import verdicts_of
@@ -57,8 +61,8 @@ def test_what_is_read_linearly_is_ranked_first_and_its_estimate_is_the_effect(wi
     assert rows["backbone.01 language"].estimate == pytest.approx(1.0, abs=0.02)
     assert all(abs(row.estimate or 0) < 0.02 for row in rows.values() if row.place in ("kv.00", "kv.02"))
     (sentence,) = attribution_sentences(list(rows.values()), context(found))
-    assert sentence.startswith("Copied: kv: gradients give 1.0")
-    assert "first kv.01 language 1.0" in sentence
+    assert sentence.startswith("Copied: gradients give 1.0")
+    assert "; first of kv: kv.01 language 1.0" in sentence
 
 
 @pytest.mark.parametrize("name", ["blocks", "roles"])
@@ -66,14 +70,13 @@ def test_a_screen_is_void_where_a_decision_has_no_slope(wired: WiredSession, nam
     """All of `kv` carries everything, and no gradient shows it."""
     found = screened(wired, name)
     rows = measured_attribution(found)
-    kv = [row for row in rows if row.stream == "kv"]
-    assert {row.finding for row in kv} == {"void"}
-    assert {row.rank for row in kv} == {None}
-    assert (kv[0].name, kv[0].estimate) == ("kv.* all", 0.0)
-    assert kv[0].exact == pytest.approx(1.0, abs=0.02)
+    assert {row.finding for row in rows} == {"void"}
+    assert {row.rank for row in rows} == {None}
+    assert (rows[0].name, rows[0].estimate) == ("kv.* all", 0.0)
+    assert rows[0].exact == pytest.approx(1.0, abs=0.02)
     (sentence,) = attribution_sentences(rows, context(found))
     said = "screen void: gradients give 0.00 where the patch gives 1.00 (kv.* all)"
-    assert f"kv: {said}; no order is shown" in sentence
+    assert f"{said}; no order is shown" in sentence
     assert said in str(attribution_table(rows, context(found)).title)
 
 
@@ -95,6 +98,13 @@ def test_the_largest_estimates_and_drawn_cells_are_patched_exactly(wired: WiredS
     )
     (sentence,) = attribution_sentences(list(rows.values()), context(found))
     assert sentence.endswith("; of 2 drawn cells the largest exact effect is 0.00.")
+
+
+def test_cells_are_ordered_among_their_kind_alone() -> None:
+    names = ("kv.02", "kv.02.values", "backbone.01", "backbone.01.heads.3", "expert.03", "expert.03@4")
+    assert [kind_of_place(name) for name in names] == [
+        "kv", "kv values", "backbone", "backbone heads", "expert", "expert iterations",
+    ]  # fmt: skip
 
 
 def test_both_ends_are_the_mean_of_two_gradients(wired: WiredSession) -> None:
