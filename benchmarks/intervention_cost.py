@@ -1,4 +1,4 @@
-"""What changing streams costs: one inference plain, with one site changed, and with all of them.
+"""What changing streams costs: a clean inference, with one site changed, with joint places, and with gradients.
 
     python benchmarks/intervention_cost.py [--family pi0-tiny] [--pairs 200] [--device cpu]
 
@@ -7,9 +7,12 @@ is a clean inference and a changed one, in drawn order, one directly behind the 
 machine disturb both alike. Prints, per way, the median of the pairs' ratios of processor time with its 95 %
 bootstrap interval, and of the times themselves the ratio of medians and of lower fifths. The second plain way says
 what the measurement itself adds. Changes take tokens over from an inference before another picture, with a ledger.
+A joint condition patches the picture and the words of every block of `kv`. Gradients are of one number at all sites
+of backbone and `kv`: an inference with a graph, and a backward pass. The load of the machine is printed first.
 """
 
 import argparse
+import os
 import random
 import statistics
 import tempfile
@@ -20,9 +23,10 @@ from pathlib import Path
 import numpy as np
 from capture_subjects import LARGER, subject
 
-from probe_kit.hooks import Observation, Policy, Site, capture, load_policy
-from probe_kit.hooks.capturing.edit_engine import apply_patch
+from probe_kit.hooks import Observation, Policy, Site, capture, gradients_at, load_policy
+from probe_kit.hooks.capturing.edit_engine import apply_patch, apply_patches
 from probe_kit.hooks.capturing.token_edits import ReplaceWith, TokenSelection
+from probe_kit.hooks.contract.sites import KV
 
 EMBEDDED = "pi0-tiny"
 INSTRUCTION = "Put the cube on the red shape"
@@ -50,8 +54,9 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
     """By name, what is timed."""
     seen, other = observations()
     backbone, expert = (policy.streams[name].sites() for name in ("backbone", "expert"))
+    kv = [] if policy.prompt_kv is None else [site for name in KV for site in policy.prompt_kv.sites(name)]
     acting = [site for site in expert if site.layer == policy.streams["expert"].layers - 1]
-    with capture(policy, [*backbone, *acting]) as source:
+    with capture(policy, [*backbone, *acting, *kv]) as source:
         policy.infer_without_acting([other], [0])
     roles = policy.roles([seen])
 
@@ -66,12 +71,30 @@ def ways(policy: Policy) -> dict[str, Callable[[], object]]:
 
         return run
 
+    def joint() -> object:
+        own = policy.roles([seen])["backbone"][0]
+        cells = [TokenSelection.of(own.mask(role), policy.card.device) for role in ("image", "language")]
+        changes = {site: [(one, ReplaceWith(source, one.count)) for one in cells] for site in kv}
+        with apply_patches(policy, changes) as edit_log:
+            policy.infer_without_acting([seen], [0])
+        assert edit_log.fires == len(cells) * len(kv)
+        return edit_log
+
+    def slopes() -> object:
+        return gradients_at(policy, [seen], [0], [*backbone, *kv], lambda chunks: chunks[0, :, 1].sum())
+
+    further: dict[str, Callable[[], object]] = {}
+    if kv:
+        further[f"joint: 2 roles of {len(kv)} kv sites"] = joint
+    if policy.interventions.gradients and policy.embodiment_mismatch() is None:
+        further[f"gradients at {len(backbone) + len(kv)} sites"] = slopes
     return {
         "plain": lambda: policy.infer_without_acting([seen], [0]),
         "plain again": lambda: policy.infer_without_acting([seen], [0]),
         "one backbone site": changed(backbone[2:3]),
         f"all {len(backbone)} backbone sites": changed(backbone),
         f"expert's end, {len(acting)} iterations": changed(acting),
+        **further,
     }
 
 
@@ -84,6 +107,7 @@ def main() -> None:
     arguments = parser.parse_args()
     policy = policy_of(arguments.family, arguments.device)
     every, draw = ways(policy), random.Random(0)
+    print(f"load of the last minute: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     plain = every.pop("plain")
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in every}
     for pair in range(arguments.pairs + 2):
@@ -98,7 +122,7 @@ def main() -> None:
         own, other = (sorted(column) for column in zip(*found, strict=True))
         low, high = interval([changed / unchanged for changed, unchanged in found])
         print(
-            f"{name:26} {1000 * statistics.median(own):8.2f} ms  of plain: "
+            f"{name:30} {1000 * statistics.median(own):8.2f} ms  of plain: "
             f"{statistics.median(changed / unchanged for changed, unchanged in found):6.3f} "
             f"[{low:.3f}, {high:.3f}] median of {len(found)} pairs, "
             f"{statistics.median(own) / statistics.median(other):6.3f} medians, "
