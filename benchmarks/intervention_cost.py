@@ -7,8 +7,8 @@ is a clean inference and a changed one, in drawn order, one directly behind the 
 machine disturb both alike. Prints, per way, the median of the pairs' ratios of processor time with its 95 %
 bootstrap interval, and of the times themselves the ratio of medians and of lower fifths. The second plain way says
 what the measurement itself adds. Changes take tokens over from an inference before another picture, with a ledger.
-A joint condition patches the picture and the words of every block of `kv`. Gradients are of one number at all sites
-of backbone and `kv`: an inference with a graph, and a backward pass. The load of the machine is printed first.
+A joint condition patches the picture and the words of every block of `kv`. Gradients are of one number at all
+sites of backbone and `kv`: an inference with a graph, and a backward pass. The machine's load is printed first.
 """
 
 import argparse

@@ -80,12 +80,12 @@ def _void(rows: Sequence[AttributionEffect]) -> str:
 
 
 def _compared(anchor: AttributionEffect) -> str:
-    return f"gradients give {anchor.estimate:.2f} where the patch gives {anchor.exact:.2f} ({anchor.name})"
+    return f"gradients give {_two(anchor.estimate)} where the patch gives {_two(anchor.exact)} ({anchor.name})"
 
 
 def _named(row: AttributionEffect) -> str:
-    exact = "" if row.exact is None else f", exact {row.exact:.2f}"
-    return f"{row.name} {row.estimate:.2f}{exact}"
+    exact = "" if row.exact is None else f", exact {_two(row.exact)}"
+    return f"{row.name} {_two(row.estimate)}{exact}"
 
 
 def _cells(row: AttributionEffect) -> "tuple[Cell, ...]":
@@ -102,4 +102,9 @@ def _cells(row: AttributionEffect) -> "tuple[Cell, ...]":
 def _share(value: float | None, limits: tuple[float, float] | None) -> str:
     if value is None or limits is None:
         return "–"
-    return f"{value:.2f} [{limits[0]:.2f}, {limits[1]:.2f}]"
+    return f"{_two(value)} [{_two(limits[0])}, {_two(limits[1])}]"
+
+
+def _two(value: float | None) -> str:
+    """Two digits, and zero without a sign."""
+    return "–" if value is None else f"{round(value, 2) + 0.0:.2f}"
