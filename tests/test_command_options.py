@@ -35,7 +35,18 @@ from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
 from probe_kit.suite.generators.couples import SUITE_VERSIONS, SuiteVersion
 from probe_kit.suite.ladder import WORDINGS, Wording
-from probe_kit.train.choices import BASELINES, INCOMPLETE, TARGETS, Baseline, Incomplete, Target
+from probe_kit.train.choices import (
+    BASELINES,
+    INCOMPLETE,
+    LABEL_CONTROLS,
+    TARGETS,
+    TASKS,
+    Baseline,
+    Incomplete,
+    LabelControl,
+    Target,
+    Task,
+)  # fmt: skip
 
 LEAVES: dict[str, Any] = dict(commands_of(typer.main.get_command(app), None))
 MOST_LINES = 100
@@ -58,10 +69,10 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("ask", "--frames"): get_args(FrameChoice),
     ("ask", "--picture"): get_args(Picture),
     ("ask", "--query"): QUERIES,
-    ("train", "--target"): TARGETS,
+    ("train", "--task"): TASKS,
     ("train", "--folds"): FOLD_UNITS,
     ("train", "--incomplete"): INCOMPLETE,
-    ("train", "--controls"): BASELINES,
+    ("train", "--controls"): BASELINES | LABEL_CONTROLS,
     ("intervene", "--kind"): KINDS,
     ("intervene", "--readout"): get_args(Readout),
     ("intervene", "--format"): get_args(get_args(Format)[0]),
@@ -123,7 +134,8 @@ def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> No
 @pytest.mark.parametrize(
     ("names", "declared"),
     [
-        (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Target, TARGETS),
+        (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Target, TARGETS), (Task, TASKS),
+        (LabelControl, LABEL_CONTROLS),
         (Incomplete, INCOMPLETE), (Baseline, BASELINES), (FoldUnit, FOLD_UNITS), (Wording, WORDINGS),
         (SuiteVersion, SUITE_VERSIONS), (ExportFormat, WRITERS), (RuleName, RULES), (AnswerScore, SCORES),
     ],

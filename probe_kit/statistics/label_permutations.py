@@ -6,7 +6,9 @@ class, because a probe that names the larger class is no signal. Under "the answ
 label permutation is as likely as the real labels, which makes the p-values exact.
 """
 
-from itertools import groupby
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from itertools import groupby, islice, permutations, product
+from math import factorial, prod
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -110,6 +112,66 @@ def _shapes(groups: ArrayLike, items: ArrayLike, layouts: ArrayLike) -> list[tup
         episodes = [of_group[item][layout] for present, item in ordered for layout in present]
         found.append((tuple(present for present, _ in ordered), episodes))
     return found
+
+
+Positions = NDArray[np.intp]
+
+ENUMERATED = factorial(6)
+"""Up to so many exchanges, those of six groups, all are made."""
+
+
+def exchange_blocks(
+    blocks: Mapping[str, Positions], kinds: Mapping[str, Hashable], count: int, seed: int
+) -> Positions:
+    """(n, P) the sample whose label each of n samples has in P exchanges of groups, never the real labelling.
+
+    blocks: by group, its samples in an order that corresponds between groups; together 0 … n − 1. kinds: by group,
+    what it must have in common with the groups with which it exchanges, so also the number of samples. With up to
+    six groups, or whenever there are no more than `count` exchanges, these are all; else `count` different ones.
+    """
+    size = sum(len(block) for block in blocks.values())
+    families = _families(blocks, kinds)
+    orders: Iterator[tuple[tuple[int, ...], ...]]
+    possible = prod(factorial(len(family)) for family in families)
+    if count == 0 or possible == 1:
+        return np.empty((size, 0), np.intp)
+    if possible <= max(ENUMERATED, count + 1):
+        orders = islice(product(*(permutations(range(len(family))) for family in families)), 1, None)
+    else:
+        orders = _drawn([len(family) for family in families], count, np.random.default_rng(seed))
+    columns = []
+    for order in orders:
+        source = np.arange(size)
+        for family, own in zip(families, order, strict=True):
+            source[family.ravel()] = family[list(own)].ravel()
+        columns.append(source)
+    return np.stack(columns, axis=1)
+
+
+def movable_share(blocks: Mapping[str, Positions], kinds: Mapping[str, Hashable]) -> float:
+    """Share of the samples whose group has another one of its kind to exchange with."""
+    moving = sum(family.size for family in _families(blocks, kinds) if len(family) > 1)
+    return moving / sum(len(block) for block in blocks.values())
+
+
+def _families(blocks: Mapping[str, Positions], kinds: Mapping[str, Hashable]) -> list[Positions]:
+    """(groups, samples) of the groups of every kind."""
+    families: dict[Hashable, list[Positions]] = {}
+    for group, block in blocks.items():
+        families.setdefault(kinds[group], []).append(block)
+    return [np.stack(family) for family in families.values()]
+
+
+def _drawn(
+    sizes: Sequence[int], count: int, generator: np.random.Generator
+) -> Iterator[tuple[tuple[int, ...], ...]]:
+    """`count` different orders of families, none of them the identity; there are more than `count`."""
+    seen = {tuple(tuple(range(size)) for size in sizes)}
+    while len(seen) <= count:
+        order = tuple(tuple(generator.permutation(size).tolist()) for size in sizes)
+        if order not in seen:
+            seen.add(order)
+            yield order
 
 
 def possible_flips(groups: int) -> int:

@@ -10,12 +10,14 @@ Matrix = NDArray[np.float64]
 DRAWS = 999
 
 
-def better_than_reference(correct: NDArray[np.bool_], reference: Matrix, groups: ArrayLike, seed: int) -> Matrix:
-    """Family-wise p (S,) of every site against one control: is its accuracy higher?
+def better_than_reference(
+    correct: NDArray[np.bool_] | Matrix, reference: Matrix, groups: ArrayLike, seed: int
+) -> Matrix:
+    """Family-wise p (S,) of every site against one control: is its mean score higher?
 
-    correct: (S, E). reference: (E,) what the control scores in each episode. groups: (E,). If a site is no better,
-    a group is as likely to favour it as to oppose it: the signs of the groups' differences are drawn anew, the
-    same for all sites, and the largest of them counts.
+    correct: (S, E) scores, such as whether a decision is right. reference: (E,) what the control scores in each
+    episode. groups: (E,). If a site is no better, a group is as likely to favour it as to oppose it: the signs of
+    the groups' differences are drawn anew, the same for all sites, and the largest of them counts.
     """
     gain = _group_sums(correct - reference, groups)
     signs = np.where(np.random.default_rng(seed).random((gain.shape[1], DRAWS)) < 0.5, -1.0, 1.0)

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from probe_kit.train.choices import BASELINES, INCOMPLETE, TARGETS, Baseline, Incomplete, Target
     from probe_kit.train.data.array_run import ArrayRun
     from probe_kit.train.data.run_reader import RunReader
+    from probe_kit.train.labels.label_results import LabelCurve, LabelResults
+    from probe_kit.train.labels.label_store import load_label_results
     from probe_kit.train.labels.labels import Labels
     from probe_kit.train.probe_sweep import Progress, train_probes
     from probe_kit.train.results.by_call import load_results_by_call
@@ -35,6 +37,8 @@ __all__ = [
     "Direction",
     "FoldUnit",
     "Incomplete",
+    "LabelCurve",
+    "LabelResults",
     "Labels",
     "ProbeCurve",
     "ProbeResults",
@@ -43,6 +47,7 @@ __all__ = [
     "RunReader",
     "Target",
     "UntrainedScore",
+    "load_label_results",
     "load_results",
     "load_results_by_call",
     "save_results",
@@ -65,7 +70,10 @@ __getattr__, __dir__ = lazy_names(
         "FoldUnit": "probe_kit.statistics.folds",
         "INCOMPLETE": "choices",
         "Incomplete": "choices",
+        "LabelCurve": "labels.label_results",
+        "LabelResults": "labels.label_results",
         "Labels": "labels.labels",
+        "load_label_results": "labels.label_store",
         "ProbeResults": "results.probe_results",
         "ProbeSettings": "settings",
         "Progress": "probe_sweep",

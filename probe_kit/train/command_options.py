@@ -8,8 +8,9 @@ import typer
 
 from probe_kit._terminal.options import LISTED, NAMED, Names, choices, some_of, speed_option
 from probe_kit.statistics.folds import FoldUnit
-from probe_kit.train.choices import BASELINES, Incomplete, Target
+from probe_kit.train.choices import BASELINES, LABEL_CONTROLS, Incomplete, Task
 
+_label_option = partial(typer.Option, rich_help_panel="Labels of your own")
 _control_option = partial(typer.Option, rich_help_panel="Controls")
 _statistics_option = partial(typer.Option, rich_help_panel="Statistics")
 MOST_PERMUTATIONS = 1_000_000
@@ -32,11 +33,13 @@ Views = Annotated[
     ),
 ]
 ProbeTarget = Annotated[
-    Target,
+    str,
     typer.Option(
         "--target",
+        metavar="NAME",
         help="Label to decode. correct: side of the correct picture. chosen: side where the cube was placed. "
-        "shuffled: correct side, flipped for half of the items, as a control.",
+        "shuffled: correct side, flipped for half of the items. Or a column of --labels, or a built-in column "
+        "such as sim.tool_y or item.named; `probe-kit labels RUN` lists them.",
     ),
 ]
 Calls = Annotated[
@@ -49,16 +52,60 @@ Calls = Annotated[
     ),
 ]
 
+# -- labels of one's own -------------------------------------------------------------------------------------
+
+LabelFile = Annotated[
+    Path | None,
+    _label_option(
+        "--labels",
+        metavar="FILE",
+        help="CSV or Parquet file with a column to decode, by episode_id and, where wanted, inference. Start from "
+        "`probe-kit labels RUN`.",
+    ),
+]
+LabelTask = Annotated[
+    Task | None,
+    _label_option(
+        "--task",
+        help="binary: one of two values. classes: one of several. continuous: a quantity, scored by R². Default: "
+        "what the values allow; few integers need it.",
+    ),
+]
+GroupBy = Annotated[
+    str | None,
+    _label_option(
+        "--group-by",
+        metavar="COLUMN",
+        help="Column of what depends on each other: folds, intervals and p-values keep it together. Default: "
+        "items that share a picture.",
+    ),
+]
+ExchangeWithin = Annotated[
+    str | None,
+    _label_option(
+        "--exchange-within",
+        metavar="COLUMN",
+        help="Column within which p-values exchange the labels of groups, such as category. Default: everywhere.",
+    ),
+]
+Window = Annotated[
+    int | None,
+    _label_option(
+        "--window",
+        help="With a label per inference: inferences per episode. Default: what 90 % of the episodes reach.",
+    ),
+]
+
 # -- controls -----------------------------------------------------------------------------------------------
 
 Controls = Annotated[
     Names | None,
     _control_option(
         "--controls",
-        parser=some_of(BASELINES, none="none"),
-        metavar=f"{choices(BASELINES)},…",
+        parser=some_of({**BASELINES, **LABEL_CONTROLS}, none="none"),
+        metavar=f"{choices({**BASELINES, **LABEL_CONTROLS})},…",
         help="Baselines that never see the model, comma-separated, or none. Default: random-features, if the "
-        "pictures of the suite are available.",
+        "pictures of the suite are available. Labels of your own have step and state, not position. Default: all.",
     ),
 ]
 Untrained = Annotated[

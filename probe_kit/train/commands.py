@@ -13,7 +13,7 @@ from probe_kit.train import command_options as own
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from probe_kit.train import Baseline, ProbeResults, RunReader
+    from probe_kit.train import Baseline, ProbeResults, RunReader, Target
     from probe_kit.train.results.inventory import Inventory, StoredProbes
 
 
@@ -22,6 +22,11 @@ def train(
     categories: own.Categories = None,
     views: own.Views = own.MEAN,
     target: own.ProbeTarget = "correct",
+    labels: own.LabelFile = None,
+    task: own.LabelTask = None,
+    group_by: own.GroupBy = None,
+    exchange_within: own.ExchangeWithin = None,
+    window: own.Window = None,
     wording: common.Wording = None,
     call: own.Calls = "0",
     seed: common.Seed = 0,
@@ -41,13 +46,35 @@ def train(
     """Fit linear probes at every site and store their scores in the run.
 
     Cross-validation is nested and grouped; p-values come from permuted labels. Stored results of the same settings
-    are loaded, not fitted again.
+    are loaded, not fitted again. To decode a label of your own, give its table and column:
+    `probe-kit train RUN --labels labels.csv --target drawer --task classes`.
     """
     from probe_kit.extract import open_run
     from probe_kit.train import train_probes
+    from probe_kit.train.label_commands import (
+        ColumnOptions,
+        check_no_others,
+        print_label_results,
+        train_on_column,
+    )  # fmt: skip
     from probe_kit.train.results.best_sites import best_sites_sentences, best_sites_table
 
+    column = ColumnOptions.of(target, labels, task, group_by, exchange_within, window)
     opened = open_run(run, allow_partial=partial).in_wording(wording)
+    if column is not None:
+        options = {
+            "views": views,
+            "permutations": permutations,
+            "seed": seed,
+            "jobs": jobs,
+            "ray": ray,
+            "suite": suite,
+        }
+        refused = {"--folds": folds != "groups", "--incomplete": incomplete != "keep", "--untrained": untrained}
+        check_no_others({**refused, "--device": device})
+        results = train_on_column(opened, column, categories, call, controls, window, options)
+        print_label_results(results, details)
+        return
     control = None if untrained is None else open_run(untrained, allow_partial=partial).in_wording(wording)
     left_out: dict[int, Exception] = {}
     fitted: list[ProbeResults] = []
@@ -60,7 +87,7 @@ def train(
                     views,
                     permutations=permutations,
                     token_permutations=token_permutations,
-                    target=target,
+                    target=cast("Target", target),
                     call=number,
                     folds=folds,
                     incomplete=incomplete,
@@ -129,6 +156,7 @@ def facts_table(found: "Inventory", further: Mapping[str, str]) -> "Table":
 _STATES = {
     "used": "what `probe-kit retention` reads: the probes asked for last",
     "other": "read with --probes RUN=KEY",
+    "label": "of a label of your own, read with `load_label_results` in Python",
     "other episodes": "of other episodes than the run has now",
     "other version": "written by another version of probe_kit, which this one cannot read",
 }
@@ -144,7 +172,7 @@ def _probes_in_words(probes: "StoredProbes", found: "Inventory") -> str:
     parts += [f"seed {probes.seed}"]
     parts += [f"captured inference {probes.call}"] * (probes.call > 0)
     parts += [f"wording {probes.wording}"] * bool(probes.wording)
-    parts += [f"only {', '.join(probes.categories)}"] * (probes.categories != found.categories)
+    parts += [f"only {', '.join(probes.categories)}"] * (probes.categories not in ((), found.categories))
     parts += [f"controls {', '.join(probes.controls)}"] * bool(probes.controls)
     return "; ".join([*parts, fitted])
 

@@ -1,13 +1,19 @@
-"""`probe-kit labels`: a table with the keys of a run, to be extended by label columns."""
+"""`probe-kit labels`, and `probe-kit train` for a label of one's own."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import marked, out, say
+from probe_kit._terminal.console import counter, marked, out, progress, say
 from probe_kit.errors import UsageError
+from probe_kit.train.choices import TARGETS, Task
+
+if TYPE_CHECKING:
+    from probe_kit.train import LabelResults, RunReader
 
 
 def labels(
@@ -46,3 +52,98 @@ def labels(
     if reason := why_no_sim(opened):
         say(marked("[yellow]no sim.* columns:[/] {}", reason))
     say(marked("next: add a column, then [bold]probe-kit train {} --labels {} --target COLUMN[/]", run, out_file))
+
+
+@dataclass(frozen=True)
+class ColumnOptions:
+    """Options of `train` that name a label column, of a table or built in."""
+
+    target: str
+    file: Path | None
+    task: Task | None
+    group_by: str | None
+    exchange_within: str | None
+
+    @classmethod
+    def of(
+        cls,
+        target: str,
+        file: Path | None,
+        task: Task | None,
+        group_by: str | None,
+        exchange_within: str | None,
+        window: int | None,
+    ) -> "ColumnOptions | None":
+        """The options; None where `target` is a side. Raises UsageError for a target that nothing names."""
+        from probe_kit.train.labels.builtin_columns import ITEM, SIM, builtin_names
+
+        if file is None and target in TARGETS:
+            further = {"--task": task, "--group-by": group_by, "--exchange-within": exchange_within}
+            given = [name for name, value in {**further, "--window": window}.items() if value is not None]
+            if given:
+                raise UsageError(
+                    f"{given[0]} is for labels of your own; give --labels FILE and --target COLUMN too"
+                )
+            return None
+        if file is None and not target.startswith((SIM, ITEM)):
+            sides = ", ".join(map(repr, TARGETS))
+            raise UsageError(
+                f"--target {target!r} is not one of {sides}, nor a built-in column ({', '.join(builtin_names())})."
+                " Give the table of another column with --labels FILE"
+            )
+        if file is not None and target in TARGETS:
+            raise UsageError(
+                f"--target {target} is a side, and --labels {file} is given. Name a column of the table with "
+                "--target; rename the column if it is called so"
+            )
+        return cls(target, file, task, group_by, exchange_within)
+
+
+def check_no_others(given: Mapping[str, Any]) -> None:
+    """Raise UsageError for an option that probes of a label do not have. given: options, with whether they are."""
+    if wrong := [name for name, value in given.items() if value]:
+        raise UsageError(f"{wrong[0]} is not for labels of your own; leave it out")
+
+
+def train_on_column(
+    run: "RunReader",
+    column: ColumnOptions,
+    categories: Any,
+    call: str,
+    controls: Any,
+    window: int | None,
+    options: Mapping[str, Any],
+) -> "LabelResults":
+    """Probe `run` for a label column, with a progress bar; see `train_probes`."""
+    from probe_kit.train import Labels, train_probes
+
+    if not call.isdecimal():
+        raise UsageError(
+            f"--call {call!r} with a label of your own; expected one number. Use --window for several"
+        )
+    further = column.task, column.group_by, column.exchange_within
+    if column.file is None:
+        labels = Labels.of_run(run, column.target, *further)
+    else:
+        labels = Labels.read(column.file, column.target, *further)
+    with progress() as bar:
+        return train_probes(
+            run,
+            categories,
+            labels=labels,
+            call=int(call),
+            window=window,
+            controls=controls,
+            progress=counter(bar, "sites"),
+            **options,
+        )
+
+
+def print_label_results(results: "LabelResults", details: bool) -> None:
+    """The table and the sentences of probes of a label."""
+    from probe_kit.train.labels.label_summary import label_sentences, label_table
+
+    out.print(label_table(results, splits=details))
+    for sentence in label_sentences(results):
+        out.print(sentence, markup=False, highlight=False)
+    say(marked("next: [bold]load_label_results(run, {!r})[/] in Python gives every site as a frame", results.key))

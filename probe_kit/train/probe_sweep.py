@@ -3,14 +3,14 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, overload
 
 import numpy as np
 
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
 from probe_kit.statistics.folds import FoldUnit
-from probe_kit.train.choices import Baseline, Incomplete, Target
+from probe_kit.train.choices import Baseline, Incomplete, LabelControl, Target
 from probe_kit.train.controls.fit_controls import add_baselines, add_untrained, check_untrained, prepare_baselines
 from probe_kit.train.crossval.category_problem import POOLED, CategoryProblem, category_problem
 from probe_kit.train.data.captured_call import restrict_to_call
@@ -18,6 +18,9 @@ from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import is_token_view, read_samples, sites_of
 from probe_kit.train.execution.dispatch import probe_columns
 from probe_kit.train.execution.executor import ExecutionSettings, Key, Probed
+from probe_kit.train.labels.label_results import LabelResults
+from probe_kit.train.labels.label_sweep import train_label_probes
+from probe_kit.train.labels.labels import Labels
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_directions import Direction
 from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
@@ -30,6 +33,26 @@ Progress = Callable[[int, int, str], None]
 """Called with (sites done, sites in all, what was just done)."""
 
 
+@overload
+def train_probes(
+    run: RunReader,
+    categories: Sequence[str] | None = None,
+    views: Sequence[str] = ("mean",),
+    *,
+    labels: Labels,
+    window: int | None = None,
+    permutations: int = 200,
+    call: int = 0,
+    controls: Sequence[LabelControl] | None = None,
+    suite: Path | None = None,
+    seed: int = 0,
+    jobs: int | None = None,
+    ray: str | None = None,
+    progress: Progress | None = None,
+) -> LabelResults: ...
+
+
+@overload
 def train_probes(
     run: RunReader,
     categories: Sequence[str] | None = None,
@@ -38,6 +61,7 @@ def train_probes(
     permutations: int = 200,
     token_permutations: int = 59,
     target: Target = "correct",
+    labels: None = None,
     call: int = 0,
     folds: FoldUnit = "groups",
     incomplete: Incomplete = "keep",
@@ -49,7 +73,31 @@ def train_probes(
     device: str | None = None,
     ray: str | None = None,
     progress: Progress | None = None,
-) -> ProbeResults:
+) -> ProbeResults: ...
+
+
+def train_probes(
+    run: RunReader,
+    categories: Sequence[str] | None = None,
+    views: Sequence[str] = ("mean",),
+    *,
+    permutations: int = 200,
+    token_permutations: int = 59,
+    target: Target = "correct",
+    labels: Labels | None = None,
+    window: int | None = None,
+    call: int = 0,
+    folds: FoldUnit = "groups",
+    incomplete: Incomplete = "keep",
+    controls: Sequence[Baseline] | Sequence[LabelControl] | None = None,
+    suite: Path | None = None,
+    untrained: RunReader | None = None,
+    seed: int = 0,
+    jobs: int | None = None,
+    device: str | None = None,
+    ray: str | None = None,
+    progress: Progress | None = None,
+) -> ProbeResults | LabelResults:
     """Probe every site of every stream for `target`, per category and view, and store the results in the run.
 
     categories: each one by default; `all` pools every episode of the run. views: pooled ones, and `tokens` or
@@ -67,6 +115,10 @@ def train_probes(
     without one. ray: address of a Ray cluster that probes, `auto` for the one this process belongs to or a new
     one on this machine; `jobs` is then how many sites at once, by default as many as it has cores.
 
+    labels: a label of one's own, see `Labels`, instead of `target`. Its categories are probed together, as
+    `window`, `controls` and pooled views of `train_label_probes` have it, and the results are a `LabelResults`.
+    `target`, `folds`, `incomplete`, `untrained` and `device` are then left out.
+
     progress: by default a bar in a notebook, nothing elsewhere.
 
     With the same settings and episodes the stored results are returned, whatever jobs and device; an
@@ -78,6 +130,25 @@ def train_probes(
     asked for and whose pictures cannot be found.
     """
     _check_options(views, permutations, token_permutations, jobs, device, ray)
+    if labels is not None:
+        _check_label_options(target, folds, incomplete, untrained, device)
+        return train_label_probes(
+            run,
+            labels,
+            categories,
+            views,
+            window=window,
+            permutations=permutations,
+            call=call,
+            controls=controls,
+            suite=suite,
+            seed=seed,
+            jobs=jobs,
+            ray=ray,
+            progress=progress,
+        )
+    if window is not None:
+        raise UsageError(f"window={window} without labels; it needs labels of single inferences")
     crew = ExecutionSettings(jobs, device, ray)
     if len(run.episodes) == 0:
         raise RunIncompleteError(f"{run.location} has no finished episode to probe. Finish it first")
@@ -87,7 +158,7 @@ def train_probes(
         run, categories, views, target, folds, incomplete, permutations, token_permutations, seed, call
     )
     sweep = _Sweep.of(run, asked, crew, progress)
-    prepared = prepare_baselines(run, controls, suite, sweep.stored)
+    prepared = prepare_baselines(run, cast("Sequence[Baseline] | None", controls), suite, sweep.stored)
     beside = None
     if untrained is not None:
         untrained = restrict_to_call(untrained, call)
@@ -135,6 +206,21 @@ def _check_options(
         )
     if not views or len(set(views)) < len(views):
         raise UsageError(f"views {', '.join(views) or 'none'}; expected one or more, each once, such as mean")
+
+
+def _check_label_options(
+    target: Target, folds: FoldUnit, incomplete: Incomplete, untrained: RunReader | None, device: str | None
+) -> None:
+    """Raise UsageError for options that probes of a label do not have."""
+    given = {
+        "target": target != "correct",
+        "folds": folds != "groups",
+        "incomplete": incomplete != "keep",
+        "untrained": untrained is not None,
+        "device": device is not None,
+    }
+    if wrong := [name for name, other in given.items() if other]:
+        raise UsageError(f"{' and '.join(wrong)} with labels; expected neither. Leave out {' and '.join(wrong)}")
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ its features hold products of both. Any random nonlinear layer does. The control
 site it is compared with, on the tiles and the words alone; a model that knows more than that must be better.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -47,11 +47,16 @@ class RandomFeatureInputs:
 
     def layer(self, rows: NDArray[np.intp], width: int, seed: int) -> Features:
         """(N, width) outputs of a random tanh layer, to which pictures and words give equal shares."""
-        generator = np.random.default_rng(seed)
-        parts = (_standardised(part[rows]) for part in (self.pixels, self.words))
-        mixed = [part @ generator.standard_normal((part.shape[1], width)) / part.shape[1] ** 0.5 for part in parts]
-        outputs: Features = np.tanh(mixed[0] + mixed[1]).astype(np.float32)
-        return outputs
+        return random_layer([self.pixels[rows], self.words[rows]], width, seed)
+
+
+def random_layer(parts: Sequence[Features], width: int, seed: int) -> Features:
+    """(N, width) outputs of a random tanh layer, to which every part (N, D) gives an equal share."""
+    generator = np.random.default_rng(seed)
+    varying = [_standardised(part) for part in parts]
+    mixed = [part @ generator.standard_normal((part.shape[1], width)) / part.shape[1] ** 0.5 for part in varying]
+    outputs: Features = np.tanh(sum(mixed)).astype(np.float32)
+    return outputs
 
 
 def random_feature_scores(

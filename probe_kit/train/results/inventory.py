@@ -7,6 +7,7 @@ from typing import Any
 from probe_kit.errors import NoProbesError
 from probe_kit.extract.store.format.bundles import Bundle
 from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.probe_results import episodes_sha256
 from probe_kit.train.results.resume import unfinished_sweeps
 from probe_kit.train.results.store import (
     is_current,
@@ -16,6 +17,7 @@ from probe_kit.train.results.store import (
     read_probes,
     settings_of,
 )
+from probe_kit.train.settings import LABEL_FORMAT
 
 
 @dataclass(frozen=True)
@@ -23,9 +25,9 @@ class StoredProbes:
     """One set of probe results, or what is known of a set written by another version.
 
     created: when they were fitted. controls: baselines and, last, `untrained: NAME`. state: `used` if `retention`
-    reads them by default, `other` if it does so for their key, `other episodes` if the run has others by now,
-    `other version` if this version cannot read them. wording: which one of the run's they are of, empty where the
-    run is in its items' own words.
+    reads them by default, `other` if it does so for their key, `label` if they are of a label of one's own,
+    `other episodes` if the run has others by now, `other version` if this version cannot read them. wording: which
+    one of the run's they are of, empty where the run is in its items' own words.
     """
 
     key: str
@@ -112,6 +114,8 @@ def _used(run: RunReader) -> str | None:
 
 def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str | None]) -> StoredProbes:
     key, created = bundle.key, bundle.times.get("created", "")
+    if bundle.head["settings"].get("format") == LABEL_FORMAT:
+        return _of_label(readers, bundle, created)
     if not is_ours(bundle):
         return StoredProbes(key, "other version", created)
     settings = settings_of(bundle)
@@ -131,6 +135,23 @@ def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str |
         call=settings.call,
         controls=_controls(bundle),
         wording=wording or "",
+    )
+
+
+def _of_label(readers: Sequence[RunReader], bundle: Bundle, created: str) -> StoredProbes:
+    """Probes of a label of one's own, of which no settings are read but those that are listed."""
+    own = bundle.head["settings"]
+    of = [(run.settings_sha256, episodes_sha256(run)) for run in readers]
+    current = (own.get("run_settings"), own.get("episodes")) in of
+    return StoredProbes(
+        key=bundle.key,
+        state="label" if current else "other episodes",
+        created=created,
+        target=f"{own['target']} ({own['task']})",
+        views=tuple(own["views"]),
+        permutations=own["permutations"],
+        seed=own["seed"],
+        call=own["call"],
     )
 
 

@@ -1,0 +1,195 @@
+"""Controls of a label: the same probe on step, state, instruction, pictures, or random features."""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import SuiteNotFoundError, UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.statistics.label_permutations import pointwise_p
+from probe_kit.statistics.paired_bootstrap import better_than_reference
+from probe_kit.train.choices import LABEL_CONTROLS
+from probe_kit.train.choices import LabelControl as Name
+from probe_kit.train.controls.baselines import THUMBNAIL, Features, tile_pixels, word_counts
+from probe_kit.train.controls.random_features import LAYERS, SIDE, random_layer
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_suite import suite_of
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.labels.builtin_columns import frames_of_inferences, why_no_sim
+from probe_kit.train.labels.label_probe import LabelProbe
+from probe_kit.train.labels.label_problem import LabelProblem
+from probe_kit.train.labels.label_results import (
+    LabelComparison,
+    LabelControl,
+    LabelControls,
+    LabelResults,
+    score_interval,
+)
+from probe_kit.train.labels.labelled_samples import LabelledSamples
+
+if TYPE_CHECKING:
+    from probe_kit.suite import Suite
+
+RANDOM: Name = "random-features"
+PICTURED: frozenset[Name] = frozenset({"pixels", "random-features"})
+MOST_BINS = 50
+"""Columns that the step has at most."""
+Matrix = NDArray[np.float64]
+
+
+class ControlInputs:
+    """What controls are made of. suite: None where no control needs pictures."""
+
+    def __init__(self, run: RunReader, samples: LabelledSamples, suite: "Suite | None") -> None:
+        self.run, self.samples, self.suite = run, samples, suite
+
+    def features(self, name: Name) -> Features:
+        """(n, D) features of a control but `random-features`. Raises UsageError where the run lacks them."""
+        if name == "step":
+            return step_features(self.samples)
+        if name == "state":
+            return state_features(self.run, self.samples)
+        if name == "instruction":
+            return word_counts(self.run)[self.samples.rows]
+        return self._pixels(THUMBNAIL)
+
+    def layer(self, width: int, seed: int) -> Features:
+        """(n, width) of a random tanh layer on pictures, words and, where there is one, state."""
+        parts = [self._pixels(SIDE), self.features("instruction")]
+        if why_no_sim(self.run) is None:
+            parts.append(self.features("state"))
+        return random_layer(parts, width, seed)
+
+    def _pixels(self, side: int) -> Features:
+        assert self.suite is not None, "what needs pictures is given them"
+        rows, place = np.unique(self.samples.rows, return_inverse=True)
+        return tile_pixels(self.run.episodes.iloc[rows], self.suite, side)[place]
+
+
+def step_features(samples: LabelledSamples) -> Features:
+    """(n, at most 50): which part of the window an inference is in, one-hot."""
+    bins = min(samples.window, MOST_BINS)
+    found: Features = np.eye(bins, dtype=np.float32)[samples.inferences * bins // samples.window]
+    return found
+
+
+def state_features(run: RunReader, samples: LabelledSamples) -> Features:
+    """(n, 7): position and angles of the hand and the opening of the gripper at the step of every inference.
+
+    Raises UsageError for a run without trajectories or control steps.
+    """
+    wanted: dict[int, list[int]] = {}
+    for place, row in enumerate(samples.rows.tolist()):
+        wanted.setdefault(row, []).append(place)
+    found = np.empty((samples.rows.size, 7), np.float32)
+    for seen, row, frames in frames_of_inferences(run):
+        for place in wanted.get(row, ()):
+            frame = frames[samples.inferences[place]]
+            found[place] = [*seen.tool[frame], seen.opening[frame]]
+    return found
+
+
+def prepare_controls(
+    run: RunReader, samples: LabelledSamples, names: Sequence[str] | None, folder: Path | None
+) -> tuple[tuple[Name, ...], ControlInputs, dict[str, str]]:
+    """Which controls to run, what they are made of, and why a default one is left out.
+
+    names: None for all that the run allows; a missing one is then left out, with a warning where pictures are
+    missing. folder: of the run's suite, see `suite_of`. Raises UsageError for a control that was asked for and is
+    unknown or not possible, and what `suite_of` raises.
+    """
+    if unknown := [name for name in names or () if name not in LABEL_CONTROLS]:
+        raise UsageError(f"control {unknown[0]!r} of a label; expected some of {', '.join(LABEL_CONTROLS)}")
+    asked = [cast(Name, name) for name in LABEL_CONTROLS if names is None or name in names]
+    impossible = _impossible(run, samples)
+    if names is not None and (wrong := [name for name in asked if name in impossible]):
+        raise UsageError(f"the control {wrong[0]!r} is not possible: {impossible[wrong[0]]}. Leave it out")
+    left_out: dict[str, str] = {name: impossible[name] for name in asked if name in impossible}
+    chosen = [name for name in asked if name not in impossible]
+    suite = None
+    if PICTURED.intersection(chosen):
+        try:
+            suite = suite_of(run, folder)
+        except SuiteNotFoundError as error:
+            if names is not None:
+                raise
+            lost = [name for name in chosen if name in PICTURED]
+            warnings.warn(
+                f"the controls {' and '.join(lost)} are on by default and were NOT run: {error}; or say which you "
+                "want (--controls, controls=)",
+                stacklevel=4,
+            )
+            left_out |= dict.fromkeys(lost, "the pictures of the suite were not found")
+            chosen = [name for name in chosen if name not in PICTURED]
+    return tuple(chosen), ControlInputs(run, samples, suite), left_out
+
+
+def _impossible(run: RunReader, samples: LabelledSamples) -> dict[str, str]:
+    """Why the run or the label does not allow a control, by name."""
+    found = {}
+    if samples.window == 1:
+        found["step"] = "every episode has one inference with a label"
+    if (reason := why_no_sim(run)) is not None:
+        found["state"] = reason
+    if "instruction" not in run.episodes:
+        found |= dict.fromkeys(("instruction", RANDOM), "the episodes have no column 'instruction'")
+    return found
+
+
+def add_label_controls(
+    results: LabelResults,
+    problem: LabelProblem,
+    widths: dict[str, int],
+    names: Sequence[Name],
+    inputs: ControlInputs,
+    left_out: dict[str, str],
+) -> LabelResults:
+    """`results` compared with these controls too. widths: of every stream, for `random-features`."""
+    before = results.controls
+    scores, comparisons = list(before.scores), list(before.comparisons)
+    for name in names:
+        if name in before.names:
+            continue
+        if name == RANDOM:
+            references = {stream: _best_layer(inputs, problem, width, results) for stream, width in widths.items()}
+            scores += [_scored(name, probe, results, stream) for stream, probe in references.items()]
+        else:
+            probe = problem.probe(Samples.pooled(inputs.features(name)))
+            references = dict.fromkeys(widths, probe)
+            scores.append(_scored(name, probe, results))
+        comparisons += list(_compared(name, references, results))
+    run = {score.name for score in scores}
+    missing = {name: why for name, why in {**before.left_out, **left_out}.items() if name not in run}
+    return results.with_controls(LabelControls(tuple(scores), tuple(comparisons), missing))
+
+
+def _best_layer(inputs: ControlInputs, problem: LabelProblem, width: int, results: LabelResults) -> LabelProbe:
+    seeds = (derive_seed("label random features", results.settings.seed, number) for number in range(LAYERS))
+    return max((problem.score(inputs.layer(width, seed)) for seed in seeds), key=lambda probe: probe.metric)
+
+
+def _scored(name: Name, probe: LabelProbe, results: LabelResults, stream: str = "") -> LabelControl:
+    own = results.settings
+    p = float(pointwise_p(np.array([probe.metric]), probe.null[None, :])[0])
+    return LabelControl(
+        name,
+        probe.metric,
+        score_interval(probe.scores, results.groups, own.task, own.seed),
+        float(probe.null.mean()) if probe.null.size else None,
+        None if np.isnan(p) else p,
+        stream,
+    )
+
+
+def _compared(name: Name, references: dict[str, LabelProbe], results: LabelResults) -> Iterator[LabelComparison]:
+    for view, curve in results.curves.items():
+        for stream in dict.fromkeys(site.stream for site in curve.sites):
+            rows, reference = curve.stream(stream), references[stream]
+            seed = derive_seed("label control", results.settings.seed, name, view, stream)
+            p = better_than_reference(curve.scores[rows], reference.scores, results.groups, seed)
+            for row, of_site in zip(rows, p, strict=True):
+                yield LabelComparison(name, view, str(curve.sites[row]), reference.metric, float(of_site))

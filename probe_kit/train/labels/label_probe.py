@@ -1,0 +1,162 @@
+"""The probe of one feature matrix for a label and all its permutations: nested cross-validation by groups."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.statistics.folds import Fold
+from probe_kit.train.choices import Task
+from probe_kit.train.crossval.nested_folds import NestedFold
+from probe_kit.train.crossval.site_probe import cross_validate
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.labels.task_scores import balanced_scores, explained_scores
+from probe_kit.train.solver.ridge import PENALTIES, RidgeFold
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LabelProbe:
+    """Held-out predictions for n samples, and what label permutations reach.
+
+    predictions: (n,) class numbers or quantities. scores: (n,), their mean is the metric. null: (P,) metric of
+    every permutation. penalties: (F,) of each outer fold: λ of ridge, 1 / C of a binary label.
+    """
+
+    predictions: Matrix
+    scores: Matrix
+    null: Matrix
+    penalties: Matrix
+
+    @property
+    def metric(self) -> float:
+        """Balanced accuracy or R²."""
+        return float(self.scores.mean())
+
+
+def fit_label_probe(
+    features: NDArray[np.floating], labels: Matrix, task: Task, folds: list[NestedFold]
+) -> LabelProbe:
+    """Probe (n, D) features for the first of (n, 1 + P) label columns, and for the permutations behind it.
+
+    Raises ProbeNotConvergedError for a binary label.
+    """
+    labels, place = _distinct(labels)
+    outer = [fold.outer for fold in folds]
+    fit = {"binary": _logistic, "classes": _indicators, "continuous": _ridge}[task]
+    predictions, penalties = fit(features, labels, folds)
+    if task == "continuous":
+        scores = explained_scores(predictions, labels, outer)
+    else:
+        scores = balanced_scores(predictions, labels)
+    return LabelProbe(predictions[:, 0], scores[:, 0], scores.mean(axis=0)[place[1:]], penalties)
+
+
+def _distinct(labels: Matrix) -> tuple[Matrix, NDArray[np.intp]]:
+    """The different columns of (n, K) labels, the first one first, and the place of every column among them.
+
+    Labels that are constant in a group have few different permutations.
+    """
+    first: dict[bytes, int] = {}
+    place = [first.setdefault(column.tobytes(), len(first)) for column in labels.T.copy()]
+    kept = [place.index(number) for number in range(len(first))]
+    return labels[:, kept], np.array(place, np.intp)
+
+
+def _logistic(features: NDArray[np.floating], labels: Matrix, folds: list[NestedFold]) -> tuple[Matrix, Matrix]:
+    """The side probes' logistic regression, without what its intercept learns from unequal classes."""
+    truth = labels == 1
+    predictions, penalties = np.empty_like(labels), []
+    samples = Samples.pooled(features)
+    for fold, fitted in zip(folds, cross_validate(samples, truth, folds), strict=True):
+        share = truth[fold.outer.train].mean(axis=0)
+        predictions[fold.outer.test] = fitted.decisions > np.log(share / (1 - share))
+        penalties.append(1 / fitted.strengths[0])
+    return predictions, np.array(penalties)
+
+
+def _ridge(features: NDArray[np.floating], labels: Matrix, folds: list[NestedFold]) -> tuple[Matrix, Matrix]:
+    """Ridge within the range of the training labels; λ by squared error."""
+    return _nested(
+        labels,
+        folds,
+        lambda fold: _quantities(features, labels, fold),
+        lambda truth: lambda predicted: -((truth - predicted) ** 2).sum(axis=0),
+    )
+
+
+def _indicators(features: NDArray[np.floating], labels: Matrix, folds: list[NestedFold]) -> tuple[Matrix, Matrix]:
+    """Ridge on class indicators, the best class; λ by balanced accuracy."""
+    classes = int(labels.max()) + 1
+
+    def gain(truth: Matrix) -> Gain:
+        worth = _worth(truth, classes)
+        return lambda predicted: ((predicted == truth) * worth).sum(axis=0)
+
+    return _nested(labels, folds, lambda fold: _best_classes(features, labels, classes, fold), gain)
+
+
+Gain = Callable[[Matrix], Matrix]
+"""How good (m, K) predictions of a test fold are, (K,)."""
+
+
+def _nested(
+    labels: Matrix,
+    folds: list[NestedFold],
+    predict: Callable[[Fold], Iterator[Matrix]],
+    gain_of: Callable[[Matrix], Gain],
+) -> tuple[Matrix, Matrix]:
+    """(n, K) held-out predictions, each column of an outer fold at the λ that is best in its inner folds.
+
+    predict: predictions (m, K) of a fold at each penalty. Returns also the first column's λ by outer fold.
+    """
+    predictions, penalties = np.empty_like(labels), []
+    for fold in folds:
+        quality = np.zeros((PENALTIES.size, labels.shape[1]))
+        for inner in fold.inner:
+            gain = gain_of(labels[inner.test])
+            for step, predicted in enumerate(predict(inner)):
+                quality[step] += gain(predicted)
+        chosen = _largest_of_best(quality)
+        for step, predicted in enumerate(predict(fold.outer)):
+            columns = np.flatnonzero(chosen == step)
+            predictions[np.ix_(fold.outer.test, columns)] = predicted[:, columns]
+        penalties.append(PENALTIES[chosen[0]])
+    return predictions, np.array(penalties)
+
+
+def _quantities(features: NDArray[np.floating], labels: Matrix, fold: Fold) -> Iterator[Matrix]:
+    """(m, K) predictions of one fold at each penalty."""
+    train = labels[fold.train]
+    low, high = train.min(axis=0), train.max(axis=0)
+    for predicted in RidgeFold.fit(features[fold.train], features[fold.test]).predictions(train):
+        yield predicted.clip(low, high)
+
+
+def _worth(truth: Matrix, classes: int) -> Matrix:
+    """(m, K) one over the number of samples of each one's class."""
+    counts = np.stack([(truth == number).sum(axis=0) for number in range(classes)])
+    found: Matrix = 1 / np.take_along_axis(counts, truth.astype(np.intp), axis=0)
+    return found
+
+
+def _best_classes(features: NDArray[np.floating], labels: Matrix, classes: int, fold: Fold) -> Iterator[Matrix]:
+    """(m, K) most likely classes of one fold at each penalty; a class without training samples is never one."""
+    train = labels[fold.train]
+    targets = [(train == number).astype(np.float64) for number in range(classes)]
+    counts = np.stack([target.sum(axis=0) for target in targets])
+    scaled = np.hstack([target / np.sqrt(count.clip(1)) for target, count in zip(targets, counts, strict=True)])
+    absent = np.where(counts == 0, -np.inf, 0.0)
+    shape = (fold.test.size, classes, labels.shape[1])
+    for predicted in RidgeFold.fit(features[fold.train], features[fold.test]).predictions(scaled):
+        yield (predicted.reshape(shape) + absent).argmax(axis=1).astype(np.float64)
+
+
+def _largest_of_best(quality: Matrix) -> NDArray[np.intp]:
+    """(K,) position of the best of (L, K) along the grid, the larger penalty on ties."""
+    scale = np.abs(quality).max(axis=0) + 1e-300
+    rounded = (quality / scale).round(12)[::-1]
+    chosen: NDArray[np.intp] = len(quality) - 1 - rounded.argmax(axis=0)
+    return chosen

@@ -1,0 +1,131 @@
+"""Storage of probes of a label: `RUN/probes/<key>/`, beside the other probes, either complete or absent."""
+
+import json
+from dataclasses import asdict
+from datetime import UTC, datetime
+from io import BytesIO
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from probe_kit._system.csv_text import csv_of_frame
+from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
+from probe_kit.extract.run_layout import PROBES
+from probe_kit.extract.store.format.bundles import Bundle, write_bundle
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.labels.label_results import LabelControls, LabelCurve, LabelResults
+from probe_kit.train.labels.label_settings import LabelSettings
+from probe_kit.train.results.probe_results import episodes_sha256
+from probe_kit.train.results.store import read_probes, stamp_of_run
+from probe_kit.train.settings import LABEL_FORMAT
+
+SCORES, PREDICTIONS, CONTROLS = "scores.csv", "predictions.npz", "controls.json"
+_SAMPLES = ("labels", "episodes", "inferences", "groups", "fold_of")
+_CURVE = ("predictions", "scores", "null", "penalties")
+
+
+def save_label_results(results: LabelResults, run: RunReader) -> None:
+    """Store `results` with the run, or the controls of results that are stored already."""
+    head: dict[str, Any] = {"settings": asdict(results.settings), "stamp": results.stamp}
+    head |= {
+        "classes": list(results.classes),
+        "left_out": dict(results.left_out),
+        "smallest_p": results.smallest_p,
+    }
+    files = {
+        SCORES: csv_of_frame(results.scores).encode(),
+        PREDICTIONS: _packed(results),
+        CONTROLS: json.dumps(results.controls.to_json(), indent=2).encode(),
+    }
+    now = datetime.now(UTC).isoformat(timespec="microseconds")
+    write_bundle(run.location, PROBES, results.key, head, files, {"created": results.created, "asked": now})
+
+
+def load_label_results(run: RunReader, key: str | None = None, target: str | None = None) -> LabelResults:
+    """The stored probes of a label called `key`, or else the newest, of `target` if that is given.
+
+    key: as `probe-kit run show` lists it; its beginning will do. Newest: those that were asked for last, of the
+    episodes that the run has now. Raises NoProbesError if there are none, UsageError for a key that is not there,
+    and RunDamagedError for results that were changed.
+    """
+    stored = {name: bundle for name, bundle in read_probes(run.location).items() if is_of_label(bundle)}
+    if key is not None:
+        found = [name for name in stored if name.startswith(key)] if key else []
+        if len(found) != 1:
+            raise UsageError(
+                f"{run.location} has {'several' if found else 'no'} probes of labels {key!r}; it has: "
+                f"{', '.join(stored) or 'none'}"
+            )
+        return _read(run, stored[found[0]])
+    current = [
+        bundle
+        for bundle in stored.values()
+        if bundle.head["settings"].get("run_settings") == run.settings_sha256
+        and bundle.head["settings"].get("episodes") == episodes_sha256(run)
+        and target in (None, bundle.head["settings"].get("target"))
+    ]
+    if not current:
+        of = "" if target is None else f" {target!r}"
+        raise NoProbesError(
+            f"{run.location} has no probes of a label{of} on its episodes (of {len(stored)} stored). Run "
+            f"`probe-kit train {run.location} --target COLUMN`"
+        )
+    return _read(run, max(current, key=lambda bundle: (bundle.times.get("asked", ""), bundle.key)))
+
+
+def is_of_label(bundle: Bundle) -> bool:
+    """Whether stored probes are of a label of one's own, in the present format."""
+    return bool(bundle.head["settings"].get("format") == LABEL_FORMAT)
+
+
+def _packed(results: LabelResults) -> bytes:
+    arrays: dict[str, Any] = {name: getattr(results, name) for name in _SAMPLES}
+    for view, curve in results.curves.items():
+        arrays |= {f"{view}/{name}": getattr(curve, name) for name in _CURVE}
+        arrays[f"{view}/sites"] = np.array([str(site) for site in curve.sites])
+        arrays[f"{view}/parts"] = np.array(curve.parts)
+    file = BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
+def _read(run: RunReader, bundle: Bundle) -> LabelResults:
+    stored, stamp = bundle.head["settings"], str(bundle.head.get("stamp", ""))
+    if stamp and (now := stamp_of_run(run)) and stamp != now and stored.get("episodes") == episodes_sha256(run):
+        raise RunDamagedError(
+            f"{run.location}/{bundle.folder} holds probes of other activations than the run has. Remove it and "
+            "run the same `probe-kit train` again"
+        )
+    try:
+        lists = {name: tuple(stored[name]) for name in ("categories", "views")}
+        settings = LabelSettings(**{**stored, **lists})
+        with np.load(BytesIO(bundle.read(PREDICTIONS)), allow_pickle=False) as arrays:
+            samples = {name: arrays[name] for name in _SAMPLES}
+            curves = {view: _curve(arrays, view) for view in settings.views}
+        controls = LabelControls.from_json(bundle.read_json(CONTROLS))
+        return LabelResults(
+            settings,
+            tuple(bundle.head["classes"]),
+            **samples,
+            curves=curves,
+            smallest_p=bundle.head["smallest_p"],
+            left_out=bundle.head["left_out"],
+            controls=controls,
+            created=bundle.times.get("created", ""),
+            stamp=stamp,
+        )
+    except (BadZipFile, ValueError, KeyError, TypeError, OSError) as error:
+        raise RunDamagedError(
+            f"{run.location}/{bundle.folder} holds no probes of a label: {error!r}. Remove {bundle.folder} and "
+            "run the same `probe-kit train` again"
+        ) from error
+
+
+def _curve(arrays: Any, view: str) -> LabelCurve:
+    return LabelCurve(
+        tuple(Site.parse(str(name)) for name in arrays[f"{view}/sites"]),
+        tuple(str(part) for part in arrays[f"{view}/parts"]),
+        **{name: arrays[f"{view}/{name}"] for name in _CURVE},
+    )

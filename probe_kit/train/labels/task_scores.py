@@ -1,0 +1,46 @@
+"""A score per sample whose mean is the metric of a task.
+
+| task | score of sample i | mean |
+|---|---|---|
+| binary, classes | 1[prediction = label] / (K π), with K classes and the label's share π | balanced accuracy |
+| continuous | 1 − (y − ŷ)² / mean (y − ȳ)², ȳ the mean of the fold's training labels | R² |
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.statistics.folds import Fold
+
+Matrix = NDArray[np.float64]
+
+
+def balanced_scores(predicted: Matrix, truth: Matrix) -> Matrix:
+    """(n, K) scores of predicted classes (n, K); every column of truth (n, K) has each class as often."""
+    classes, counts = np.unique(truth[:, 0], return_counts=True)
+    share = (counts / len(truth))[np.searchsorted(classes, truth)]
+    scores: Matrix = (predicted == truth) / (classes.size * share)
+    return scores
+
+
+def explained_scores(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> Matrix:
+    """(n, K) scores of predicted quantities (n, K)."""
+    deviations = np.empty_like(truth)
+    for fold in folds:
+        deviations[fold.test] = (truth[fold.test] - truth[fold.train].mean(axis=0)) ** 2
+    scores: Matrix = 1 - (truth - predicted) ** 2 / deviations.mean(axis=0)
+    return scores
+
+
+def fold_spearman(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> float:
+    """Spearman's ρ of (n,) predictions and labels within each test fold, averaged; NaN where neither varies.
+
+    Within, because every fold's probe has its own mean.
+    """
+    from scipy.stats import rankdata  # type: ignore[import-untyped]
+
+    found = []
+    for fold in folds:
+        ranks = [rankdata(values[fold.test]) for values in (predicted, truth)]
+        if all(np.ptp(one) > 0 for one in ranks):
+            found.append(float(np.corrcoef(*ranks)[0, 1]))
+    return float(np.mean(found)) if found else float("nan")
