@@ -134,8 +134,8 @@ def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> No
 @pytest.mark.parametrize(
     ("names", "declared"),
     [
-        (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Target, TARGETS), (Task, TASKS),
-        (LabelControl, LABEL_CONTROLS),
+        (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Target, TARGETS),
+        (Task, TASKS), (LabelControl, LABEL_CONTROLS),
         (Incomplete, INCOMPLETE), (Baseline, BASELINES), (FoldUnit, FOLD_UNITS), (Wording, WORDINGS),
         (SuiteVersion, SUITE_VERSIONS), (ExportFormat, WRITERS), (RuleName, RULES), (AnswerScore, SCORES),
     ],

@@ -146,4 +146,4 @@ def print_label_results(results: "LabelResults", details: bool) -> None:
     out.print(label_table(results, splits=details))
     for sentence in label_sentences(results):
         out.print(sentence, markup=False, highlight=False)
-    say(marked("next: [bold]load_label_results(run, {!r})[/] in Python gives every site as a frame", results.key))
+    say(marked("next: [bold]load_label_results(run, '{}')[/] in Python gives every site as a frame", results.key))

@@ -84,7 +84,8 @@ def _in_stream(results: LabelResults, row: "pd.Series") -> str:
     numbers += f"; chance {row['chance']:.2f})"
     missed = _exceeded(results, row)[1]
     if missed:
-        return f"not shown {where} beyond {' and '.join(missed)} {numbers}"
+        beyond = " and ".join(filter(None, [", ".join(missed[:-1]), missed[-1]]))
+        return f"not shown {where} beyond {beyond} {numbers}"
     return f"decodable {where} at {row['site']} {numbers}"
 
 

@@ -1,0 +1,89 @@
+"""The null of labels: groups exchange, so that what is alike within an episode or a group is no signal."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+
+from probe_kit.statistics.label_permutations import pointwise_p
+from probe_kit.train import ArrayRun, Labels
+from probe_kit.train.labels.label_probe import fit_label_probe
+from probe_kit.train.labels.label_problem import LabelProblem, label_problem
+from probe_kit.train.labels.labelled_samples import LabelledSamples
+
+GROUPS, FRAMES = 12, 6
+GROUP, FRAME = (axis.ravel() for axis in np.indices((GROUPS, FRAMES)))
+
+
+def problem_of(values: NDArray[np.float64], permutations: int, kinds: list[str] | None = None) -> LabelProblem:
+    """Labels of one episode per group."""
+    names = np.array([f"e{number}" for number in range(GROUPS)])
+    table = pd.DataFrame({"episode_id": names[GROUP], "inference": FRAME, "y": values})
+    episodes = pd.DataFrame({"episode_id": names, "group_id": names, "layout": kinds or ["original"] * GROUPS})
+    run = ArrayRun(Path("nowhere"), "none", "none", episodes, {})
+    everywhere = np.full(GROUP.size, "all")
+    samples = LabelledSamples(GROUP, FRAME, values, names[GROUP], everywhere, FRAMES, {})
+    return label_problem(run, Labels.read(table, "y", "continuous"), samples, permutations, 0)
+
+
+def trend_and_noise(draw: np.random.Generator) -> NDArray[np.float64]:
+    return np.asarray(3 * FRAME / FRAMES + draw.normal(size=GROUP.size))
+
+
+def test_a_permutation_keeps_the_position_in_the_episode_and_the_blocks_of_groups() -> None:
+    values = np.arange(GROUP.size, dtype=np.float64)
+    columns = problem_of(values, 50).columns
+    assert columns.shape == (GROUP.size, 51)
+    assert (columns % FRAMES == FRAME[:, None]).all(), "labels of one step stay at that step"
+    blocks = (columns // FRAMES).reshape(GROUPS, FRAMES, -1)
+    assert (blocks == blocks[:, :1]).all(), "a group gives all its labels to one other"
+
+
+def test_groups_of_another_layout_do_not_exchange() -> None:
+    kinds = ["original"] * 7 + ["swapped"] * 5
+    columns = problem_of(np.arange(GROUP.size, dtype=np.float64), 50, kinds).columns
+    assert ((columns < 7 * FRAMES) == (columns[:, :1] < 7 * FRAMES)).all()
+
+
+def test_folds_never_split_a_group_and_do_not_depend_on_the_labels() -> None:
+    draw = np.random.default_rng(0)
+    one, other = (problem_of(draw.normal(size=GROUP.size), 0) for _ in range(2))
+    assert (one.fold_of == other.fold_of).all()
+    for number in range(GROUPS):
+        assert np.unique(one.fold_of[number == GROUP]).size == 1
+
+
+def test_a_trend_over_the_episode_is_read_and_is_no_signal() -> None:
+    draw = np.random.default_rng(1)
+    problem = problem_of(trend_and_noise(draw), 19)
+    features = FRAME[:, None] + 0.1 * draw.normal(size=(GROUP.size, 4))
+    probe = fit_label_probe(features, problem.columns, "continuous", problem.folds)
+    assert probe.metric > 0.2, "the label can be predicted from the step"
+    assert probe.null.mean() > 0.2, "so chance is not 0"
+    assert pointwise_p(np.array([probe.metric]), probe.null[None, :])[0] > 0.05
+    free = np.column_stack([problem.columns[:, 0], *(draw.permutation(problem.columns[:, 0]) for _ in range(19))])
+    shuffled = fit_label_probe(features, free, "continuous", problem.folds)
+    assert pointwise_p(np.array([shuffled.metric]), shuffled.null[None, :])[0] == 0.05, (
+        "as a null of frames has it"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["trend", "group", "noise"])
+def test_labels_that_know_nothing_are_found_in_five_of_a_hundred(kind: str) -> None:
+    found = 0
+    for seed in range(100):
+        draw = np.random.default_rng(seed)
+        values = {
+            "trend": trend_and_noise(draw),
+            "group": draw.normal(size=GROUPS)[GROUP],
+            "noise": draw.normal(size=GROUP.size),
+        }[kind]
+        of_group = draw.normal(size=(GROUPS, 4))[GROUP]
+        features = of_group + FRAME[:, None] + draw.normal(size=(GROUP.size, 4))
+        problem = problem_of(values, 39)
+        probe = fit_label_probe(features, problem.columns, "continuous", problem.folds)
+        found += int(pointwise_p(np.array([probe.metric]), probe.null[None, :])[0] <= 0.05)
+    assert found <= 12, "five are expected; 13 or more have a chance of 0.0015"
