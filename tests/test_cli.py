@@ -250,6 +250,7 @@ def test_the_demo_makes_everything_it_promises(tmp_path: Path) -> None:
     answer = probe_kit("demo", "--out", tmp_path / "demo")
     assert answer.returncode == 0, answer.stderr
     assert "knowledge" in answer.stdout
+    assert re.fullmatch(r"Open +probe-kit view \S+run \S+run-vlm", answer.stdout.splitlines()[-1].strip())
     for name in ("run/run.json", "layer_curves.png", "table.md", "episode.gif", "report.html"):
         assert (tmp_path / "demo" / name).is_file()
 

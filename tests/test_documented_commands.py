@@ -224,6 +224,7 @@ RUNS = {
     "docs/report.md": ("runs/a", "runs/b"),
     "docs/spatialvla.md": ("RUN_SPATIALVLA", "RUN_OPENVLA", "RUN_PI0"),
     "docs/success-rate.md": ("RUN",),
+    "docs/view.md": ("runs/mine",),
 }
 """Runs that a page takes for granted, made of the embedded policy; all of a page are different runs."""
 
@@ -257,6 +258,7 @@ NOT_TYPED = {
     r"^\./with-uv --extra": "the extras are installed here",
     r"with-uv probe-kit demo": "minutes; tests/test_cli.py types it",
     r"with-uv pytest": "is what runs this",
+    r"^probe-kit view \S+$": "serves until Ctrl-C; tests/view/test_server.py has the server",
     r"^python benchmarks/intervention_acceptance": "hours",
     r"^python -m probe_kit.hooks.families.internvla.convert RUN OUT": "RUN is a training of InternVLA's",
     r"^export AWS_|s3://": "needs keys of an object store; tests/extract/test_remote.py has a server of its own",

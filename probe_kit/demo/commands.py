@@ -45,7 +45,9 @@ def demo(
 
 
 def print_demo(made: "Demo") -> None:
-    """Where to look, and last the finding, which stays in view."""
+    """Where to look, then the finding, which stays in view, and last the command that opens the viewer."""
     out.print(made.next_steps(), soft_wrap=True)
     out.print()
     out.print(made.table.to_rich())
+    out.print()
+    out.print(made.viewer(), soft_wrap=True)

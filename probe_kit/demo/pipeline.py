@@ -47,6 +47,10 @@ class Demo:
             lines.insert(0, marked(warning))
         return Text("\n").join(line if isinstance(line, Text) else Text(line) for line in lines)
 
+    def viewer(self) -> Text:
+        """The command that shows both runs episode by episode."""
+        return marked("[bold]Open[/]    probe-kit view {} {}", self.run.path, self.asked.path)
+
 
 def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:
     """The demo's questions put to policies of which the truth is known; see `probe_kit.demo.organisms`."""

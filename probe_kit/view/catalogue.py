@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 from probe_kit.extract import Run
@@ -31,6 +32,10 @@ class Catalogue:
 
     def __init__(self, runs: Sequence[Run]) -> None:
         self.runs = {viewed.key: viewed for viewed in view_runs(runs)}
+
+    def replace(self, key: str, run: Run) -> None:
+        """Show a run as it is now. Raises KeyError."""
+        self.runs[key] = replace(self.runs[key], run=run)
 
     def names(self, categories: Collection[str] | None = None) -> Iterator[str]:
         """All names in the order of export. categories: whose episodes and maps are named, all by default."""

@@ -63,7 +63,9 @@ def tables_in(text: str) -> int:
 def test_a_command_prints_one_table_and_ends_on_a_sentence(
     name: str, width: int, run: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = printed(name, run, width, capsys, monkeypatch)
+    text, opens, viewer = printed(name, run, width, capsys, monkeypatch).partition("\nOpen ")
+    assert bool(opens) == (name == "demo"), "the demo alone adds the command that opens the viewer"
+    assert viewer.strip().startswith("probe-kit view ") or not opens
     assert tables_in(text) == 1, text
     assert max(map(len, text.split("category")[1].splitlines())) <= width
     last = " ".join(text.rpartition("\nColor (")[2].split())

@@ -105,3 +105,9 @@ def test_the_page_runs_its_own_scripts_only() -> None:
         assert not re.search(rb"innerHTML|\beval\(|new Function\(|document\.write", content) or "preact" in name, (
             name
         )
+
+
+def test_options_of_an_export_need_its_folder(little_runs: Path) -> None:
+    done = CliRunner().invoke(app, ["view", str(little_runs / "run"), "--without-frames"])
+    assert done.exit_code == 2
+    assert "give --export FOLDER" in done.stderr

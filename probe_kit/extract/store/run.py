@@ -277,6 +277,16 @@ class Run:
     def _showing(self, wording: str | None, item_ids: frozenset[str] | None) -> "Run":
         return Run(self.location, wording, item_ids).under(self.rule, self.last_steps)
 
+    def grown(self) -> "Run":
+        """The same run with the episodes that were committed since; only their commits are read."""
+
+        def read() -> Run:
+            run = self._showing(self.wording, self.item_ids)
+            run.__dict__["_commits"] = read_commits(run.root, self._commits)
+            return run
+
+        return while_growing(self.location, read)
+
     @cached_property
     def _commits(self) -> dict[int, Commit]:
         return read_commits(self.root)

@@ -11,9 +11,28 @@ const VIEW = { overview: Overview, map: Maps, episodes: Episodes, compare: Compa
 const HELP = [["← →", "step back and forward"], ["space", "play and pause"], ["Home End", "first and last step"], ["j k", "next and previous episode"], ["/", "search"], [`1 … ${Object.keys(VIEWS).length}`, "views"], ["?", "these keys"]];
 const CLEARED = { ep: undefined, t: undefined, category: undefined, outcome: undefined, layout: undefined, case: undefined, words: undefined, site: undefined };
 
+/* Events of a server tell that a run grew: its payloads are read again, and filter, episode and scroll stay. */
+function useGrowth(known) {
+  const [grown, set] = useState({});
+  useEffect(() => {
+    if (!known || !location.protocol.startsWith("http")) return;
+    const events = new EventSource("follow");
+    events.onmessage = async (event) => {
+      const now = JSON.parse(event.data), shown = store.get(`${now.run}/run`);
+      if (shown && shown.committed !== now.committed) {
+        for (const name of [...store.keys()].filter((one) => one.startsWith(`${now.run}/map/`))) store.delete(name);
+        await Promise.all([load(`${now.run}/run`, true), load(`${now.run}/episodes`, true)]);
+      }
+      set((before) => ({ ...before, [now.run]: now }));
+    };
+    return () => events.close();
+  }, [known]);
+  return grown;
+}
 function App() {
   const place = usePlace(), [[index], trouble] = useLoaded("index"), help = useRef(null);
   const known = index?.schema === SCHEMA && index.runs.length > 0, key = known ? (index.runs.find((r) => r.key === place.run) ?? index.runs[0]).key : null;
+  const grown = useGrowth(known)[key];
   const [[run, episodes], lost] = useLoaded(key && `${key}/run`, key && `${key}/episodes`);
   useKeys((e) => {
     if (e.key === "?") help.current?.showModal();
@@ -27,6 +46,7 @@ function App() {
   const list = listOf(run.key), View = VIEW[place.view];
   return html`<header class="bar"><a class="brand" href="#/overview">probe_kit</a>
       <label class="run"><span class="sr">Run</span><select value=${run.key} onChange=${(e) => go({ ...CLEARED, run: e.target.value })}>${index.runs.map((r) => html`<option value=${r.key}>${r.label} (${r.key}, ${r.episodes})</option>`)}</select></label>
+      ${run.committed < run.planned && html`<span class="live" role="status">${grown && html`<i></i>`}${run.committed} of ${run.planned} episodes so far${run.failed ? `, ${run.failed} failed` : ""}</span>`}
       ${run.random_weights && html`<span class="random">RANDOM WEIGHTS</span>`}
       <nav aria-label="Views">${Object.entries(VIEWS).map(([view, words]) => html`<a href=${link({ view })} aria-current=${view === place.view ? "page" : null}>${view === "map" ? html`<span class="wide-only">${words}</span><span class="narrow-only">Map</span>` : words}</a>`)}</nav>
       <button type="button" class="plain" onClick=${toggleTheme} aria-label="Light or dark">◐</button><button type="button" class="plain" onClick=${() => help.current.showModal()} aria-label="Keys">?</button></header>

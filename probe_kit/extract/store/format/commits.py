@@ -65,24 +65,35 @@ def numbered(location: Location, folder: str) -> Iterator[tuple[int, str, bytes]
             yield int(found[1]), f"{folder}/{name}", raw
 
 
-def read_commits(root: Root) -> dict[int, Commit]:
+def read_commits(root: Root, known: Mapping[int, Commit] | None = None) -> dict[int, Commit]:
     """All commits by episode number, each checked, and against the sizes of the objects it names.
 
+    known: commits that were read and checked before; these are not read again.
     Raises RunDamagedError naming the first commit that was changed or belongs elsewhere, or the first object that
     is missing or has another size.
     """
     location = root.location
-    commits = {number: read_commit(root, number, key, raw) for number, key, raw in numbered(location, COMMITS)}
-    sizes = committed_sizes(location, commits)
-    for number, commit in commits.items():
+    unread = _unread(location, known) if known else numbered(location, COMMITS)
+    found = {number: read_commit(root, number, key, raw) for number, key, raw in unread}
+    sizes = committed_sizes(location, found)
+    for number, commit in found.items():
         for key, (length, *_) in commit["objects"].items():
             problem = wrong_size(sizes, key, length)
             if problem and not is_left_out(key, root.left_out):
                 raise RunDamagedError(
                     f"{location}/{DATA}/{key} of episode {commit['episode_id']} {problem}. {redo(number)}"
                 )
+    commits = dict(sorted({**(known or {}), **found}.items()))
     root.check_room(commits)
     return commits
+
+
+def _unread(location: Location, known: Mapping[int, Commit]) -> Iterator[tuple[int, str, bytes]]:
+    """Number, key and content of the commits that are not among the `known` ones."""
+    for key in location.keys(COMMITS):
+        name = _NUMBERED.fullmatch(key.rpartition("/")[2])
+        if name and int(name[1]) not in known:
+            yield int(name[1]), key, location.read(key)
 
 
 def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:

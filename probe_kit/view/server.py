@@ -1,0 +1,203 @@
+"""The viewer's server: loopback only, behind a token, and names are looked up and never joined to a path.
+
+Checks in order: the Host header (another name of this machine may be a rebound one), the method and the site of
+the request, the token or the cookie, and the name of the payload.
+"""
+
+import asyncio
+import hashlib
+import json
+import re
+import secrets
+import socket
+from collections.abc import AsyncIterator
+from http.cookies import SimpleCookie
+from threading import Lock
+from urllib.parse import parse_qs
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.middleware import Middleware
+from starlette.middleware.gzip import GZipMiddleware
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, RedirectResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from probe_kit.errors import ProbeKitError
+from probe_kit.view.catalogue import Catalogue
+from probe_kit.view.follower import Follower, Growth
+from probe_kit.view.page_files import INDEX, page_files
+
+HOST = "127.0.0.1"
+TICK_S = 2.0
+"""Seconds between two listings of the commits of a run that grows."""
+_GZIP_FROM = 2000
+_PICTURE = re.compile(r"([A-Za-z0-9._-]+)/f/([0-9]{5,8})\.webp")
+_KINDS = {"css": "text/css", "html": "text/html", "js": "text/javascript", "svg": "image/svg+xml"}
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+    "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+_HEADERS = {
+    "content-security-policy": _POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-resource-policy": "same-origin",
+}
+
+
+class _Guard:
+    """Admits the requests of the page that was opened with the token, and no other."""
+
+    def __init__(self, app: ASGIApp, port: int, token: str) -> None:
+        self._app, self._token = app, token
+        self._hosts = {f"{HOST}:{port}", f"localhost:{port}"}
+        self._cookie, self._pass = f"probe_kit_view_{port}", secrets.token_urlsafe(32)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return await self._app(scope, receive, send)
+
+        async def send_guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                own = [(name.encode(), value.encode()) for name, value in _HEADERS.items()]
+                message = {**message, "headers": [*message["headers"], *own]}
+            await send(message)
+
+        answer = self._answer(Request(scope)) or self._app
+        return await answer(scope, receive, send_guarded)
+
+    def _answer(self, request: Request) -> Response | None:
+        """A refusal, or the way from the token to the page; None for what is admitted."""
+        if request.headers.get("host") not in self._hosts:
+            return PlainTextResponse("unknown host", 400)
+        site = request.headers.get("sec-fetch-site", "none")
+        if request.method not in ("GET", "HEAD") or site not in ("none", "same-origin"):
+            return PlainTextResponse("refused", 403)
+        given = parse_qs(request.url.query).get("token", [""])[0]
+        if given and secrets.compare_digest(given.encode(), self._token.encode()):
+            response = RedirectResponse("/", 303)
+            response.set_cookie(self._cookie, self._pass, httponly=True, samesite="strict")
+            return response
+        cookie = SimpleCookie(request.headers.get("cookie", "")).get(self._cookie)
+        if cookie is None or not secrets.compare_digest(cookie.value.encode(), self._pass.encode()):
+            return PlainTextResponse("Open the address that `probe-kit view` printed.", 403)
+        return None
+
+
+class _Pages:
+    """The endpoints. The catalogue is used by one thread at a time."""
+
+    def __init__(self, catalogue: Catalogue, tick_s: float) -> None:
+        self._catalogue, self._tick_s, self._lock = catalogue, tick_s, Lock()
+        self._files = page_files()
+        self._follower = Follower(catalogue)
+
+    def file(self, request: Request) -> Response:
+        """The page, or a file of it."""
+        name = request.path_params.get("name")
+        content = self._files.get(INDEX if name is None else f"app/{name}")
+        if content is None:
+            return _missing()
+        kind = _KINDS.get((name or INDEX).rpartition(".")[2], "text/plain")
+        return _tagged(request, content, hashlib.sha256(content).hexdigest(), kind)
+
+    def data(self, request: Request) -> Response:
+        """A payload or a picture."""
+        name = str(request.path_params["name"])
+        try:
+            with self._lock:
+                if found := _PICTURE.fullmatch(name):
+                    picture = self._catalogue.picture(found[1], int(found[2]))
+                    if picture is None:
+                        return _missing()
+                    return _tagged(request, picture, hashlib.sha256(picture).hexdigest(), "image/webp")
+                own = name.removesuffix(".js")
+                if own == name:
+                    return _missing()
+                tag = self._catalogue.stamp(own)
+                if request.headers.get("if-none-match") == f'"{tag}"':
+                    return _tagged(request, b"", tag, _KINDS["js"])
+                return _tagged(request, self._catalogue.script(own), tag, _KINDS["js"])
+        except KeyError:
+            return _missing()
+        except ProbeKitError as error:
+            return PlainTextResponse(str(error), 500)
+
+    async def follow(self, request: Request) -> Response:
+        """Events of runs that grow: how many episodes are committed. Nothing where every run is finished."""
+        if not self._follower.is_growing:
+            return Response(status_code=204)
+        return StreamingResponse(self._events(request), media_type="text/event-stream")
+
+    async def _events(self, request: Request) -> AsyncIterator[str]:
+        sent: dict[str, int] = {}
+        yield ": following\n\n"
+        while not await request.is_disconnected():
+            for growth in await run_in_threadpool(self._poll):
+                if sent.get(growth.run) != growth.committed:
+                    sent[growth.run] = growth.committed
+                    yield f"data: {json.dumps(vars(growth))}\n\n"
+            await asyncio.sleep(self._tick_s)
+
+    def _poll(self) -> list[Growth]:
+        with self._lock:
+            return self._follower.poll()
+
+
+def _missing() -> Response:
+    return PlainTextResponse("there is no such page", 404)
+
+
+def _tagged(request: Request, content: bytes, tag: str, kind: str) -> Response:
+    """The content with its tag, or nothing where the browser has it."""
+    headers = {"etag": f'"{tag}"', "cache-control": "no-cache"}
+    if request.headers.get("if-none-match") == headers["etag"]:
+        return Response(status_code=304, headers=headers)
+    return Response(content, headers=headers, media_type=kind)
+
+
+def viewer_app(catalogue: Catalogue, port: int, token: str, tick_s: float) -> Starlette:
+    """The application that serves the page of `catalogue` at `127.0.0.1:port` to who knows `token`."""
+    pages = _Pages(catalogue, tick_s)
+    return Starlette(
+        routes=[
+            Route("/", pages.file),
+            Route("/app/{name}", pages.file),
+            Route("/data/{name:path}", pages.data),
+            Route("/follow", pages.follow),
+        ],
+        middleware=[
+            Middleware(_Guard, port=port, token=token),
+            Middleware(GZipMiddleware, minimum_size=_GZIP_FROM),
+        ],
+    )
+
+
+class ViewerServer:
+    """A server on loopback whose socket is open from the first moment. port: 0 for any free one."""
+
+    def __init__(self, catalogue: Catalogue, port: int = 0) -> None:
+        self._socket = socket.socket()
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._socket.bind((HOST, port))
+        self._socket.listen()
+        self.port: int = self._socket.getsockname()[1]
+        self._token = secrets.token_urlsafe(16)
+        app = viewer_app(catalogue, self.port, self._token, TICK_S)
+        self._server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
+
+    @property
+    def address(self) -> str:
+        """The address that opens the page."""
+        return f"http://{HOST}:{self.port}/?token={self._token}"
+
+    def run(self) -> None:
+        """Serve until interrupted, or until `stop`."""
+        self._server.run(sockets=[self._socket])
+
+    def stop(self) -> None:
+        """End `run`."""
+        self._server.should_exit = True

@@ -1,0 +1,365 @@
+"""The page in a real Chromium, opened from a file: it shows what the run holds, by mouse and by keyboard."""
+
+import json
+import shutil
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from probe_kit.extract import Run, label_run, open_run, seal
+from probe_kit.extract.plan import make_plan
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.thumbnails import read_thumbnail
+from probe_kit.extract.store.writer import RunWriter
+from probe_kit.suite import Suite
+from probe_kit.train import load_results, train_probes
+from probe_kit.view import write_viewer
+from probe_kit.view.catalogue import Catalogue
+from tests.support.browser import CHROMIUM, WHY_SKIPPED, Browser, Page
+from tests.support.little_run import STREAMS, certify, episode, little_plan, little_settings, little_writer
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=WHY_SKIPPED)]
+
+CALLS = 2
+HOSTILE = "</script><img src=x onerror=alert(1)>"
+
+
+def write_run(where: Path, suite: Suite, seed: int) -> Run:
+    """24 episodes of two captured inferences. The backbone's last layer holds the answer at the first of them."""
+    settings = {**little_settings(), "captured_calls": CALLS, "tokens": "pooled", "light": str(seed)}
+    plan = make_plan(suite, list(STREAMS), 0, CALLS, True)
+    writer = RunWriter(locate(where), plan, settings)
+    certify(writer)
+    for number in writer.remaining():
+        record = episode(plan, number, seed)
+        draw = np.random.default_rng([seed, number])
+        pooled = {}
+        for stream in STREAMS:
+            shape = (CALLS, *stream.lead, len(stream.views), stream.width)
+            pooled[stream.name] = draw.normal(size=shape).astype(np.float32)
+        sign = 1 if plan.episodes[number].episode.side_correct == "left" else -1
+        pooled["backbone"][0, -1, :, 0] = 3 * sign + draw.normal(size=2) / 2
+        roles = [*record.roles, *record.roles]
+        writer.write(replace(record, arrays={"pooled": pooled}, roles=roles, control_steps=(0, 1)))
+    seal(where)
+    train_probes(open_run(where), permutations=60)
+    return open_run(where)
+
+
+@pytest.fixture(scope="module")
+def runs(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
+    folder = tmp_path_factory.mktemp("runs")
+    suite = small_suite.select(["color"])
+    found = [write_run(folder / name, suite, seed) for seed, name in enumerate(("a", "b"))]
+    label_run(folder / "b", HOSTILE)
+    return [found[0], open_run(folder / "b")]
+
+
+@pytest.fixture(scope="module")
+def address(runs: list[Run], tmp_path_factory: pytest.TempPathFactory) -> str:
+    return write_viewer(runs, tmp_path_factory.mktemp("viewer") / "page").as_uri()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("profile")) as found:
+        yield found
+
+
+@pytest.fixture
+def page(browser: Browser) -> Iterator[Page]:
+    """A fresh page; its console stays empty."""
+    browser.complaints.clear()
+    yield browser.page()
+    assert browser.complaints == []
+
+
+def text(page: Page, selector: str) -> str:
+    return str(page.read(f"document.querySelector({json.dumps(selector)}).innerText"))
+
+
+def shown(page: Page) -> int:
+    return int(text(page, "output.count").split(" of ")[0])
+
+
+def cases(run: Run) -> list[int]:
+    """Numbers of the episodes that the backbone's best site reads right, and that did not end correctly."""
+    curve = load_results(run).curves["color", "mean"]
+    right = curve.correct[curve.best("backbone")]
+    wrong = dict(zip(run.episodes["episode_id"], run.episodes["outcome"] != "correct", strict=True))
+    numbers = dict(zip(run.episodes["episode_id"], run.episodes["episode"], strict=True))
+    return [int(numbers[name]) for name, read in zip(curve.episodes, right, strict=True) if read and wrong[name]]
+
+
+def test_a_count_of_the_overview_opens_a_list_of_so_many_episodes(
+    page: Page, address: str, runs: list[Run]
+) -> None:
+    assert load_results(runs[0]).scores.query("view == 'mean' and signal")["stream"].tolist() == ["backbone"]
+    page.open(f"{address}#/overview")
+    expected = cases(runs[0])
+    assert text(page, "[data-count='backbone color']") == str(len(expected))
+    page.click("[data-count='backbone color']")
+    page.wait("document.querySelector('.episode')")
+    assert shown(page) == len(expected)
+    listed = page.read("[...document.querySelectorAll('.list .item small')].map(s => parseInt(s.textContent))")
+    assert listed == expected
+
+
+def test_a_site_without_signal_is_not_counted(page: Page, address: str) -> None:
+    page.open(f"{address}#/overview")
+    assert page.read("document.querySelector(\"[data-count='action color']\")") is None
+    page.open(f"{address}#/map?site=expert.00.residual@0")
+    assert page.read("document.querySelectorAll('.swarm').length") == 0
+    assert "neither right nor wrong" in page.read("document.body.innerText")
+
+
+def test_scrubbing_by_key_slider_and_drag_agree(page: Page, address: str, runs: list[Run]) -> None:
+    page.open(f"{address}#/episodes?ep=0&t=0")
+    last = runs[0].trajectory(0).steps
+
+    def state() -> tuple[int, str, str, float]:
+        return (
+            int(page.read("Number(new URLSearchParams(location.hash.split('?')[1]).get('t'))")),
+            text(page, ".scrub output"),
+            str(page.read("document.querySelector('.film').dataset.frame")),
+            float(page.read("+document.querySelector('[data-series=Arm] .cursor').getAttribute('x1')")),
+        )
+
+    start = state()
+    page.press("ArrowRight")
+    by_key = state()
+    assert by_key[:2] == (1, f"1 / {last}")
+    page.press("End")
+    by_end = state()
+    page.press("Home")
+    assert state() == start
+    page.choose(".scrub input", str(last))
+    assert state() == by_end == (last, f"{last} / {last}", "1", by_end[3])
+    page.drag("[data-series=Arm] svg[role=img]", 0.0)
+    assert state() == start
+    page.drag("[data-series=Arm] svg[role=img]", 0.99)
+    assert state() == by_end
+    assert by_end[3] > by_key[3] > start[3]
+
+
+def test_the_frame_that_is_shown_is_the_stored_one(page: Page, address: str, runs: list[Run]) -> None:
+    stored = read_thumbnail(runs[0].location, 1)
+    assert stored is not None
+    both = np.asarray(Image.open(BytesIO(stored)).convert("RGB"), int)
+    width = both.shape[1] // 2
+    for step, half in ((0, both[:, :width]), (runs[0].trajectory(1).steps, both[:, width:])):
+        page.open(f"{address}#/episodes?ep=1&t={step}")
+        page.read("document.querySelector('.stamp').remove()")
+        page.read("new Promise(done => setTimeout(done, 300))")
+        box = page.read(
+            "(() => { const b = document.querySelector('.film').getBoundingClientRect(); "
+            "return [b.left, b.top, b.right, b.bottom].map(Math.round); })()"
+        )
+        seen = Image.open(BytesIO(page.picture(whole=False))).convert("RGB").crop(box)
+        middle = np.asarray(seen, int)[box[3] // 4 : -box[3] // 4, 40:-40].reshape(-1, 3)
+        assert np.abs(np.median(middle, axis=0) - np.median(half.reshape(-1, 3), axis=0)).max() <= 3
+
+
+def test_every_cell_of_a_map_shows_its_stored_scores(page: Page, address: str, runs: list[Run]) -> None:
+    page.open(f"{address}#/map?category=color")
+    scores = load_results(runs[0]).scores.query("view == 'mean'")
+    for row in scores.to_dict("records"):
+        page.hover(f".mapwrap [data-site='{row['site']}']")
+        read = text(page, "dl.readout")
+        share, low, high = (f"{100 * row[name]:.1f}" for name in ("accuracy", "ci_low", "ci_high"))
+        assert f"{share} [{low}, {high}]" in read
+        assert f"{row['p']:.3f}" in read
+        assert f"{row['p_fwe']:.3f}" in read
+        assert ("no signal shown" in read) == (not row["signal"])
+
+
+def test_from_a_cell_to_an_episode_and_back_is_the_same_place(page: Page, address: str) -> None:
+    page.open(f"{address}#/map?category=color")
+    page.click(".mapwrap [data-site='backbone.01.residual']")
+    page.wait("document.querySelector('.chip')")
+    before, number = page.read("[location.hash, document.querySelector('.chip').textContent]")
+    page.click(".chip")
+    page.wait("document.querySelector('.episode')")
+    assert f"episode {number}" in text(page, ".facts")
+    page.read("history.back()")
+    page.wait("document.querySelector('.mapwrap')")
+    assert page.read("location.hash") == before
+
+
+def test_an_address_shows_the_same_in_a_fresh_browser(browser: Browser, page: Page, address: str) -> None:
+    page.open(f"{address}#/episodes?category=color&layout=swapped")
+    page.press("j")
+    page.press("ArrowRight")
+    place, read = page.read("location.hash"), text(page, "main")
+    other = browser.page()
+    other.open(address + place)
+    assert text(other, "main") == read
+
+
+def test_filters_work_together_down_to_none_and_back(page: Page, address: str, runs: list[Run]) -> None:
+    page.open(f"{address}#/episodes")
+    episodes = runs[0].episodes
+    page.choose("select[name=layout]", "swapped")
+    page.choose("select[name=outcome]", "wrong")
+    chosen = episodes.query("layout == 'swapped' and outcome == 'wrong'")
+    assert shown(page) == len(chosen)
+    page.choose("input[name=words]", "no such words")
+    assert shown(page) == 0
+    page.click(".empty a")
+    assert shown(page) == len(episodes)
+    page.read("history.back()")
+    page.wait("document.querySelector('output.count').innerText.startsWith('0 ')")
+
+
+def test_two_runs_are_compared_by_pair_and_step(page: Page, address: str, runs: list[Run]) -> None:
+    page.open(f"{address}#/compare")
+    a, b = (run.episodes["outcome"].eq("correct").tolist() for run in runs)
+    for name, of_a, of_b in (("right-wrong", True, False), ("wrong-right", False, True)):
+        own = [n for n, pair in enumerate(zip(a, b, strict=True)) if pair == (of_a, of_b)]
+        assert text(page, f"[data-quad={name}] b") == str(len(own))
+    number = int(page.read("document.querySelector('[data-quad=right-wrong] .chip').textContent"))
+    page.click("[data-quad=right-wrong] .chip")
+    tools = [run.trajectory(number).tool[:, :3].astype(float) for run in runs]
+    apart = np.linalg.norm(tools[0] - tools[1], axis=1)
+    assert f"the tools part by 5 mm at step {np.flatnonzero(apart > 0.005)[0]}" in text(page, ".sentence")
+
+
+def test_hostile_text_is_text(page: Page, address: str) -> None:
+    page.open(f"{address}#/overview?run=b")
+    named = page.read("document.querySelector('.run select').selectedOptions[0].textContent")
+    assert HOSTILE in named
+    assert page.read("document.querySelectorAll('img').length") == 0
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "#/nothing", "#/episodes?ep=abc&t=-7&case=x&category=none&site=no", "#/map?category=%00&site=1", "#?&&=",
+        "#/compare?with=none&ep=999", "#/episodes?t=1e9&case=constructor.right-wrong", "#/constructor",
+    ],
+)  # fmt: skip
+def test_an_unknown_address_falls_back(page: Page, address: str, place: str) -> None:
+    page.open(address + place)
+    assert page.read("document.querySelector('main').innerText.length") > 40
+    assert page.read("document.querySelectorAll('.trouble').length") == 0
+
+
+def test_the_page_can_be_used_by_keyboard_alone(page: Page, address: str) -> None:
+    page.open(f"{address}#/map")
+    page.read("document.querySelector('.mapwrap [tabindex=\"0\"]').focus()")
+    before = page.read("document.activeElement.dataset.site")
+    page.press("ArrowRight")
+    page.press("ArrowLeft")
+    page.press("ArrowDown")
+    after = page.read("document.activeElement.dataset.site")
+    assert after != before
+    page.press("Enter")
+    assert page.read("new URLSearchParams(location.hash.split('?')[1]).get('site')") == after
+    page.press("Tab")
+    outlines = []
+    for _ in range(12):
+        page.press("Tab")
+        outlines.append(page.read(FOCUS))
+    assert [one for style, one in outlines if style == "none" and "<body" not in one] == []
+    page.read("document.activeElement.blur()")
+    page.press("3")
+    page.wait("location.hash.startsWith('#/episodes')")
+    page.press("/")
+    assert page.read("document.activeElement.name") == "words"
+
+
+FOCUS = "[getComputedStyle(document.activeElement).outlineStyle, document.activeElement.outerHTML.slice(0, 120)]"
+WIDE = """[...document.querySelectorAll("main *")].filter(one => !one.closest(".scroll, svg") &&
+    one.getBoundingClientRect().right > innerWidth + 1).map(one => one.outerHTML.slice(0, 160))"""
+
+CONTRAST = """(() => {
+    const canvas = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
+    const parse = colour => { canvas.clearRect(0, 0, 1, 1); canvas.fillStyle = colour; canvas.fillRect(0, 0, 1, 1);
+      return [...canvas.getImageData(0, 0, 1, 1).data]; };
+    const linear = v => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4;
+    const light = ([r, g, b]) => .2126 * linear(r / 255) + .7152 * linear(g / 255) + .0722 * linear(b / 255);
+    const ground = one => { for (let up = one; up; up = up.parentElement) {
+      const colour = parse(getComputedStyle(up).backgroundColor); if (colour[3] === 255) return colour; }
+      return [255, 255, 255]; };
+    const low = [];
+    for (const one of document.querySelectorAll("body *")) {
+      const own = [...one.childNodes].some(node => node.nodeType === 3 && node.textContent.trim());
+      if (!own || !one.checkVisibility() || one.closest(".sr, option, .film, [aria-hidden=true]")) continue;
+      const style = getComputedStyle(one);
+      const [a, b] = [light(parse(one.closest("svg") ? style.fill : style.color)), light(ground(one))];
+      const ratio = (Math.max(a, b) + .05) / (Math.min(a, b) + .05);
+      if (ratio < 4.5) low.push([one.outerHTML.slice(0, 110), ratio]);
+    }
+    return low;
+})()"""
+
+
+@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize("width", [1400, 400])
+def test_nothing_overflows_and_every_word_can_be_read(
+    browser: Browser, address: str, width: int, dark: bool
+) -> None:
+    browser.complaints.clear()
+    page = browser.page(width, dark=dark)
+    for view in ("overview", "map", "episodes?ep=1", "compare"):
+        page.open(f"{address}#/{view}")
+        page.settle()
+        assert page.read("document.documentElement.scrollWidth") <= width, (view, page.read(WIDE))
+        assert page.read(CONTRAST) == [], view
+    assert browser.complaints == []
+
+
+def test_a_damaged_payload_is_named(browser: Browser, runs: list[Run], tmp_path: Path) -> None:
+    found = write_viewer(runs[:1], tmp_path / "page")
+    shutil.rmtree(found.parent / "data" / "a" / "e")
+    page = browser.page()
+    page.open(f"{found.as_uri()}#/episodes?ep=3")
+    assert "data/a/e/00003.js is missing" in text(page, ".trouble")
+    (found.parent / "data" / "index.js").write_text('put("index",{"schema":99,"runs":[]})', encoding="utf-8")
+    page.open("about:blank")
+    page.open(found.as_uri())
+    assert "schema 99" in text(page, ".trouble")
+    browser.complaints.clear()
+
+
+def test_a_served_page_shows_episodes_that_are_committed_while_it_is_open(
+    browser: Browser, small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("starlette", reason="the server of the viewer is not installed (starlette, uvicorn)")
+    from probe_kit.view.server import ViewerServer
+
+    monkeypatch.setattr("probe_kit.view.server.TICK_S", 0.05)
+    browser.complaints.clear()
+    plan = little_plan(small_suite.select(["color"]), 0, 6)
+    writer = little_writer(locate(tmp_path / "run"), plan)
+    for number in range(3):
+        writer.write(episode(plan, number))
+    server = ViewerServer(Catalogue([open_run(tmp_path / "run", allow_partial=True)]))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    try:
+        page = browser.page()
+        page.open(server.address)
+        assert page.read("location.search") == ""
+        assert text(page, ".live") == "3 of 6 episodes so far"
+        page.open(f"http://127.0.0.1:{server.port}/#/episodes?layout=original&ep=2&t=1")
+        before = [text(page, selector) for selector in ("h2", ".scrub output", "output.count")]
+        assert before[2] == "2 of 3"
+        for number in (3, 4):
+            writer.write(episode(plan, number))
+        page.wait("document.querySelector('.live').innerText.startsWith('5 of 6')")
+        page.wait("document.querySelector('output.count').innerText === '3 of 5'")
+        after = [text(page, selector) for selector in ("h2", ".scrub output")]
+        assert after == before[:2]
+        assert page.read("document.querySelector('.list [aria-selected=true] small').textContent").startswith("2 ")
+        page.open("about:blank")
+    finally:
+        server.stop()
+        thread.join(30)
+    assert browser.complaints == []

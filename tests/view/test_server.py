@@ -1,0 +1,205 @@
+"""The server answers the page that was opened with its token, on this machine, and no other request."""
+
+import gzip
+import http.client
+import json
+import re
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from probe_kit.extract import Run, open_run, seal
+from probe_kit.extract.store.format import commits
+from probe_kit.extract.store.format.root import Root
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.suite import Suite
+from probe_kit.view.catalogue import Catalogue
+from tests.support.little_run import episode, little_plan, little_writer
+from tests.view.payload_reader import read_payload
+
+pytest.importorskip("starlette", reason="the server of the viewer is not installed (starlette, uvicorn)")
+pytest.importorskip("uvicorn", reason="the server of the viewer is not installed (starlette, uvicorn)")
+
+Answer = tuple[int, Mapping[str, str], bytes]
+
+
+class Client:
+    """Asks a server with chosen headers, as any program on the machine can."""
+
+    def __init__(self, port: int, token: str) -> None:
+        self.port, self.token = port, token
+        self.cookie = ""
+
+    def ask(self, path: str, method: str = "GET", **headers: str) -> Answer:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
+        sent = {"Host": f"127.0.0.1:{self.port}", **({"Cookie": self.cookie} if self.cookie else {})}
+        sent |= {name.replace("_", "-"): value for name, value in headers.items()}
+        connection.request(method, path, headers=sent)
+        answer = connection.getresponse()
+        found = answer.status, {name.lower(): value for name, value in answer.getheaders()}, answer.read()
+        connection.close()
+        return found
+
+    def admit(self) -> None:
+        """Open the address that the command prints."""
+        status, headers, _ = self.ask(f"/?token={self.token}")
+        assert (status, headers["location"]) == (303, "/")
+        assert {"HttpOnly", "SameSite=strict"} <= set(re.split("; ?", headers["set-cookie"]))
+        self.cookie = headers["set-cookie"].partition(";")[0]
+
+
+@contextmanager
+def served(runs: list[Run]) -> Iterator[Client]:
+    from probe_kit.view.server import ViewerServer
+
+    server = ViewerServer(Catalogue(runs))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    try:
+        yield Client(server.port, server.address.partition("token=")[2])
+    finally:
+        server.stop()
+        thread.join(30)
+
+
+@pytest.fixture(scope="module")
+def server(little_runs: Path) -> Iterator[Client]:
+    with served([open_run(little_runs / "run")]) as found:
+        found.admit()
+        yield found
+
+
+def test_the_page_and_the_payloads_are_those_of_an_export(server: Client, exported: Path) -> None:
+    folder = exported.parent
+    files = ["app/page.js", "app/page.css", "data/run/episodes.js", "data/run/e/00003.js", "data/run/f/00001.webp"]
+    for file in ["index.html", *files]:
+        status, headers, content = server.ask(f"/{file.removeprefix('index.html')}")
+        assert (status, content) == (200, (folder / file).read_bytes()), file
+        assert "default-src 'none'" in headers["content-security-policy"]
+        assert "frame-ancestors 'none'" in headers["content-security-policy"]
+        assert headers["x-content-type-options"] == "nosniff"
+        assert headers["referrer-policy"] == "no-referrer"
+        assert "access-control-allow-origin" not in headers
+    name, value = read_payload(server.ask("/data/index.js")[2])
+    assert (name, [run["key"] for run in value["runs"]]) == ("index", ["run"])
+
+
+@pytest.mark.parametrize(
+    ("method", "headers", "status"),
+    [
+        ("GET", {"Host": "evil.example"}, 400),
+        ("GET", {"Host": "127.0.0.1"}, 400),
+        ("GET", {"Host": "127.0.0.1:1"}, 400),
+        ("POST", {}, 403),
+        ("DELETE", {}, 403),
+        ("GET", {"Sec_Fetch_Site": "cross-site"}, 403),
+        ("GET", {"Sec_Fetch_Site": "same-site"}, 403),
+        ("GET", {"Cookie": ""}, 403),
+        ("GET", {"Cookie": "probe_kit_view=guess"}, 403),
+        ("GET", {"Sec_Fetch_Site": "same-origin"}, 200),
+        ("HEAD", {}, 200),
+    ],
+)
+def test_only_the_page_itself_is_answered(
+    server: Client, method: str, headers: dict[str, str], status: int
+) -> None:
+    for path in ("/", "/data/run/run.js", "/follow"):
+        found, _, content = server.ask(path, method, **headers)
+        assert found == (204 if status == 200 and path == "/follow" else status)
+        assert status == 200 or b"put(" not in content
+
+
+def test_a_wrong_token_admits_nothing(server: Client) -> None:
+    for token in ("", "x", server.token[:-1], f"{server.token}x", "%00"):
+        status, headers, _ = server.ask(f"/?token={token}", Cookie="")
+        assert status == 403
+        assert "set-cookie" not in headers
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/data/../run.json", "/data/..%2frun.json", "/data//etc/passwd", "/data/run/run.json", "/nothing",
+        "/data/run/f/00099.webp", "/data/run/f/../../index.js", "/app/../commands.py", "/app/..%2fcommands.py",
+        "/app/", "/data/", "/data/run/run", "/data/other/run.js", "/data/run/map/%2e%2e.js",
+        "/data/run/e/99999.js",
+    ],
+)  # fmt: skip
+def test_another_name_is_not_found(server: Client, path: str) -> None:
+    status, _, content = server.ask(path)
+    assert status == 404
+    assert b"put(" not in content
+
+
+def test_what_the_browser_has_is_not_sent_again_and_large_payloads_are_packed(server: Client) -> None:
+    for path in ("/data/run/episodes.js", "/app/page.js", "/data/run/f/00000.webp"):
+        _, headers, content = server.ask(path)
+        again, _, nothing = server.ask(path, If_None_Match=headers["etag"])
+        assert (again, nothing) == (304, b"")
+        _, packed_headers, packed = server.ask(path, Accept_Encoding="gzip")
+        if path.endswith(".js"):
+            assert packed_headers["content-encoding"] == "gzip"
+            assert gzip.decompress(packed) == content
+            assert len(packed) < len(content)
+
+
+def test_episodes_that_are_committed_while_the_page_is_open_are_followed(
+    small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("probe_kit.view.server.TICK_S", 0.05)
+    plan = little_plan(small_suite.select(["color"]), 0, 4)
+    writer = little_writer(locate(tmp_path / "run"), plan)
+    writer.write(episode(plan, 0))
+    with served([open_run(tmp_path / "run", allow_partial=True)]) as client:
+        client.admit()
+        connection = http.client.HTTPConnection("127.0.0.1", client.port, timeout=60)
+        host = {"Host": f"127.0.0.1:{client.port}", "Cookie": client.cookie}
+        connection.request("GET", "/follow", headers=host)
+        stream = connection.getresponse()
+        assert stream.getheader("content-type", "").startswith("text/event-stream")
+
+        def next_count() -> int:
+            while True:
+                line = stream.readline().decode()
+                if line.startswith("data: "):
+                    said = json.loads(line.removeprefix("data: "))
+                    assert (said["run"], said["planned"], said["failed"]) == ("run", 4, 0)
+                    return int(said["committed"])
+
+        assert next_count() == 1
+        for number in (1, 2, 3):
+            writer.write(episode(plan, number))
+            assert next_count() == number + 1
+            _, value = read_payload(client.ask("/data/run/episodes.js")[2])
+            assert value["number"] == list(range(number + 1))
+        connection.close()
+    seal(tmp_path / "run")
+
+
+def test_a_grown_run_reads_new_commits_only_and_is_the_run_that_is_opened(
+    small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = little_plan(small_suite.select(["color"]), 0, 5)
+    writer = little_writer(locate(tmp_path / "run"), plan)
+    for number in (0, 3):
+        writer.write(episode(plan, number))
+    run = open_run(tmp_path / "run", allow_partial=True)
+    for number in (1, 4):
+        writer.write(episode(plan, number))
+    read: list[int] = []
+    reading = commits.read_commit
+
+    def noted(root: Root, number: int, key: str, raw: bytes) -> commits.Commit:
+        read.append(number)
+        return reading(root, number, key, raw)
+
+    monkeypatch.setattr(commits, "read_commit", noted)
+    grown = run.grown()
+    assert read == [1, 4]
+    assert run.episodes["episode"].tolist() == [0, 3]
+    opened = open_run(tmp_path / "run", allow_partial=True)
+    assert grown.stamp == opened.stamp
+    assert grown.episodes.equals(opened.episodes)
