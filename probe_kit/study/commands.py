@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 HELP = """Run a whole study from one file: models × conditions × categories.
 
-Print the plan, play what is missing, look at what is stored, and print the tables of the file. Stored runs are
-never played again.
+Print the plan, play what is missing, look at what is stored, print the tables.
+Stored runs are never played again.
 
 \b
 probe-kit study run embedded --dry-run
@@ -72,11 +72,11 @@ def run(
 ) -> None:
     """Play and ask what a study needs and is not stored yet, then fit its probes.
 
-    Each model is loaded once for all of its runs. A model that fails stops itself alone, and the ledger keeps the
-    reason. The same command resumes; what failed while it played is tried again with --retry-failed.
+    Each model is loaded once. A model that fails stops itself alone, and the ledger keeps the reason.
+    The same command resumes. What failed while it played is tried again with --retry-failed.
 
     \b
-    probe-kit study run embedded --dry-run
+    probe-kit study run mine.toml --dry-run
     probe-kit study run mine.toml --slots 2
     probe-kit study run mine.toml --only base --retry-failed
     """

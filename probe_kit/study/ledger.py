@@ -73,8 +73,8 @@ class Played(_Record):
     """A whole run. began, ended: of its last playing; empty for a run that lay there already.
 
     episodes: that it holds. seconds: wall-clock time per episode of that playing, None if nothing was played.
-    machine: where. provenance: of all its episodes. served_by: another run that has these episodes, empty if the
-    run lies in its own place.
+    machine: where. stamp: of the commits. provenance: of all its episodes. served_by: another run that has these
+    episodes, empty if the run lies in its own place.
     """
 
     episodes: int
@@ -85,6 +85,7 @@ class Played(_Record):
     ended: str = ""
     seconds: float | None = None
     machine: str = ""
+    stamp: str = ""
     served_by: str = ""
 
 

@@ -32,7 +32,8 @@ class PlannedCell:
     """A cell with what lies at its location. done: episodes of its selection that are stored. why: in words.
 
     seconds: per episode, measured in the stored episodes; None without any. failure: of the last time it was
-    played. waits_for: failure of another run of its model. probes: those that the file names of it.
+    played. waits_for: failure of another run of its model. probes: those that the file names of it. noted: whether
+    the ledger knows the run as it is now.
     """
 
     cell: Cell
@@ -44,6 +45,7 @@ class PlannedCell:
     failure: Failure | None = None
     waits_for: Failure | None = None
     probes: tuple[PlannedProbes, ...] = ()
+    noted: bool = False
 
     @property
     def missing(self) -> int:
@@ -194,7 +196,8 @@ class _Stored:
             return self._failed(PlannedCell(cell, location, "partial", done, why, seconds), entry)
         why = f"whole, served by {location}" if entry.played and entry.played.served_by else "whole"
         probes = tuple(self._probes(cell, entry, run))
-        return PlannedCell(cell, location, "whole", cell.episodes, why, seconds, probes=probes)
+        noted = entry.played is not None and (bool(entry.played.served_by) or entry.played.stamp == run.stamp)
+        return PlannedCell(cell, location, "whole", cell.episodes, why, seconds, probes=probes, noted=noted)
 
     def work(self, one: PlannedCell) -> Work:
         """What is missing of a cell, and what is known of its stored episodes."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from probe_kit._system.optional_dependencies import require
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract import open_run
+from probe_kit.extract import open_run, seal
 from probe_kit.extract.plan import plan_episodes
 from probe_kit.extract.prepared import as_protocol, check_run
 from probe_kit.extract.rollout.preflight import run_preflight
@@ -90,10 +90,13 @@ class _Course:
             self._report(event)
 
     def note_found(self) -> None:
-        """Enter runs that were whole before there was a ledger."""
+        """Finish and enter runs that are whole and not noted: made by hand, or by a process that was killed."""
         for one in self._plan.played:
-            if one.state == "whole" and self.ledger.of(one.cell).played is None:
-                self.ledger.note(one.cell, played=played_by(open_run(locate(one.location), allow_partial=True)))
+            if one.state == "whole" and not one.noted:
+                location = locate(one.location)
+                with location.held(lambda: None):  # which removes what a killed process left aside
+                    seal(location)
+                self.ledger.note(one.cell, played=played_by(open_run(location, allow_partial=True)), failure=None)
 
     def checked(self, missing: list[PlannedCell]) -> Iterator[ModelTask]:
         """The tasks of all models whose runs pass the checks; the others fail at once."""

@@ -158,5 +158,6 @@ def played_by(
         ended=ended,
         seconds=None if seconds is None else round(seconds, 4),
         machine=machine,
+        stamp=run.stamp,
         served_by=served_by,
     )

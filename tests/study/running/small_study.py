@@ -69,12 +69,45 @@ kind = "vlms"
 runs = ["vlms"]
 """
 EPISODES = 4 * 24
+SCRIPTED = """
+schema = 1
+name = "scripted"
+out = "{out}"
+
+[suite]
+path = "{suite}"
+categories = ["color"]
+items = 6
+
+[models.expert]
+family = "expert"
+
+[models.idle]
+family = "idle"
+
+[conditions.plain]
+max_steps = 2
+
+[conditions.dark]
+max_steps = 2
+light_level = 0.7
+
+[[runs]]
+name = "main"
+models = ["expert", "idle"]
+conditions = ["plain", "dark"]
+
+[tables.main]
+kind = "success"
+runs = ["main"]
+"""
+"""Without a network, so that twenty kills take minutes."""
 
 
-def small_study(folder: Path, suite: Suite, out: str | None = None) -> Path:
-    """Its file in `folder`; runs lie in `folder/out` unless `out` says otherwise."""
+def small_study(folder: Path, suite: Suite, text: str = TEXT) -> Path:
+    """Its file in `folder`; runs lie in `folder/out`."""
     file = folder / "study.toml"
-    file.write_text(TEXT.format(out=out or folder / "out", suite=suite.folder), encoding="utf-8")
+    file.write_text(text.format(out=folder / "out", suite=suite.folder), encoding="utf-8")
     return file
 
 
