@@ -143,6 +143,7 @@ LOOKED_FOR = {
     "extract": "accepted so far",
     "ask": "accepted so far",
     "view": "Make one with",
+    "labels": "Make one with",
     "train": "Make one with|AWS_ACCESS_KEY_ID",
     "intervene": "Make one with",
     "retention": "Make one with",
