@@ -230,6 +230,26 @@ def test_two_runs_are_compared_by_pair_and_step(page: Page, address: str, runs: 
     assert f"the tools part by 5 mm at step {np.flatnonzero(apart > 0.005)[0]}" in text(page, ".sentence")
 
 
+def test_a_question_shows_both_layouts_with_what_the_probes_read_and_the_arm_did(
+    page: Page, address: str, runs: list[Run]
+) -> None:
+    page.open(f"{address}#/questions")
+    curve, episodes = load_results(runs[0]).curves["color", "mean"], runs[0].episodes
+    read = dict(zip(curve.episodes, curve.correct[curve.best("backbone")], strict=True))
+    assert page.read("document.querySelectorAll('tbody tr').length") == episodes["item_id"].nunique()
+    disagreeing = []
+    for row in episodes.to_dict("records"):
+        cell = f"[data-item='{row['item_id']}'] [data-stage='{{}} {row['layout']}']"
+        right = row["outcome"] == "correct"
+        assert text(page, cell.format("arm")).startswith("✓" if right else "✗")
+        assert text(page, cell.format("backbone")).startswith("✓" if read[row["episode_id"]] else "✗")
+        assert text(page, cell.format("action")) == "–"
+        if bool(read[row["episode_id"]]) != right:
+            disagreeing.append(row["item_id"])
+    first = page.read("document.querySelector('tbody tr').dataset.item")
+    assert disagreeing.count(first) == max(map(disagreeing.count, disagreeing))
+
+
 def test_hostile_text_is_text(page: Page, address: str) -> None:
     page.open(f"{address}#/overview?run=b")
     named = page.read("document.querySelector('.run select').selectedOptions[0].textContent")
@@ -307,7 +327,7 @@ def test_nothing_overflows_and_every_word_can_be_read(
 ) -> None:
     browser.complaints.clear()
     page = browser.page(width, dark=dark)
-    for view in ("overview", "map", "episodes?ep=1", "compare"):
+    for view in ("overview", "map", "episodes?ep=1", "compare", "questions"):
         page.open(f"{address}#/{view}")
         page.settle()
         assert page.read("document.documentElement.scrollWidth") <= width, (view, page.read(WIDE))

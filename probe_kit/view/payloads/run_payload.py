@@ -106,6 +106,7 @@ def _table(viewed: ViewedRun, asked: Sequence[ViewedRun]) -> dict[str, Any]:
             *({"key": column.key, "heading": column.heading, "help": column.help} for column in columns),
         ],
         "vlm": None if vlm is None else vlm.run.label,
+        "vlm_key": None if vlm is None else vlm.key,
         "rows": [
             {
                 "category": row.category,
