@@ -72,7 +72,7 @@ class FrozenProbes:
         """Of the episode in row `position` of `run.episodes`, at every captured inference that it reached."""
         row = self.run.episodes.iloc[position]
         side, item = str(row["side_correct"]), str(row["item_id"])
-        calls = sum(bool(reached[position]) for reached in self._reached)
+        calls = int(self._calls[position])
         found = np.full((calls, len(self.sites)), np.nan)
         fold = self._fold_of.get(item)
         if not self._reads_activations:
@@ -95,8 +95,8 @@ class FrozenProbes:
         return not (left_out or is_token_view(self._view))
 
     @cached_property
-    def _reached(self) -> list[NDArray[np.bool_]]:
-        return [self.run.reached(call) for call in range(self.run.captured_calls)]
+    def _calls(self) -> NDArray[np.intp]:
+        return count_inferences(self.run)
 
     @cached_property
     def _rows(self) -> dict[str, Rows]:
@@ -123,6 +123,14 @@ class FrozenProbes:
             np.stack([direction.weights.astype(np.float64) for direction in directions]),
             np.stack([np.asarray(direction.intercepts, np.float64) for direction in directions]),
         )
+
+
+def count_inferences(run: Run) -> NDArray[np.intp]:
+    """(E,) how many captured inferences every episode reached."""
+    counts = np.zeros(len(run.episodes), np.intp)
+    for call in range(run.captured_calls):
+        counts += run.reached(call)
+    return counts
 
 
 def toward(side_correct: str) -> float:

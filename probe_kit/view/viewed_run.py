@@ -5,6 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+from numpy.typing import NDArray
+
 from probe_kit.errors import UsageError
 from probe_kit.extract import Run
 from probe_kit.extract.store.format.commits import WITH_CONTROL_STEPS
@@ -14,7 +17,7 @@ from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.view.frozen_probes import FrozenProbes
+from probe_kit.view.frozen_probes import FrozenProbes, count_inferences
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
@@ -50,6 +53,11 @@ class ViewedRun:
     def has_control_steps(self) -> bool:
         """Whether the run holds the control step of every inference."""
         return self.run.root.schema >= WITH_CONTROL_STEPS
+
+    @cached_property
+    def captured_inferences(self) -> NDArray[np.intp]:
+        """(E,) how many captured inferences every episode reached."""
+        return count_inferences(self.run)
 
     @property
     def answers(self) -> bool:

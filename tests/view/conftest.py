@@ -1,12 +1,24 @@
 """The small run that the viewer's tests share, and its export."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from probe_kit.extract import Run, open_run
+from probe_kit.extract import Run, label_run, open_run, seal
+from probe_kit.extract.plan import make_plan
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.writer import RunWriter
+from probe_kit.suite import Suite
+from probe_kit.train import train_probes
 from probe_kit.view import write_viewer
 from probe_kit.view.catalogue import Catalogue
+from tests.support.little_run import STREAMS, certify, episode, little_settings
+
+CALLS = 2
+HOSTILE = "</script><img src=x onerror=alert(1)>"
+"""A label that a page may not obey."""
 
 
 @pytest.fixture(scope="module")
@@ -26,3 +38,36 @@ def exported(little_runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     """The page of both small runs."""
     runs = [open_run(little_runs / name) for name in ("run", "other")]
     return write_viewer(runs, tmp_path_factory.mktemp("viewer") / "page")
+
+
+def write_run(where: Path, suite: Suite, seed: int) -> Run:
+    """24 episodes of two captured inferences. The backbone's last layer holds the answer at the first of them."""
+    settings = {**little_settings(), "captured_calls": CALLS, "tokens": "pooled", "light": str(seed)}
+    plan = make_plan(suite, list(STREAMS), 0, CALLS, True)
+    writer = RunWriter(locate(where), plan, settings)
+    certify(writer)
+    for number in writer.remaining():
+        record = episode(plan, number, seed)
+        draw = np.random.default_rng([seed, number])
+        pooled = {}
+        for stream in STREAMS:
+            shape = (CALLS, *stream.lead, len(stream.views), stream.width)
+            pooled[stream.name] = draw.normal(size=shape).astype(np.float32)
+        sign = 1 if plan.episodes[number].episode.side_correct == "left" else -1
+        pooled["backbone"][0, -1, :, 0] = 3 * sign + draw.normal(size=2) / 2
+        roles = [*record.roles, *record.roles]
+        writer.write(replace(record, arrays={"pooled": pooled}, roles=roles, control_steps=(0, 1)))
+    seal(where)
+    for call in range(CALLS):
+        train_probes(open_run(where), permutations=60, call=call)
+    return open_run(where)
+
+
+@pytest.fixture(scope="module")
+def runs(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
+    """Two runs of the same seeds, whose probes were fitted to both inferences; tests that use them are slow."""
+    folder = tmp_path_factory.mktemp("runs")
+    suite = small_suite.select(["color"])
+    found = [write_run(folder / name, suite, seed) for seed, name in enumerate(("a", "b"))]
+    label_run(folder / "b", HOSTILE)
+    return [found[0], open_run(folder / "b")]

@@ -17,6 +17,7 @@ from probe_kit.extract.store.thumbnails import thumbnail_key
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention import retention_table
 from probe_kit.train import load_results
+from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_directions import read_directions
 from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.payloads.coding import pack_floats, pack_log_odds, payload_script
@@ -205,3 +206,29 @@ def test_the_stamp_of_a_payload_names_commits_and_probes(little_runs: Path) -> N
     assert one.stamp("run/run") == both.stamp("run/run") != both.stamp("other/run")
     assert one.stamp("index") != both.stamp("index")
     assert json.dumps(one.stamp("run/e/00000")) != json.dumps(one.stamp("run/e/00001"))
+
+
+@pytest.mark.slow
+def test_later_inferences_are_read_by_the_fold_that_tests_the_item_and_by_probes_of_their_own(
+    runs: list[Run],
+) -> None:
+    catalogue, results = Catalogue(runs[:1]), load_results(runs[0])
+    own = {call: found.curves["color", "mean"] for call, found in load_results_by_call(runs[0], results).items()}
+    curve = own[0]
+    features = {site: [runs[0].column(site, call=call) for call in range(2)] for site in curve.sites}
+    for position, number in enumerate(runs[0].episodes["episode"]):
+        found = payload(catalogue, f"a/e/{number:05d}")
+        at = curve.episodes.tolist().index(runs[0].episodes["episode_id"].iloc[position])
+        sign = 1 if curve.labels[at] else -1
+        frozen, refitted = (log_odds(found[name]).reshape(2, -1) for name in ("log_odds", "refitted"))
+        for place, site in enumerate(curve.sites):
+            probe = results.direction("color", "mean", site)
+            weights, intercept = (
+                probe.weights[curve.fold_of[at]].astype(float),
+                probe.intercepts[curve.fold_of[at]],
+            )
+            expected = [sign * (features[site][call][position] @ weights + intercept) for call in range(2)]
+            np.testing.assert_allclose(frozen[:, place], expected, atol=0.003)
+            stored = [sign * own[call].decisions[place, own[call].episodes.tolist().index(curve.episodes[at])]
+                      for call in range(2)]  # fmt: skip
+            np.testing.assert_allclose(refitted[:, place], stored, atol=0.003)

@@ -33,7 +33,7 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
     row = {str(name): value for name, value in run.episodes.iloc[position].to_dict().items()}
     probes = viewed.probes.get(str(row["category"]))
     found = None if probes is None else probes.log_odds(position)
-    calls = sum(bool(viewed.run.reached(call)[position]) for call in range(run.captured_calls))
+    calls = int(viewed.captured_inferences[position])
     trajectory = run.trajectory(position) if run.has_trajectories else None
     return {
         "number": number,
