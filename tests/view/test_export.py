@@ -73,7 +73,9 @@ def test_the_command_prints_the_page(little_runs: Path, tmp_path: Path) -> None:
 
 
 def test_the_vendored_file_is_the_one_that_its_record_names() -> None:
-    rows = re.findall(r"^\| `(\S+)` .* `([0-9a-f]{64})` \|$", (APP / "VENDORED.md").read_text(), re.MULTILINE)
+    rows = re.findall(
+        r"^\| `(\S+)` .* `([0-9a-f]{64})` \|$", (APP / "VENDORED.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert [name for name, _ in rows] == ["preact-htm.js"]
     for name, recorded in rows:
         assert hashlib.sha256((APP / name).read_bytes()).hexdigest() == recorded

@@ -88,7 +88,7 @@ def heads_that_are_not_declared_are_refused_by_name(subject: Subject) -> None:
         with refused(f"heads of {stream.name}", UnknownSiteError, says=stream.name):
             stream.sites(HEADS)
         site = Site(stream.name, 0, HEADS, None if stream.iterations is None else 0)
-        with refused(f"tap({site})", UnknownSiteError, says=model.card.family):
+        with refused(f"tap({site})", UnknownSiteError, says=HEADS):
             model.tap(site)
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from probe_kit._terminal.console import out
 from probe_kit.cli import app
 from probe_kit.errors import RunIncompleteError, UsageError
 from probe_kit.extract import ExtractSettings, open_run
@@ -243,7 +244,8 @@ def test_what_fails_while_it_plays_is_kept_with_its_traceback_and_tried_again_on
         assert len(tries) == tried
     assert states(changed)["broken/short"] == ("failed", 0)
     assert states(changed)["idle/dark"] == ("whole", 4)
-    result = CliRunner().invoke(app, ["study", "status", str(changed)], env={"COLUMNS": "200"})
+    monkeypatch.setattr(out, "_width", 200)
+    result = CliRunner().invoke(app, ["study", "status", str(changed)])
     assert result.exit_code == 1
     assert "the loader of a family is wrong" in result.stdout
 
