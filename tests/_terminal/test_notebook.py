@@ -70,6 +70,7 @@ def shown(
     return dict(zip(cells, done, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shown", [INLINE, pytest.param("agg", marks=pytest.mark.slow)], indirect=True, ids=["inline", "agg"]
 )
@@ -94,6 +95,7 @@ def test_a_policy_and_a_tape_show_short_tables_and_short_lines() -> None:
         assert_short(name, DisplayFormatter().format(shown)[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shown", [INLINE], indirect=True, ids=["inline"])
 def test_objects_show_short_tables_and_short_lines(shown: dict[str, NotebookNode]) -> None:
     for name in OBJECTS:
@@ -104,6 +106,7 @@ def test_objects_show_short_tables_and_short_lines(shown: dict[str, NotebookNode
     assert "random weights" in table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shown", [INLINE], indirect=True, ids=["inline"])
 def test_a_notebook_draws_one_bar_while_it_works_and_none_for_what_is_read_back(
     shown: dict[str, NotebookNode],

@@ -108,6 +108,7 @@ def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothin
     assert measured(replace(alone, image_swap=SwapEffect(use=follows)), shown) == "used"
 
 
+@pytest.mark.slow
 def test_a_random_network_of_another_seed_is_found_again(small_suite: Suite, tmp_path: Path) -> None:
     """Its pictures are exchanged before its own weights; those of another seed are refused."""
     other = replace(OTHER_TWINS[0], max_steps=1)

@@ -23,6 +23,8 @@ from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
 from tests.support.pi0_checkpoints import write_intact
 
+pytestmark = pytest.mark.slow
+
 ACTING = ExtractSettings(
     "pi0-tiny", random_weights=True, categories=("color",), scene=SceneSpec(max_steps=4), env_workers=0
 )

@@ -229,6 +229,7 @@ def test_a_picture_that_changed_on_disk_stops_everything(two_items: Suite, tmp_p
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_run_that_does_not_fit_the_disk_is_refused_unless_forced(
     two_items: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

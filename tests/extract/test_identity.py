@@ -58,6 +58,7 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:
     monkeypatch.setattr("probe_kit.extract.prepared.provenance_here", there)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -33,6 +33,7 @@ def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Ex
     )
 
 
+@pytest.mark.slow
 def test_a_run_has_the_two_streams_and_every_token_has_its_role(settings: ExtractSettings, tmp_path: Path) -> None:
     run = extract_run(settings, tmp_path / "run")
     assert list(run.streams) == ["backbone", "action"]

@@ -187,6 +187,7 @@ def test_protocols_that_are_not_there_are_refused() -> None:
         prepare(ExtractSettings("smolvla", protocol="act2answer"))
 
 
+@pytest.mark.slow
 def test_a_run_names_its_protocol_and_the_report_lists_what_differs(small_suite: Suite, tmp_path: Path) -> None:
     """A tiny checkpoint of the protocol's kind, in the protocol's scene; two actions instead of eighty."""
     settings = ExtractSettings(

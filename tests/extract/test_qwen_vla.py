@@ -15,6 +15,8 @@ from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from tests.support import internvla_checkpoints, xiaomi_checkpoints
 
+pytestmark = pytest.mark.slow
+
 EPISODES = 8
 
 

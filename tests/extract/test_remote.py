@@ -120,6 +120,7 @@ def test_a_store_that_ignores_conditions_is_refused_for_several_writers(suite: S
     assert len(run.episodes) == 4
 
 
+@pytest.mark.slow
 def test_numbers_and_probes_of_a_bucket_are_those_of_a_folder(recorded_run: Run, copied: Run) -> None:
     assert copied.sealed
     np.testing.assert_array_equal(copied.column(SITE), recorded_run.column(SITE))

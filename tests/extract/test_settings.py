@@ -33,6 +33,7 @@ def test_an_edited_run_is_called_so_and_is_another_run() -> None:
     assert plain.choices() != edited.choices()
 
 
+@pytest.mark.slow
 def test_only_what_is_asked_is_drawn_of_the_embedded_suite(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

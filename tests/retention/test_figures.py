@@ -79,6 +79,7 @@ def drawn(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return table, {exhibit.name: exhibit.draw() for exhibit in collect_figures(runs, table)}
 
 
+@pytest.mark.slow
 def test_nothing_is_clipped_footers_are_one_line_and_the_width_is_used(drawn: Drawn) -> None:
     table, figures = drawn
     for name, figure in figures.items():

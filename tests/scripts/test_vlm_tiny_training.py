@@ -18,6 +18,8 @@ from probe_kit.env.question import Question
 from probe_kit.env.scene import SIDES
 from probe_kit.models.embedded.vlm_tiny import new_vlm_tiny, write_vlm_tiny
 
+pytestmark = pytest.mark.slow
+
 PRESETS = ("bridge", "act2answer")
 LETTERS = {("A", True): 0, ("A", False): 1, ("B", True): 1, ("B", False): 0}
 """The side (0 left) by the letter and whether left is named first."""

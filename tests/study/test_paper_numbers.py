@@ -159,6 +159,7 @@ GROUPS = {
 }
 
 
+@pytest.mark.slow
 def test_co_trained_minus_robot_only_is_10_points_and_p_over_models_a_fifth(
     runs: dict[str, SaidRun], derived: dict[str, Any]
 ) -> None:
@@ -184,6 +185,7 @@ def test_without_magma_the_difference_is_half(rows: dict[str, RetentionTable]) -
     assert 100 * (fmean(co_trained[1:]) - fmean(robot_only)) == pytest.approx(5.51, abs=0.005)
 
 
+@pytest.mark.slow
 def test_what_fine_tuning_changes(runs: dict[str, SaidRun], derived: dict[str, Any]) -> None:
     names = ["OpenVLA (SFT)", "OpenVLA (RL)", "OpenVLA"]
     table = retention_table([runs[name] for name in names], against="OpenVLA")
@@ -195,6 +197,7 @@ def test_what_fine_tuning_changes(runs: dict[str, SaidRun], derived: dict[str, A
         assert found == pytest.approx(derived[f"rq6 {name} - OpenVLA"], abs=0.005)
 
 
+@pytest.mark.slow
 def test_ablations_minus_the_default_are_paired_on_the_four_categories_in_common(
     tables: dict[str, Any], runs: dict[str, SaidRun], derived: dict[str, Any]
 ) -> None:
@@ -213,6 +216,7 @@ def test_ablations_minus_the_default_are_paired_on_the_four_categories_in_common
     assert checked == 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("vlm", "policy"), [("Prismatic-VLM-7B", "OpenVLA"), ("Paligemma-3B", "pi0")])
 def test_vlm_minus_vla_of_the_two_policies_whose_source_is_there(
     tables: dict[str, Any], runs: dict[str, SaidRun], derived: dict[str, Any], vlm: str, policy: str

@@ -70,6 +70,7 @@ def test_any_value_in_any_field_is_refused_by_name(
         assert getattr(loaded.items[2], field) == value, "it is read as it was written"
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Generating overly large repr")
 @given(field=st.sampled_from(CARD), value=st.sampled_from(HOSTILE))
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)

@@ -78,6 +78,7 @@ def independent(items: int, above: float, sites: int, draws: int) -> float:
     return float((best(signal, draws) > null[-ceil(0.05 * len(null))]).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("items", "above", "sites"), [(60, 0.25, 1), (60, 0.1, 1), (24, 0.15, 5)])
 def test_power_against_chance_is_that_of_an_independent_simulation(items: int, above: float, sites: int) -> None:
     expected = independent(items, above, sites, 1000)

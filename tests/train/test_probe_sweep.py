@@ -31,6 +31,7 @@ def test_the_curve_peaks_exactly_where_the_answer_was_planted(planted_run: Plant
         assert curve.index[curve["p_fwe"] < 0.05].tolist() == [str(site)]
 
 
+@pytest.mark.slow
 def test_nothing_is_significant_with_shuffled_labels(planted_run: PlantedRun) -> None:
     scores = train_probes(planted_run({PLANTED: 2.0}), permutations=60, target="shuffled").scores
     assert (scores["p_fwe"] > 0.05).all()

@@ -72,6 +72,7 @@ def assert_reads_as_written(run: Run, plan: Plan, written: list[int], calls: int
             np.testing.assert_array_equal(values, (bits.astype(np.uint32) << 16).view(np.float32))
 
 
+@pytest.mark.slow
 @given(
     stream=STREAMS, calls=st.integers(1, 3), codec=st.sampled_from(["zstd", "fast", "none"]),
     episodes=st.sets(st.integers(0, 11), min_size=1),

@@ -15,6 +15,8 @@ from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.intervene.replay.token_directions import TokenDirections, fit_token_directions
 from probe_kit.intervene.replay.token_features import TokenFeatures, by_episode, fit_by_fold
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 

@@ -66,6 +66,7 @@ def test_transformers_reads_the_same_network_from_the_same_folder(vlm: PaliGemma
     np.testing.assert_allclose(reading.option_logits[0], logits[options].numpy(), atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["bridge", pytest.param("act2answer", marks=pytest.mark.slow)])
 def test_it_knows_color_on_pictures_it_has_not_seen(scene: str, tmp_path: Path) -> None:
     """Eight questions, each with the options in both orders."""

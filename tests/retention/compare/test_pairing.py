@@ -80,6 +80,7 @@ def test_a_success_rate_less_another_is_what_a_plain_loop_over_groups_says(tmp_p
         assert found.p == pytest.approx(p)
 
 
+@pytest.mark.slow
 def test_an_accuracy_less_another_is_what_a_plain_loop_over_groups_says(probed_run: ProbedRun) -> None:
     one, other = probed_run({"color": SIGNAL}, "one"), probed_run({"color": WEAK}, "other")
     found = difference(retention_table([one, other]), "other", "color")

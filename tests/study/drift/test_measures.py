@@ -13,6 +13,8 @@ from probe_kit.study.tables.drifts import drift_table
 from probe_kit.train import ArrayRun, load_results, train_probes
 from tests.retention.asked_runs import ASK, SaidRun, episodes
 
+pytestmark = pytest.mark.slow
+
 ITEMS, WIDTH = 24, 8
 TRUTH = {
     "kept": "kept",

@@ -145,6 +145,7 @@ def test_tables_are_made_of_stored_runs_alone_and_name_what_is_missing(file: Pat
     ]
 
 
+@pytest.mark.slow
 def test_a_file_that_asks_for_more_items_plays_the_missing_ones_alone(file: Path) -> None:
     conduct_study(plan_study(load_study(file)), env_workers=0)
     more = file.with_name("more.toml")
@@ -182,6 +183,7 @@ def test_a_whole_study_is_entered_in_its_ledger_again_if_that_was_deleted(file: 
         assert (found.settings_sha256, found.episodes, found.began) == (made.settings_sha256, made.episodes, "")
 
 
+@pytest.mark.slow
 def test_equal_runs_elsewhere_serve_a_study_and_stay_where_they_lie(file: Path) -> None:
     conduct_study(plan_study(load_study(file)), env_workers=0)
     text = file.read_text(encoding="utf-8")
@@ -205,6 +207,7 @@ def test_equal_runs_elsewhere_serve_a_study_and_stay_where_they_lie(file: Path) 
     assert {path: path.stat().st_mtime_ns for path in Path(out).rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.slow
 def test_every_scene_is_built_before_the_first_run_is_played(file: Path, tmp_path: Path) -> None:
     torn = tmp_path / "torn.png"
     torn.write_text("no picture", encoding="utf-8")

@@ -35,6 +35,7 @@ def test_twins_put_every_baseline_at_exactly_one_half(honest: tuple[Baseline, ..
     assert {baseline.accuracy for baseline in honest} == {0.5}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("category", ["attribute", pytest.param("state", marks=pytest.mark.slow)])
 def test_pictures_give_the_answer_away_if_only_one_polarity_is_asked(category: str, tmp_path: Path) -> None:
     suite = build_suite(tmp_path / "suite", [category], 100)

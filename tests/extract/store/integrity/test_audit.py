@@ -76,6 +76,7 @@ def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
         verify_run(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_command_reports_and_exits_with_1(damaged: Path) -> None:
     flip_a_bit(an_object(damaged, "backbone/pooled", 0))
     command = [sys.executable, "-m", "probe_kit", "run", "verify", str(damaged), "--deep", "--json"]

@@ -12,6 +12,7 @@ from probe_kit.hooks.testing import example_observations
 from tests.support.smolvla_checkpoints import write_smolvla
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shown", [1, 2])
 @pytest.mark.parametrize(
     "fields",
