@@ -26,6 +26,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what runs in its background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+gc.disable()  # until all tests are collected: imports and tests make objects that stay
 CHECKOUT = Path(__file__).parents[1]
 GOLDEN = Path(__file__).parent / "golden"
 SHARED = Path(os.environ.get("PROBE_KIT_SHARED", CHECKOUT.parent / "shared"))
@@ -105,6 +106,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """What the imported libraries hold stays: looking through it for garbage again and again takes a minute."""
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

@@ -281,6 +281,7 @@ def assert_no_traceback(run: Path, path: Path, cases: list[tuple[str, bytes]]) -
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pattern", RECORDS)
 def test_a_malformed_record_with_a_right_hash_is_damage_and_no_traceback(run: Path, pattern: str) -> None:
     path = the_record(run, pattern)

@@ -204,6 +204,7 @@ def test_who_answers_by_side_has_no_letter_bias_and_is_right_as_often_as_wrong(s
     assert (episodes["content"] == 1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prompt", [P1, P2, SEEN], ids=["p1", "p2", "seen"])
 def test_without_a_picture_exactly_as_many_are_right_as_wrong(settings: AskSettings, prompt: Template) -> None:
     episodes = answers(replace(settings, picture="none", prompt=prompt, items=6))

@@ -123,6 +123,7 @@ def test_a_folder_that_is_not_there_is_refused_without_the_network(name: str, sm
         prepare(settings_of(name, small_suite, checkpoint="./nowhere"), fetch=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fetch", [True, False])
 def test_words_that_a_policy_cannot_read_are_refused_before_its_network_is_built(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fetch: bool

@@ -101,6 +101,7 @@ util.find_spec = lambda name, *rest: None if name == "rtbdata" else found(name, 
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "workers",
     [("--workers", "1"), *(pytest.param(other, marks=pytest.mark.slow) for other in [(), ("--env-workers", "2")])],

@@ -60,6 +60,7 @@ def stop_after(count: int):
     return progress
 
 
+@pytest.mark.slow
 def test_a_run_that_was_interrupted_continues_to_the_same_bytes(two_items: Suite, tmp_path: Path) -> None:
     settings = ExtractSettings("pi0-tiny", suite=two_items.folder, scene=SHORT, tokens="all")
     extract_run(settings, tmp_path / "whole")

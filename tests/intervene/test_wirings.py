@@ -241,6 +241,7 @@ def tie_of(session: WiredSession, name: str, layer: int) -> str:
     return tie_at_site(whole, [row for row in along if not row.is_control])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "ties"),
     [

@@ -50,6 +50,7 @@ def cards(page: str) -> list[dict[str, Any]]:
     return listed
 
 
+@pytest.mark.slow
 def test_the_page_needs_nothing_but_itself(probed_run: ProbedRun) -> None:
     page = report_html([probed_run({"color": SIGNAL})])
     assert "<b>Bold</b>: above chance and every control" in page

@@ -75,6 +75,7 @@ def test_both_layouts_show_the_correct_picture_on_opposite_sides(small_suite: Su
     assert original.picture(original.side_correct) == swapped.picture(swapped.side_correct)
 
 
+@pytest.mark.slow
 def test_over_both_layouts_no_instruction_leans_to_a_side(embedded: Suite) -> None:
     sides = Counter((episode.item.instruction, episode.side_correct) for episode in embedded.episodes())
     for instruction in {item.instruction for item in embedded.items}:

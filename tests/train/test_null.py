@@ -28,6 +28,7 @@ def p_values(seed: int, sites: int, permuted_labels: int) -> tuple[np.ndarray, n
     return pointwise_p(accuracy, null), max_statistic_p(accuracy, null)
 
 
+@pytest.mark.slow
 def test_p_values_without_signal_are_uniform_or_larger() -> None:
     """Ties between accuracies make p larger, never smaller."""
     p = np.sort([p_values(seed, 1, 19)[0][0] for seed in range(40)])

@@ -23,6 +23,7 @@ PLANTED_EXPERT = Site("expert", 1, "residual", 0)
 PlantedRun = Callable[..., ArrayRun]
 
 
+@pytest.mark.slow
 def test_the_curve_peaks_exactly_where_the_answer_was_planted(planted_run: PlantedRun) -> None:
     scores = train_probes(planted_run({PLANTED: 2.0, PLANTED_EXPERT: 2.0}), permutations=60).scores
     for stream, site in (("backbone", PLANTED), ("expert", PLANTED_EXPERT)):

@@ -190,6 +190,7 @@ def generator_exit(_: Any) -> Any:
     raise GeneratorExit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [

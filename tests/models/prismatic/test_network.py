@@ -102,6 +102,7 @@ def test_every_part_has_the_precision_that_is_asked_for_whatever_the_file_says(a
     assert {parameter.dtype for parameter in built.parameters()} == {asked}
 
 
+@pytest.mark.slow
 def test_the_full_size_has_the_released_number_of_parameters() -> None:
     assert sum(parameter.numel() for parameter in full_size_openvla().parameters()) == 7_541_237_184
     assert full_size_prismatic().state_dict().keys() == full_size_openvla().state_dict().keys()

@@ -23,6 +23,7 @@ def rules(folder: Path) -> set[str]:
     return {finding.rule for finding in validate_suite(folder).findings}
 
 
+@pytest.mark.slow
 def test_the_embedded_suite_is_valid(embedded: Suite) -> None:
     report = validate_suite(embedded.folder)
     assert report.ok

@@ -244,6 +244,7 @@ def test_the_two_states_of_a_thing_look_different() -> None:
 # -- symmetry ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_shapes_are_what_they_are_called_when_measured() -> None:
     for couple in couples("symmetry", 60):
         for concept, tile in ((couple.left, couple.left_tile), (couple.right, couple.right_tile)):

@@ -64,6 +64,7 @@ class _Letters:
         return [replace(seen[0], instruction=text) for text in ("Put it on the star", "Put it on the stir")]
 
 
+@pytest.mark.slow
 class TestOneStepHeard(_Letters, AdapterContract):
     family = "spatialvla"
 
@@ -95,7 +96,6 @@ class TestWholeChunkHeardWithinSlotsByTheTrainingCamera(_Letters, AdapterContrac
         return chunked
 
 
-@pytest.mark.slow
 class TestWithoutDepth(_Letters, AdapterContract):
     @pytest.fixture
     def policy(self, flat: SpatialVLA) -> SpatialVLA:

@@ -24,6 +24,8 @@ from probe_kit.intervene.replay.rollout import roll_out
 from probe_kit.intervene.replay.session import ReplaySession, open_session
 from probe_kit.suite import Suite
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 

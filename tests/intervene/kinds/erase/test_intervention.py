@@ -22,6 +22,8 @@ from probe_kit.intervene import (
 from probe_kit.intervene.kinds.erase.effects import ErasureEffect, erasure_effects
 from tests.intervene.answers import follower, habit, outcomes_of
 
+pytestmark = pytest.mark.slow
+
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 

@@ -110,6 +110,7 @@ def drawn(seed: int, groups: int, mean: float, spread: float, other: float = 0.0
 DRAWS = 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("groups", "mean", "spread", "other", "expected", "least"),
     [
