@@ -19,6 +19,7 @@ def play_many(make_env, play):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", EPISODES)
 @pytest.mark.parametrize("preset", ["bridge", "frontal"])
 @pytest.mark.parametrize("arm", ARMS)

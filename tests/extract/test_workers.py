@@ -40,6 +40,7 @@ def plain(suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return extract_run(settings(suite, env_workers=0), tmp_path_factory.mktemp("plain") / "run").path
 
 
+@pytest.mark.slow
 def test_environment_processes_give_the_same_bytes(suite: Suite, plain: Path, tmp_path: Path) -> None:
     run = extract_run(settings(suite, env_workers=2), tmp_path / "run")
     assert commits(run.path) == commits(plain)

@@ -74,6 +74,7 @@ def test_every_link_of_the_contents_leads_somewhere(probed_run: ProbedRun) -> No
     assert all(f'id="{link}"' in page for link in links)
 
 
+@pytest.mark.slow
 def test_the_page_opens_with_what_is_encoded_and_used_in_plain_words(probed_run: ProbedRun) -> None:
     page = report_html([probed_run({"color": SIGNAL, "shape": NOISE}, "pi0-tiny")])
     opening = page[page.index('<section id="summary"') : page.index('<details class="part"')]

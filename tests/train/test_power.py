@@ -13,6 +13,7 @@ from probe_kit.statistics.significance import detectable, items_for_width
 from probe_kit.train.power import _carriers, _limit, fewest, items_needed, simulate
 
 
+@pytest.mark.slow
 def test_power_grows_with_items_and_with_the_signal() -> None:
     few, many = simulate(24, 0.15, draws=60), simulate(150, 0.15, draws=60)
     assert few.chance < many.chance
@@ -133,6 +134,7 @@ def test_a_number_that_reaches_the_goal_by_luck_is_not_the_fewest() -> None:
     assert fewest(lambda items: items == 1000, 10, 1000) is not None
 
 
+@pytest.mark.slow
 def test_the_items_needed_reach_the_power_and_a_step_less_does_not() -> None:
     needed = items_needed(0.25, 0.8, sites=3, draws=60)
     assert needed.items is not None

@@ -46,6 +46,7 @@ def fall(_: Any) -> Any:
     raise KeyError("no such thing")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [

@@ -119,6 +119,7 @@ def test_the_commands_print_the_plan_and_say_by_their_exit_code_whether_it_is_wh
     assert run.invoke(app, ["study", "status", str(file), "--only", "absent-block"]).exit_code == 2
 
 
+@pytest.mark.slow
 def test_tables_are_made_of_stored_runs_alone_and_name_what_is_missing(file: Path) -> None:
     conduct_study(plan_study(load_study(file)), env_workers=0)
     study = load_study(file)

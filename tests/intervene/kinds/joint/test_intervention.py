@@ -63,6 +63,7 @@ def test_it_is_stored_listed_and_shown(copy: Run, result: InterventionResult) ->
     assert len(result.table) == len(rows)
 
 
+@pytest.mark.slow
 def test_heads_of_one_block_are_cells_and_no_search_of_the_backbone(
     copy: Run, source: ReplaySource, twin: "Policy"
 ) -> None:
