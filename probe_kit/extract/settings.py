@@ -429,7 +429,7 @@ def run_label(settings: RunSettings) -> str:
 
 def check_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: str) -> None:
     """Raise SettingsMismatchError naming the settings that differ between a stored run and this request."""
-    was, now = _flat(stored), _flat(asked)
+    was, now = flat_settings(stored), flat_settings(asked)
     different = [key for key in sorted(was | now) if was.get(key) != now.get(key)]
     if different:
         lines = [f"  {key}: stored {was.get(key)!r}, asked {now.get(key)!r}" for key in different]
@@ -439,11 +439,12 @@ def check_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: s
         )
 
 
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    if not isinstance(value, dict):
+def flat_settings(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Settings by their path, such as `scene.light_level`."""
+    if not isinstance(value, Mapping):
         return {prefix: value}
     return {
         key: leaf
         for name, child in value.items()
-        for key, leaf in _flat(child, f"{prefix}.{name}" if prefix else str(name)).items()
+        for key, leaf in flat_settings(child, f"{prefix}.{name}" if prefix else str(name)).items()
     }

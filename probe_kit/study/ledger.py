@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.rollout.events import traceback_of
+from probe_kit.extract.settings import flat_settings
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hashing import sha256_text
 from probe_kit.study.cells import Cell
@@ -201,17 +202,16 @@ def name_of(cell: Cell) -> str:
 
 def settings_changed(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
     """In words what differs between the settings of two records, such as `light_level 1 → 0.7`."""
-    old, new = dict(_flat(before)), dict(_flat(after))
+    old, new = _leaves(before), _leaves(after)
     names = [name for name in (*new, *(one for one in old if one not in new)) if old.get(name) != new.get(name)]
-    return [f"{name} {_short(old.get(name))} → {_short(new.get(name))}" for name in names]
+    return [f"{name.rpartition('.')[2]} {_short(old.get(name))} → {_short(new.get(name))}" for name in names]
 
 
-def _flat(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value)
-        else:
-            yield name, list(value) if isinstance(value, tuple) else value
+def _leaves(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """By path; a stored record has lists where settings have tuples."""
+    return {
+        name: list(value) if isinstance(value, tuple) else value for name, value in flat_settings(settings).items()
+    }
 
 
 def _short(value: Any) -> str:

@@ -82,6 +82,12 @@ def test_changed_settings_are_named_by_their_innermost_key() -> None:
     assert settings_changed(before, before) == []
 
 
+def test_two_settings_of_one_innermost_name_are_told_apart() -> None:
+    before = {"camera": {"width": 640}, "picture": {"width": 224}}
+    after = {"camera": {"width": 320}, "picture": {"width": 224}}
+    assert settings_changed(before, after) == ["width 640 → 320"]
+
+
 def test_a_plan_says_what_changed_since_a_run_of_the_same_name(
     study_file: Path, cell: Cell, tmp_path: Path
 ) -> None:

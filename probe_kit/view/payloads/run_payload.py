@@ -1,9 +1,10 @@
 """The payload of a run: what it is, its streams and sites, its rows of the table, its settings."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from probe_kit.env.scoring.rules import RULES
+from probe_kit.extract.settings import flat_settings
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.columns.columns import (
     ACCURACY,
@@ -67,7 +68,7 @@ def run_payload(viewed: ViewedRun, others: Sequence[ViewedRun] = ()) -> dict[str
         },
         "table": _table(viewed, [other for other in others if other.answers and other.run.suite == run.suite]),
         "notes": [note for note in viewed.table.notes if len(run.episodes)],
-        "settings": dict(_flat(run.settings)),
+        "settings": {name: str(value) for name, value in flat_settings(run.settings).items()},
         "stamp": run.stamp,
     }
 
@@ -138,12 +139,3 @@ def _cell(column: Column, row: RetentionRow) -> dict[str, Any]:
         cell["value"] = rounded(value)
         cell["limits"] = None if limits is None else [rounded(limit) for limit in limits]
     return cell
-
-
-def _flat(settings: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Settings by their path, such as `scene.light_level`, as text."""
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", str(value)
