@@ -1,5 +1,6 @@
 """Cross-validation folds that keep items with a shared picture together."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -38,7 +39,7 @@ def grouped_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int)
     """
     fold_of = assign_folds(labels, groups, n_folds, seed)
     classes = np.unique(np.asarray(labels))
-    folds = [Fold(np.flatnonzero(fold_of != fold), np.flatnonzero(fold_of == fold)) for fold in range(n_folds)]
+    folds = split_by_fold(fold_of, range(n_folds))
     if any(np.unique(np.asarray(labels)[fold.train]).size < max(2, classes.size) for fold in folds):
         raise TooFewGroupsError(
             f"{np.unique(np.asarray(groups)).size} groups leave a training fold with a single class; "
@@ -46,6 +47,11 @@ def grouped_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int)
             "Extract more items of this category."
         )
     return folds
+
+
+def split_by_fold(fold_of: NDArray[np.integer], numbers: Iterable[int]) -> list[Fold]:
+    """The splits of (E,) fold numbers, one for each of `numbers`."""
+    return [Fold(np.flatnonzero(fold_of != number), np.flatnonzero(fold_of == number)) for number in numbers]
 
 
 def fold_units(episodes: "pd.DataFrame", unit: FoldUnit) -> NDArray[np.str_]:

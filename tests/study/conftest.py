@@ -4,6 +4,7 @@ import pytest
 
 from probe_kit.study import LoadedStudy, conduct_study, load_study, plan_study
 from probe_kit.suite import Suite
+from tests.study.running.small_study import small_study
 
 PLAYED = """
 schema = 1
@@ -80,9 +81,6 @@ runs = ["main"]
 @pytest.fixture(scope="session")
 def played(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> LoadedStudy:
     """Whole, without probes."""
-    folder = tmp_path_factory.mktemp("played")
-    file = folder / "study.toml"
-    file.write_text(PLAYED.format(out=folder / "out", suite=small_suite.folder), encoding="utf-8")
-    study = load_study(file)
+    study = load_study(small_study(tmp_path_factory.mktemp("played"), small_suite, PLAYED))
     assert conduct_study(plan_study(study), env_workers=0) == []
     return study

@@ -17,9 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import NoInterventionsError, UsageError
+from probe_kit.errors import NoInterventionsError
 from probe_kit.extract.run_layout import INTERVENTIONS
-from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle
+from probe_kit.extract.store.format.bundles import (
+    HEAD,
+    Bundle,
+    complete_key,
+    read_bundles,
+    tidy_bundle,
+    write_bundle,
+)
 from probe_kit.extract.store.format.hashes import as_json
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.intervene.store.former_words import (
@@ -204,10 +211,5 @@ def find_stored(run: RunReader, key: str | None = None, kind: str | None = None)
                 f"episodes. Run `probe-kit intervene {run.location}`"
             )
         return there[-1]
-    found = [one for one in there if key and one.key.startswith(key)]
-    if len(found) != 1:
-        raise UsageError(
-            f"{run.location} has {'several' if found else 'no'} interventions {key!r}; it has: "
-            f"{', '.join(one.key for one in there) or 'none'}"
-        )
-    return found[0]
+    by_key = {one.key: one for one in there}
+    return by_key[complete_key(key, by_key, run.location, "interventions")]

@@ -1,6 +1,8 @@
 """Nested, grouped cross-validation: the folds, the grid of C, and the probes of an outer fold."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,10 +24,16 @@ class NestedFold:
     inner: list[Fold]
 
 
-def nested_folds(labels: NDArray[np.bool_], groups: ArrayLike, seed: int) -> list[NestedFold]:
+def nested_folds(
+    labels: NDArray[Any],
+    groups: ArrayLike,
+    seed: int,
+    split: Callable[[NDArray[Any], ArrayLike, int, int], list[Fold]] = grouped_folds,
+) -> list[NestedFold]:
     """Outer folds for scoring, each with inner folds for choosing C; all positions refer to the E episodes.
 
-    labels, groups: (E,). Raises TooFewGroupsError.
+    labels, groups: (E,). split: makes the folds of labels, groups, their number and a seed. Raises what it raises,
+    by default TooFewGroupsError.
     """
     group_of = np.asarray(groups)
     return [
@@ -33,10 +41,10 @@ def nested_folds(labels: NDArray[np.bool_], groups: ArrayLike, seed: int) -> lis
             outer,
             [
                 Fold(outer.train[inner.train], outer.train[inner.test])
-                for inner in grouped_folds(labels[outer.train], group_of[outer.train], INNER_FOLDS, seed)
+                for inner in split(labels[outer.train], group_of[outer.train], INNER_FOLDS, seed)
             ],
         )
-        for outer in grouped_folds(labels, groups, OUTER_FOLDS, seed)
+        for outer in split(labels, groups, OUTER_FOLDS, seed)
     ]
 
 

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -59,10 +60,15 @@ class ControlInputs:
 
     def layer(self, width: int, seed: int) -> Features:
         """(n, width) of a random tanh layer on pictures, words and, where there is one, state."""
+        return random_layer(self._layer_inputs, width, seed)
+
+    @cached_property
+    def _layer_inputs(self) -> list[Features]:
+        """Read once for the layers of all streams."""
         parts = [self._pixels(SIDE), self.features("instruction")]
         if why_no_sim(self.run) is None:
             parts.append(self.features("state"))
-        return random_layer(parts, width, seed)
+        return parts
 
     def _pixels(self, side: int) -> Features:
         assert self.suite is not None, "what needs pictures is given them"

@@ -7,15 +7,15 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS, Fold, assign_folds
+from probe_kit.statistics.folds import OUTER_FOLDS, Fold, assign_folds, split_by_fold
 from probe_kit.statistics.label_permutations import exchange_blocks, movable_share, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import Task
-from probe_kit.train.crossval.nested_folds import NestedFold
+from probe_kit.train.crossval.nested_folds import NestedFold, nested_folds
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.labels.label_probe import LabelProbe, fit_label_probe
@@ -71,7 +71,7 @@ def label_problem(
     trained on one value.
     """
     _check_groups(labels, samples)
-    folds = _folds(samples, derive_seed("label folds", seed))
+    folds = nested_folds(samples.strata, samples.groups, derive_seed("label folds", seed), _split)
     blocks, kinds = _blocks(run, samples)
     share = movable_share(blocks, kinds)
     if permutations and share < LEAST_MOVABLE:
@@ -113,23 +113,9 @@ def _check_groups(labels: Labels, samples: LabelledSamples) -> None:
             )
 
 
-def _folds(samples: LabelledSamples, seed: int) -> list[NestedFold]:
-    """Nested folds of whole groups, balanced by stratum and size."""
-    return [
-        NestedFold(
-            outer,
-            [
-                Fold(outer.train[inner.train], outer.train[inner.test])
-                for inner in _split(samples.strata[outer.train], samples.groups[outer.train], INNER_FOLDS, seed)
-            ],
-        )
-        for outer in _split(samples.strata, samples.groups, OUTER_FOLDS, seed)
-    ]
-
-
-def _split(strata: NDArray[np.str_], groups: NDArray[np.str_], count: int, seed: int) -> list[Fold]:
-    fold_of = assign_folds(strata, groups, count, seed)
-    return [Fold(np.flatnonzero(fold_of != fold), np.flatnonzero(fold_of == fold)) for fold in range(count)]
+def _split(strata: NDArray[np.str_], groups: ArrayLike, count: int, seed: int) -> list[Fold]:
+    """Folds of whole groups, balanced by stratum and size."""
+    return split_by_fold(assign_folds(strata, groups, count, seed), range(count))
 
 
 def _blocks(

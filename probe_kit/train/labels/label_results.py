@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.statistics.folds import Fold
+from probe_kit.statistics.folds import Fold, split_by_fold
 from probe_kit.statistics.label_permutations import max_statistic_p, pointwise_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.student import student_interval, unbounded_student_interval
@@ -191,10 +191,7 @@ class LabelResults:
     @property
     def folds(self) -> list[Fold]:
         """The outer folds."""
-        return [
-            Fold(np.flatnonzero(self.fold_of != fold), np.flatnonzero(self.fold_of == fold))
-            for fold in np.unique(self.fold_of)
-        ]
+        return split_by_fold(self.fold_of, np.unique(self.fold_of))
 
     @cached_property
     def scores(self) -> "pd.DataFrame":

@@ -10,9 +10,9 @@ from zipfile import BadZipFile
 import numpy as np
 
 from probe_kit._system.csv_text import csv_of_frame
-from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
+from probe_kit.errors import NoProbesError, RunDamagedError
 from probe_kit.extract.run_layout import PROBES
-from probe_kit.extract.store.format.bundles import Bundle, write_bundle
+from probe_kit.extract.store.format.bundles import Bundle, complete_key, write_bundle
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.labels.label_results import LabelControls, LabelCurve, LabelResults
@@ -52,13 +52,7 @@ def load_label_results(run: RunReader, key: str | None = None, target: str | Non
     """
     stored = {name: bundle for name, bundle in read_probes(run.location).items() if is_of_label(bundle)}
     if key is not None:
-        found = [name for name in stored if name.startswith(key)] if key else []
-        if len(found) != 1:
-            raise UsageError(
-                f"{run.location} has {'several' if found else 'no'} probes of labels {key!r}; it has: "
-                f"{', '.join(stored) or 'none'}"
-            )
-        return _read(run, stored[found[0]])
+        return _read(run, stored[complete_key(key, stored, run.location, "probes of labels")])
     current = [
         bundle
         for bundle in stored.values()

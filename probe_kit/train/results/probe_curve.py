@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.sites import Site, part_of
 from probe_kit.statistics.estimates.balanced import GroupSums, balanced_sums
-from probe_kit.statistics.folds import Fold
+from probe_kit.statistics.folds import Fold, split_by_fold
 from probe_kit.statistics.label_permutations import max_statistic_p
 from probe_kit.train.crossval.metrics import correctness
 
@@ -98,9 +98,7 @@ class ProbeCurve:
 
     def folds(self) -> list[Fold]:
         """The outer folds."""
-        return [
-            Fold(np.flatnonzero(self.fold_of != f), np.flatnonzero(self.fold_of == f)) for f in self._fold_names
-        ]
+        return split_by_fold(self.fold_of, self._fold_names)
 
     @property
     def _fold_names(self) -> list[int]:

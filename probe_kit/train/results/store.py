@@ -15,9 +15,16 @@ from zipfile import BadZipFile
 import numpy as np
 
 from probe_kit._system.csv_text import csv_of_frame
-from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
+from probe_kit.errors import NoProbesError, RunDamagedError
 from probe_kit.extract.run_layout import PROBE_DIRECTIONS, PROBES
-from probe_kit.extract.store.format.bundles import HEAD, Bundle, read_bundles, tidy_bundle, write_bundle
+from probe_kit.extract.store.format.bundles import (
+    HEAD,
+    Bundle,
+    complete_key,
+    read_bundles,
+    tidy_bundle,
+    write_bundle,
+)
 from probe_kit.extract.store.format.stored_words import in_current_words
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
@@ -102,15 +109,7 @@ def load_results(run: RunReader, key: str | None = None, target: Target = "corre
     probes = read_probes(location)
     stored = _ours(probes)
     if key is not None:
-        found = [name for name in stored if name == key] or [
-            name for name in stored if key and name.startswith(key)
-        ]
-        if len(found) != 1:
-            raise UsageError(
-                f"{location} has {'several' if found else 'no'} probe results {key!r}; it has: "
-                f"{', '.join(stored) or 'none'}"
-            )
-        return _read(run, probes[found[0]])
+        return _read(run, probes[complete_key(key, stored, location, "probe results")])
     asked = [(bundle, settings_of(bundle)) for bundle in stored.values()]
     fitting = [(bundle, own) for bundle, own in asked if (own.target, own.call) == (target, 0)]
     current = [bundle for bundle, own in fitting if is_current(own, run)]

@@ -14,6 +14,7 @@ from probe_kit.extract import ExtractSettings, open_run
 from probe_kit.study import Failure, Ledger, conduct_study, fit_probes, load_study, make_table, plan_study
 from probe_kit.study.running import model_task
 from probe_kit.suite import Suite
+from tests.study.running.small_study import small_study
 
 TEXT = """
 schema = 1
@@ -67,10 +68,7 @@ comparison = "light"
 
 @pytest.fixture(scope="module")
 def file(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("study")
-    path = folder / "study.toml"
-    path.write_text(TEXT.format(out=folder / "out", suite=small_suite.folder), encoding="utf-8")
-    return path
+    return small_study(tmp_path_factory.mktemp("study"), small_suite, TEXT)
 
 
 def states(file: Path) -> dict[str, tuple[str, int]]:

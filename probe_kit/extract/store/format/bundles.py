@@ -10,13 +10,13 @@ Files are never written over: what changes gets another name, and counts when th
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any, BinaryIO
 
 from probe_kit._system.bounded_json import parse_json
-from probe_kit.errors import RunDamagedError
+from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.extract.run_layout import INTERVENTIONS, PROBES
 from probe_kit.extract.store.format.hashes import HASH, Sum, as_record, digest_of, expect, is_sum, read_record
 from probe_kit.extract.store.format.root import find_root
@@ -226,6 +226,19 @@ def bundle_keys(location: Location, home: str) -> list[str]:
     return [
         name for name in names if _KEY.fullmatch(name) and (name in complete or f".{name}{PARTIAL}" not in names)
     ]
+
+
+def complete_key(key: str, stored: Collection[str], location: Location, kind: str) -> str:
+    """The stored key that `key` is, or begins. kind: what is stored, in the plural, for messages.
+
+    Raises UsageError if there is none, or if there are several.
+    """
+    found = [name for name in stored if name == key] or [name for name in stored if key and name.startswith(key)]
+    if len(found) != 1:
+        raise UsageError(
+            f"{location} has {'several' if found else 'no'} {kind} {key!r}; it has: {', '.join(stored) or 'none'}"
+        )
+    return found[0]
 
 
 def read_bundles(location: Location, home: str) -> dict[str, Bundle]:

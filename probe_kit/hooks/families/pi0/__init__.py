@@ -5,9 +5,8 @@ from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.default_scene import EMBEDDED
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
-from probe_kit.hooks.contract.state_layout import OPENNESS
 from probe_kit.hooks.families.shared.capabilities import FLOW
-from probe_kit.hooks.families.shared.lerobot.evaluation import PICTURES
+from probe_kit.hooks.families.shared.lerobot.evaluation import EVALUATION_OPTIONS
 from probe_kit.hooks.family import Family
 
 _VERIFIER = "probe_kit.hooks.families.pi0.verify:verify_pi0"
@@ -76,21 +75,7 @@ FAMILIES = (
         },
         full_size="probe_kit.models.lerobot.pi0:full_size_pi0",
         options=(
-            Option(
-                "statistics",
-                str,
-                "File with p01 and p99 of action and proprio, or bridge (shipped), where the checkpoint has none; "
-                "none: its numbers are metres and radians.",
-                "the checkpoint's",
-            ),
-            Option(
-                "picture",
-                str,
-                "How pictures come to the network's resolution.",
-                "as the checkpoint's layout implies",
-                PICTURES,
-            ),
-            Option("openness", str, "release: as Act2Answer's evaluation has it.", "measured", OPENNESS),
+            *EVALUATION_OPTIONS,
             Option("unread", str, "Settings of an old config.json that change nothing, comma-separated.", "none"),
         ),
         protocols={

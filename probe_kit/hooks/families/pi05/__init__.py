@@ -2,10 +2,8 @@
 
 from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.declared import backbone, expert
-from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.contract.state_layout import OPENNESS
 from probe_kit.hooks.families.shared.capabilities import FLOW
-from probe_kit.hooks.families.shared.lerobot.evaluation import PICTURES
+from probe_kit.hooks.families.shared.lerobot.evaluation import EVALUATION_OPTIONS
 from probe_kit.hooks.family import Family
 
 FAMILIES = (
@@ -34,23 +32,7 @@ FAMILIES = (
             )
         },
         full_size="probe_kit.models.lerobot.pi05:full_size_pi05",
-        options=(
-            Option(
-                "statistics",
-                str,
-                "File with p01 and p99 of action and proprio, or bridge (shipped), where the checkpoint has none; "
-                "none: its numbers are metres and radians.",
-                "the checkpoint's",
-            ),
-            Option(
-                "picture",
-                str,
-                "How pictures come to the network's resolution.",
-                "as the checkpoint's layout implies",
-                PICTURES,
-            ),
-            Option("openness", str, "release: as Act2Answer's evaluation has it.", "measured", OPENNESS),
-        ),
+        options=EVALUATION_OPTIONS,
         interventions=FLOW,
     ),
 )

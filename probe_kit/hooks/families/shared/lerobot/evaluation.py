@@ -3,8 +3,29 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.state_layout import OPENNESS
+
 Picture = Literal["padded", "padded-top-left", "squashed"]
 PICTURES: tuple[Picture, ...] = ("padded", "padded-top-left", "squashed")
+EVALUATION_OPTIONS = (
+    Option(
+        "statistics",
+        str,
+        "File with p01 and p99 of action and proprio, or bridge (shipped), where the checkpoint has none; "
+        "none: its numbers are metres and radians.",
+        "the checkpoint's",
+    ),
+    Option(
+        "picture",
+        str,
+        "How pictures come to the network's resolution.",
+        "as the checkpoint's layout implies",
+        PICTURES,
+    ),
+    Option("openness", str, "release: as Act2Answer's evaluation has it.", "measured", OPENNESS),
+)
+"""The fields of `Evaluation` that users of any such policy set."""
 
 
 @dataclass(frozen=True)
