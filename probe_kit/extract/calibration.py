@@ -70,7 +70,7 @@ def calibrated[Settings: RunSettings](
     """
     if settings.batch != 1 or settings.env_workers is not None:
         raise UsageError("--batch auto chooses batch and simulating processes: leave out --env-workers")
-    example = example_observations(settings.scene, [plan.episodes[0].episode.item.instruction])[0]
+    example = example_observations(settings.scene, [plan.episodes[0].instruction])[0]
     most = largest_batch(controller.policy.card.batch, len(plan.episodes))
     with torch_threads(controller.threads):
         times = inference_times(lambda batch: _infer(controller, example, batch), most)

@@ -102,12 +102,8 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
         **_protocol_row(identity),
-        "suite": plan.suite.identity,
-        "categories": ", ".join(plan.suite.categories),
-        "scene": _describe_scene(extraction.settings.scene),
-        "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
+        **_rows_of_plan(extraction),
         **({"grows": growth.words} if growth and growth.words else {}),
-        **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
         "streams": ("; ".join(_describe(s) for s in plan.streams) or "none") + declared,
         **(
             {"acts": "no: only captured, once per episode; no success rate"}
@@ -128,13 +124,30 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     err.print(table)
 
 
+def _rows_of_plan(extraction: "Extraction") -> dict[str, str]:
+    """What is shown to the model."""
+    from probe_kit.extract.plan import Plan
+
+    plan = extraction.plan
+    assert isinstance(plan, Plan)
+    return {
+        "suite": plan.suite.identity,
+        "categories": ", ".join(plan.suite.categories),
+        "scene": _describe_scene(extraction.settings.scene),
+        "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
+        **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
+    }
+
+
 def print_sufficiency(extraction: "Extraction") -> None:
     """What the plan is enough for, said before any work; too few items in yellow."""
     from rich.table import Table
 
+    from probe_kit.extract.plan import Plan
     from probe_kit.suite.validation.sufficiency import Smallest, sufficiencies
 
     plan, scored = extraction.plan, not getattr(extraction.settings, "capture_only", False)
+    assert isinstance(plan, Plan)
     table = Table(show_header=False, title=f"enough for ({Smallest.of(plan.suite).words})", box=None)
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")

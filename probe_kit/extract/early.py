@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.installing import install_command
 from probe_kit.errors import DiskSpaceError, MissingExtraError, UsageError
-from probe_kit.extract.plan import plan_episodes, plan_rows
+from probe_kit.extract.plan import plan_episodes, plan_rows, suite_name
 from probe_kit.extract.run_layout import RUN_FILE
 from probe_kit.extract.settings import AskSettings, RunSettings, check_other_settings
 from probe_kit.extract.store.growth import further_rows
@@ -95,11 +95,6 @@ def _known_settings(settings: RunSettings, suite: "Suite") -> dict[str, Any]:
     }
     as_stored: dict[str, Any] = json.loads(canonical_json(known))
     return as_stored
-
-
-def suite_name(suite: "Suite") -> dict[str, str]:
-    """What a run's identity says of its suite; items are compared one by one, by their content."""
-    return {"name": suite.name, "version": suite.version}
 
 
 def asked_objects(settings: RunSettings, suite: "Suite") -> Mapping[str, str]:

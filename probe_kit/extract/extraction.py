@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import EpisodesFailedError, StoreError, UsageError
 from probe_kit.extract.needs import space_needed
-from probe_kit.extract.plan import Plan
+from probe_kit.extract.plan import RowPlan
 from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_answer_model
 from probe_kit.extract.rollout.events import Done, Event
 from probe_kit.extract.run_layout import RUN_FILE
@@ -88,7 +88,7 @@ class Extraction(Prepared):
             root.check_continuable()
             check_other_settings(root.own_settings, json.loads(canonical_json(self.identity())), str(location))
 
-    def further_plan(self, location: Location) -> Plan:
+    def further_plan(self, location: Location) -> RowPlan:
         """The plan of the episodes that the run at `location` does not plan yet: all of them where there is none.
 
         Raises SettingsMismatchError if the run there cannot grow by this plan, and RunDamagedError.
@@ -99,7 +99,7 @@ class Extraction(Prepared):
         root.check_continuable()
         rows = further_rows(root.plan, self.plan.to_json()["episodes"], str(location))
         added = {row["episode_id"] for row in rows}
-        return self.plan.only(one for one in self.plan.episodes if one.episode.episode_id in added)
+        return self.plan.only(one for one in self.plan.episodes if one.episode_id in added)
 
     def _check_exclusive(self, writer: RunWriter) -> None:
         if writer.several_may_write():
@@ -141,7 +141,7 @@ class Extraction(Prepared):
         )
         for number, failed in scheduler.given_up.items():
             where = f" (traceback in {writer.location}/{failure_key(number)})" if failed.traceback else ""
-            error.add_note(f"{writer.plan.episode(number).episode.episode_id}: {failed.reason}{where}")
+            error.add_note(f"{writer.plan.episode(number).episode_id}: {failed.reason}{where}")
         return error
 
 

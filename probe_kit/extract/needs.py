@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from probe_kit.extract.plan import Plan
+from probe_kit.extract.plan import RowPlan
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import RunSettings
 from probe_kit.hooks.contract.views import view_names
@@ -19,7 +19,7 @@ REPORT = 5_000_000
 """Bytes of a report with its figures."""
 
 
-def space_needed(plan: Plan, settings: RunSettings) -> dict[str, int]:
+def space_needed(plan: RowPlan, settings: RunSettings) -> dict[str, int]:
     """Bytes by part, uncompressed. Probes are those of one view; more views take as much again each."""
     return space_of(plan.streams, len(plan.episodes), settings)
 

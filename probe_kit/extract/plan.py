@@ -1,15 +1,52 @@
 """The plan of a run: episodes, their order and their estimated cost, computed before anything is written."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.suite import Episode, Suite
 from probe_kit.suite.ladder import Wording, in_words
+
+
+class PlannedRow(Protocol):
+    """One row of a plan, wherever its observations come from: an episode of a scene, a stretch of a recording."""
+
+    @property
+    def index(self) -> int:
+        """Its number in the run, where its objects lie."""
+
+    @property
+    def policy_seed(self) -> int:
+        """From which every inference of the row derives its own seed."""
+
+    @property
+    def episode_id(self) -> str:
+        """Its id, the same in every selection."""
+
+    @property
+    def category(self) -> str:
+        """What tables group it by."""
+
+    @property
+    def instruction(self) -> str:
+        """What the model reads."""
+
+    def numbered(self, index: int) -> Self:
+        """The same row under another number."""
+
+    def control_step(self, call: int, executed: int) -> int:
+        """What inference `call` saw: the frame after `executed` actions, or a recorded frame by its number."""
+
+    def noise_of(self, call: int) -> int:
+        """Which number its seed for inference `call` is derived from."""
+
+    def to_json(self) -> dict[str, Any]:
+        """The row as flat columns."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +63,34 @@ class PlannedEpisode:
     scene_seed: int
     policy_seed: int
     asked_object: str | None = None
+
+    @property
+    def episode_id(self) -> str:
+        """Item, layout and wording."""
+        return self.episode.episode_id
+
+    @property
+    def category(self) -> str:
+        """That of its item."""
+        return self.episode.item.category
+
+    @property
+    def instruction(self) -> str:
+        """That of its item, in the wording of the episode."""
+        return self.episode.item.instruction
+
+    def numbered(self, index: int) -> Self:
+        """The same episode under another number."""
+        return replace(self, index=index)
+
+    def control_step(self, call: int, executed: int) -> int:
+        """As many actions as were executed before."""
+        del call
+        return executed
+
+    def noise_of(self, call: int) -> int:
+        """The inference itself."""
+        return call
 
     def to_json(self) -> dict[str, Any]:
         """The planned episode as flat columns."""
@@ -50,17 +115,75 @@ class PlannedEpisode:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """All episodes of a run, and the size of what they leave.
+class RowPlan(ABC):
+    """All rows of a run in order, and the size of what they leave."""
+
+    episodes: tuple[PlannedRow, ...]
+    streams: tuple[StoredStream, ...]
+    bytes: int
+
+    @property
+    @abstractmethod
+    def identity(self) -> dict[str, Any]:
+        """What a run's identity says of where its observations come from."""
+
+    @property
+    @abstractmethod
+    def name_parts(self) -> list[Any]:
+        """What the default name of a run depends on beside its identity."""
+
+    @property
+    @abstractmethod
+    def selection(self) -> dict[str, Any]:
+        """What was selected, as it stands among a run's settings; no part of its identity."""
+
+    @abstractmethod
+    def to_json(self) -> dict[str, Any]:
+        """As stored in `plan/`: `episodes` as flat columns, and `suite_parent`."""
+
+    def numbered(self, numbers: Mapping[str, int]) -> Self:
+        """The same episodes, in the same order, with the numbers that a run has for their ids."""
+        return replace(self, episodes=tuple(one.numbered(numbers[one.episode_id]) for one in self.episodes))
+
+    def only(self, episodes: Iterable[PlannedRow]) -> Self:
+        """A plan of these episodes alone, with their share of the bytes."""
+        kept = tuple(episodes)
+        return replace(self, episodes=kept, bytes=self.bytes * len(kept) // max(1, len(self.episodes)))
+
+    def episode(self, number: int) -> PlannedRow:
+        """The episode that has this number. Raises KeyError."""
+        return self._by_number[number]
+
+    @cached_property
+    def _by_number(self) -> dict[int, PlannedRow]:
+        return {one.index: one for one in self.episodes}
+
+    @property
+    def sites(self) -> int:
+        """Number of captured sites per inference."""
+        return sum(len(stream.stream.sites()) for stream in self.streams)
+
+
+@dataclass(frozen=True)
+class Plan(RowPlan):
+    """All episodes of a suite.
 
     skipped: by wording, how many items have none and are not asked in it; None for items in their own words.
     """
 
-    suite: Suite
     episodes: tuple[PlannedEpisode, ...]
-    streams: tuple[StoredStream, ...]
-    bytes: int
+    suite: Suite
     skipped: dict[Wording, int] | None = None
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Name and version of the suite; items are compared one by one, by their content."""
+        return {"suite": suite_name(self.suite)}
+
+    @property
+    def name_parts(self) -> list[Any]:
+        """The whole suite and the selected categories."""
+        return [self.suite.whole.content_sha256, self.suite.categories]
 
     def to_json(self) -> dict[str, Any]:
         """As stored in `plan/`: the episodes, each with its item's content hash, and the suite's parent."""
@@ -77,24 +200,6 @@ class Plan:
             **({} if self.wordings is None else {"wordings": self.wordings}),
         }
 
-    def numbered(self, numbers: Mapping[str, int]) -> Self:
-        """The same episodes, in the same order, with the numbers that a run has for their ids."""
-        episodes = (replace(one, index=numbers[one.episode.episode_id]) for one in self.episodes)
-        return replace(self, episodes=tuple(episodes))
-
-    def only(self, episodes: Iterable[PlannedEpisode]) -> Self:
-        """A plan of these episodes alone, with their share of the bytes."""
-        kept = tuple(episodes)
-        return replace(self, episodes=kept, bytes=self.bytes * len(kept) // max(1, len(self.episodes)))
-
-    def episode(self, number: int) -> PlannedEpisode:
-        """The episode that has this number. Raises KeyError."""
-        return self._by_number[number]
-
-    @cached_property
-    def _by_number(self) -> dict[int, PlannedEpisode]:
-        return {one.index: one for one in self.episodes}
-
     @property
     def wordings(self) -> dict[str, Any] | None:
         """What names the wordings of a run beside its suite, None for items in their own words."""
@@ -103,10 +208,10 @@ class Plan:
         texts = [[e.episode.episode_id, e.episode.item.instruction] for e in self.episodes]
         return {"names": list(self.skipped), "skipped": self.skipped, "texts_sha256": sha256_json(texts)}
 
-    @property
-    def sites(self) -> int:
-        """Number of captured sites per inference."""
-        return sum(len(stream.stream.sites()) for stream in self.streams)
+
+def suite_name(suite: Suite) -> dict[str, str]:
+    """What a run's identity says of its suite; items are compared one by one, by their content."""
+    return {"name": suite.name, "version": suite.version}
 
 
 def plan_episodes(
@@ -156,7 +261,7 @@ def make_plan(
     episodes = tuple(plan_episodes(suite, seed, wordings, asked_objects))
     per_call = sum(stream.raw_bytes(with_tokens) for stream in streams)
     skipped = None if wordings is None else skipped_items(suite, episodes, wordings)
-    return Plan(suite, episodes, tuple(streams), per_call * calls * len(episodes), skipped)
+    return Plan(episodes, tuple(streams), per_call * calls * len(episodes), suite, skipped)
 
 
 def skipped_items(

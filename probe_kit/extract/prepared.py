@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.calibration import Calibration, calibrated
-from probe_kit.extract.early import asked_objects, check_model, check_place, check_words, suite_name
+from probe_kit.extract.early import asked_objects, check_model, check_place, check_words
 from probe_kit.extract.needs import declared_streams
-from probe_kit.extract.plan import Plan, instructions_of, make_plan, plan_episodes, skipped_items
+from probe_kit.extract.plan import RowPlan, instructions_of, make_plan, plan_episodes, skipped_items
 from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
@@ -37,7 +37,7 @@ class Prepared:
     """
 
     settings: RunSettings
-    plan: Plan
+    plan: RowPlan
     card: dict[str, Any]
     controller: ActingController | AnswerController | None
     calibration: Calibration | None = None
@@ -51,7 +51,7 @@ class Prepared:
         return {
             **self.settings.choices(),
             **self.card,
-            "suite": suite_name(self.plan.suite),
+            **self.plan.identity,
             "scene": self.settings.scene.to_json(),
             **(protocol_identity(self.settings) if isinstance(self.settings, ExtractSettings) else {}),
         }
@@ -73,8 +73,7 @@ class Prepared:
 
         A command with more items finds it too; one with other categories, wordings or another suite does not.
         """
-        suite, wordings = self.plan.suite, self.settings.asked_wordings
-        named = [self.identity(), suite.whole.content_sha256, suite.categories, wordings]
+        named = [self.identity(), *self.plan.name_parts, self.settings.asked_wordings]
         # Without the weights' hash there is no name yet.
         name = [self.settings.model, "…" if self.declared else sha256_json(named)[:8]]
         if isinstance(self.settings, AskSettings):

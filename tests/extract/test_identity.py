@@ -15,6 +15,7 @@ from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepa
 from probe_kit.extract.store import provenance
 from probe_kit.extract.store.format.hashes import HASH
 from probe_kit.extract.store.locations.locate import locate
+from probe_kit.hashing import sha256_json
 from probe_kit.retention import retention_table
 from probe_kit.retention.report import report_html
 from probe_kit.suite import Suite, build_suite
@@ -43,6 +44,16 @@ def begin(settings: ExtractSettings, folder: Path) -> None:
     with pytest.raises(EnoughError):
         extract_run(settings, folder, stop)
     assert 0 < len(open_run(folder, allow_partial=True).episodes) < 4
+
+
+def test_a_scene_run_has_the_identity_and_the_plan_that_it_had_before_there_were_other_sources(
+    suite: Suite,
+) -> None:
+    """So that runs of former versions continue: hashes of version 0.2.0 without recordings."""
+    prepared = prepare(expert(suite))
+    assert sha256_json(prepared.identity())[:16] == "3777166dc1fb5cab"
+    assert sha256_json(prepared.plan.to_json())[:16] == "cca3b354003d1de5"
+    assert prepared.default_name() == "expert-f807c87e"
 
 
 def elsewhere(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:

@@ -37,7 +37,8 @@ class Turn:
 
     seed: of the episode; every inference derives its own. call: how many inferences came before.
     buffers: where the activations of the first calls go. past: chunks of the inferences before, oldest first,
-    which the controller keeps where a policy averages them.
+    which the controller keeps where a policy averages them. noise: the number that its seed is derived from, None
+    for `call`.
     """
 
     seen: Observation
@@ -45,6 +46,11 @@ class Turn:
     call: int
     buffers: "EpisodeBuffers"
     past: list[NDArray[np.float32]] = field(default_factory=list)
+    noise: int | None = None
+
+    def derived_seed(self, of: str) -> int:
+        """The seed of this inference for `of`."""
+        return derive_seed(self.seed, of, self.call if self.noise is None else self.noise)
 
 
 class Controller(Protocol):
@@ -163,7 +169,7 @@ class PolicyController:
         Where the policy's card asks for it, one action averaged over the plans of this and earlier chunks.
         """
         with self._acting():
-            begin_randomness(derive_seed("global", *(derive_seed(turn.seed, "call", turn.call) for turn in turns)))
+            begin_randomness(derive_seed("global", *(turn.derived_seed("call") for turn in turns)))
             return self._act(turns)
 
     def _acting(self) -> AbstractContextManager[None]:
@@ -171,7 +177,7 @@ class PolicyController:
 
     def _act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
         observations = copied([turn.seen for turn in turns])
-        seeds = [derive_seed(turn.seed, "inference", turn.call) for turn in turns]
+        seeds = [turn.derived_seed("inference") for turn in turns]
         captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
         if captured:
             chunks = self._capturer.run(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.plan import PlannedRow
 from probe_kit.extract.rollout.controllers import ActingController, Turn
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.events import traceback_of
@@ -29,7 +29,7 @@ class Rollout:
     the episode came before it.
     """
 
-    planned: PlannedEpisode
+    planned: PlannedRow
     outcome: dict[str, Any]
     buffers: EpisodeBuffers
     frames: list[NDArray[np.uint8]]
@@ -54,12 +54,12 @@ class Rollout:
 class Failure:
     """An episode that could not be played to its end. traceback: of the error that ended it."""
 
-    planned: PlannedEpisode
+    planned: PlannedRow
     reason: str
     traceback: str
 
     @classmethod
-    def from_error(cls, planned: PlannedEpisode, error: ProbeKitError) -> "Failure":
+    def from_error(cls, planned: PlannedRow, error: ProbeKitError) -> "Failure":
         """The failure of `planned` by `error`."""
         return cls(planned, f"{type(error).__name__}: {error}", traceback_of(error))
 
@@ -73,8 +73,8 @@ class EpisodeSlot:
 
     def __init__(self, stage: AskableStage) -> None:
         self.stage = stage
-        self.planned: PlannedEpisode | None = None
-        self.following: PlannedEpisode | None = None
+        self.planned: PlannedRow | None = None
+        self.following: PlannedRow | None = None
         self.ahead = False
         self.seen: Observation | None = None
         self.control_steps: list[int] = []
@@ -84,7 +84,7 @@ class EpisodeSlot:
         self.instruction_ids: Sequence[int] | None = None
         self.past: list[NDArray[np.float32]] = []
 
-    def start(self, planned: PlannedEpisode, buffers: EpisodeBuffers, begin: StageRequest | None) -> None:
+    def start(self, planned: PlannedRow, buffers: EpisodeBuffers, begin: StageRequest | None) -> None:
         """Take an episode up; begin: the question that begins it, None if the stage does so already."""
         self.planned, self.buffers, self.seen = planned, buffers, None
         self.control_steps, self.steps, self.seconds = [], 0, 0.0
@@ -100,14 +100,16 @@ class EpisodeSlot:
 
     def count_inference(self, seconds: float) -> None:
         """Note an inference about what is seen. seconds: that it took."""
-        self.control_steps.append(self.steps)
+        assert self.planned is not None
+        self.control_steps.append(self.planned.control_step(self.calls, self.steps))
         self.seconds += seconds
 
     def turn(self) -> Turn:
         """The inference that is due."""
         assert self.planned is not None
         assert self.seen is not None
-        return Turn(self.seen, self.planned.policy_seed, self.calls, self.buffers, self.past)
+        noise = self.planned.noise_of(self.calls)
+        return Turn(self.seen, self.planned.policy_seed, self.calls, self.buffers, self.past, noise)
 
     def advance(self, actions: NDArray[np.float32], flagged: bool | None, then: StageRequest | None) -> None:
         """Execute actions. flagged: whether their inference put out no valid action; None if unknown."""
@@ -141,7 +143,7 @@ class EpisodeLoop:
 
     def __init__(
         self, stages: Sequence[AskableStage], controller: ActingController, ring: BufferPool,
-        next_episode: Callable[[], PlannedEpisode | None], film: Callable[[PlannedEpisode], bool],
+        next_episode: Callable[[], PlannedRow | None], film: Callable[[PlannedRow], bool],
     ) -> None:  # fmt: skip
         slots = [EpisodeSlot(stage) for stage in stages]
         self._groups = [slots[: len(slots) // 2], slots[len(slots) // 2 :]]
@@ -169,7 +171,7 @@ class EpisodeLoop:
         else:
             slot.start(planned, self._pool.take(), None if begun else self._beginning(planned))
 
-    def _beginning(self, planned: PlannedEpisode) -> StageRequest:
+    def _beginning(self, planned: PlannedRow) -> StageRequest:
         return "begin", (planned, self._film(planned))
 
     def _then(self, slot: EpisodeSlot) -> StageRequest | None:

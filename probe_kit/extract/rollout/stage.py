@@ -1,6 +1,6 @@
 """A stage: one environment and its current episode, advanced by one chunk of actions at a time."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from time import perf_counter
@@ -73,17 +73,10 @@ Answer = Observation | Ending | Seen
 _BEGINNINGS = ("begin", "look")
 
 
-class Stage:
-    """Plays episodes in this process.
+class TimedStage:
+    """One source of observations with its current episode, and the seconds it worked on that."""
 
-    script: `expert`, `expert-mirrored` or `idle` to let that script play every episode to its end at once.
-    keep_ends: whether every episode ends with small pictures of its first and last frame.
-    """
-
-    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
-        self.script, self._keep_ends = script, keep_ends
-        self._env, self._intrinsics = Act2AnswerEnv(scene), scene.intrinsics
-        self._seconds = 0.0
+    _seconds = 0.0
 
     def timed(self, method: str, arguments: tuple[Any, ...]) -> Answer:
         """Call one of the methods below; what ends an episode says how many seconds all of its calls took."""
@@ -93,6 +86,21 @@ class Stage:
         answer: Answer = getattr(self, method)(*arguments)
         self._seconds += perf_counter() - started
         return answer if isinstance(answer, Observation) else replace(answer, seconds=self._seconds)
+
+    def close(self) -> None:
+        """Free what it holds."""
+
+
+class Stage(TimedStage):
+    """Plays episodes in this process.
+
+    script: `expert`, `expert-mirrored` or `idle` to let that script play every episode to its end at once.
+    keep_ends: whether every episode ends with small pictures of its first and last frame.
+    """
+
+    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
+        self.script, self._keep_ends = script, keep_ends
+        self._env, self._intrinsics = Act2AnswerEnv(scene), scene.intrinsics
 
     def begin(self, planned: PlannedEpisode, film: bool) -> Answer:
         """Set up an episode. Errors carry a note naming it."""
@@ -211,6 +219,10 @@ StageRequest = tuple[str, tuple[Any, ...]]
 """A method of `Stage` and its arguments."""
 
 
+StageKind = Callable[..., TimedStage]
+"""What opens a stage: `Stage`, or the stage of another source. Child processes import it by its name."""
+
+
 class AskableStage(Protocol):
     """A stage somewhere: asked first, answered later, so that several can work at a time."""
 
@@ -230,8 +242,9 @@ class AskableStage(Protocol):
 class LocalStage:
     """A stage in this process: the work is done when the answer is wanted."""
 
-    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
-        self._stage = Stage(scene, script, keep_ends)
+    def __init__(self, source: Any, script: str | None, keep_ends: bool = False, kind: StageKind = Stage) -> None:
+        """source: where observations come from, for `kind`: a SceneSpec for `Stage`."""
+        self._stage = kind(source, script, keep_ends)
 
     def ask(self, method: str, *arguments: Any, then: StageRequest | None = None) -> None:
         """Remember the question."""

@@ -4,17 +4,17 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from probe_kit._execution.child_process import Child
-from probe_kit.env import SceneSpec
 from probe_kit.errors import ProbeKitError, StageDiedError
 from probe_kit.extract.rollout.events import add_traceback
-from probe_kit.extract.rollout.stage import Answer, Ending, Stage, StageRequest
+from probe_kit.extract.rollout.stage import Answer, Ending, Stage, StageKind, StageRequest, TimedStage
 
 
 class ProcessStage:
     """A stage in a child process; a child that dies costs its episode and is replaced."""
 
-    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
-        self._settings = scene, script, keep_ends
+    def __init__(self, source: Any, script: str | None, keep_ends: bool = False, kind: StageKind = Stage) -> None:
+        """source: where observations come from, for `kind`; see `LocalStage`."""
+        self._settings = kind, (source, script, keep_ends)
         self._start()
 
     def _start(self) -> None:
@@ -51,7 +51,8 @@ class ProcessStage:
 def serve(connection: Connection) -> None:
     """The child's side: answer questions until the parent hangs up."""
     try:
-        stage = Stage(*connection.recv())
+        kind, settings = connection.recv()
+        stage = kind(*settings)
     except ProbeKitError as error:
         connection.recv()
         connection.send(error)
@@ -67,7 +68,7 @@ def serve(connection: Connection) -> None:
         stage.close()
 
 
-def _answered(stage: Stage, question: StageRequest) -> Answer | ProbeKitError:
+def _answered(stage: TimedStage, question: StageRequest) -> Answer | ProbeKitError:
     method, arguments = question
     try:
         return stage.timed(method, arguments)

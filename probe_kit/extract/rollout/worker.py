@@ -7,13 +7,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import Self, cast
 
 import numpy as np
 from PIL import Image
 
 from probe_kit.env import save_gif
-from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.plan import PlannedEpisode, PlannedRow
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import ActingController
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
@@ -32,6 +32,7 @@ SPARE_BUFFERS = 2
 # With fewer episodes than this, starting processes takes longer than they save.
 WORTH_PROCESSES = 8
 _FILM_SIZE = (320, 240)
+NextEpisode = Callable[[], PlannedEpisode | None]
 
 
 class Worker:
@@ -82,14 +83,14 @@ class Worker:
     def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
         """EpisodeLoop what `next_number` gives until it gives None; an event per episode, when it is committed."""
 
-        def next_episode() -> PlannedEpisode | None:
+        def next_episode() -> PlannedRow | None:
             number = next_number()
             return None if number is None else self._writer.plan.episode(number)
 
         controller, stages, ring = self._controller, self._stages, self._ring
         playing: Iterable[Rollout | Failure]
         if isinstance(controller, AnswerController):
-            playing = Asking(stages, controller, ring, next_episode)
+            playing = Asking(stages, controller, ring, cast("NextEpisode", next_episode))
         else:
             playing = EpisodeLoop(stages, controller, ring, next_episode, self._is_filmed)
         for played in playing:
@@ -115,7 +116,7 @@ class Worker:
             self._ring.give_back(rollout.buffers)
         return Done(rollout.planned.index, rollout.outcome)
 
-    def _is_filmed(self, planned: PlannedEpisode) -> bool:
+    def _is_filmed(self, planned: PlannedRow) -> bool:
         return self._settings.films(planned.index)
 
 
@@ -148,7 +149,7 @@ def _film(rollout: Rollout) -> tuple[str, bytes]:
         np.asarray(Image.fromarray(frame).resize(_FILM_SIZE, Image.Resampling.LANCZOS)) for frame in rollout.frames
     ]
     planned = rollout.planned
-    name = f"{planned.index:08d}-{planned.episode.item.category}-{rollout.outcome['outcome']}.gif"
+    name = f"{planned.index:08d}-{planned.category}-{rollout.outcome['outcome']}.gif"
     with tempfile.TemporaryDirectory() as folder:
         save_gif(Path(folder) / name, frames)
         return f"{VIDEOS}/{name}", (Path(folder) / name).read_bytes()

@@ -16,7 +16,7 @@ from zarr.core.buffer import Buffer
 from zarr.storage import MemoryStore
 
 from probe_kit.errors import SettingsMismatchError
-from probe_kit.extract.plan import Plan, PlannedEpisode
+from probe_kit.extract.plan import PlannedRow, RowPlan
 from probe_kit.extract.run_layout import COMMITS, DATA, FAILED, LABEL_FILE, PLANS, RUN_FILE, StoredStream
 from probe_kit.extract.settings import check_other_settings
 from probe_kit.extract.store.certificates import write_certificate
@@ -64,7 +64,7 @@ class EpisodeRecord:
     episode took, which no hash of the run covers.
     """
 
-    planned: PlannedEpisode
+    planned: PlannedRow
     outcome: Mapping[str, Any]
     arrays: Mapping[str, Mapping[str, NDArray[Any]]]
     roles: Sequence[Mapping[str, Sequence[tuple[str, int, int]]]]
@@ -87,7 +87,7 @@ class RunWriter:
     """
 
     def __init__(
-        self, location: Location, plan: Plan, settings: dict[str, Any], provenance: Provenance | None = None,
+        self, location: Location, plan: RowPlan, settings: dict[str, Any], provenance: Provenance | None = None,
         label: str | None = None,
     ) -> None:  # fmt: skip
         self.location, self.plan = location, plan
@@ -273,7 +273,7 @@ class RunWriter:
         return {
             "run": self.root.identity,
             "episode": planned.index,
-            "episode_id": planned.episode.episode_id,
+            "episode_id": planned.episode_id,
             "plan": self.root.stored_plan.hash_of(planned.index),
             "outcome": episode.outcome,
             "roles": episode.roles,

@@ -12,6 +12,7 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ActionError
 from probe_kit.extract import ExtractSettings, prepare
+from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.episode_loop import EpisodeLoop, Failure, Rollout
 from probe_kit.extract.rollout.stage import Ending, LocalStage, Seen, Stage
 from probe_kit.extract.rollout.stage_process import ProcessStage
@@ -80,7 +81,8 @@ def played(
     episodes: int, batch: int = 1, length: int = 1, bad: set[int] | None = None, capture_only: bool = False
 ) -> tuple[list[Rollout | Failure], list[tuple[str, int]]]:
     log: list[tuple[str, int]] = []
-    left = iter([SimpleNamespace(index=number, policy_seed=number) for number in range(episodes)])
+    nothing: Any = None
+    left = iter([PlannedEpisode(number, nothing, scene_seed=0, policy_seed=number) for number in range(episodes)])
     ring: Any = SimpleNamespace(take=lambda: object(), give_back=lambda _buffers: None)
     stages: Any = [Quick(log, length, bad or set()) for _ in range(2 * batch)]
     controller: Any = Thinking(log, capture_only)
