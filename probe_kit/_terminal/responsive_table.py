@@ -1,7 +1,8 @@
 """Console tables that never truncate numbers: columns that do not fit move below, or are left out by name."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -10,6 +11,8 @@ if TYPE_CHECKING:
 
 GAP = 2
 """Blanks between columns."""
+_INDENT = "  "
+"""Of a row's name below that of its section."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,8 @@ class ResponsiveTable:
     A row that has nothing to say in one of several tables, all its cells there being empty, is left out of it.
 
     names: of the rows, under the heading `name`; styles: one per row. caption: under the last table. splits:
-    whether columns that do not fit stand in further tables; else the caption names them.
+    whether columns that do not fit stand in further tables; else the caption names them. sections: none, or one
+    per row: rows of one section stand below its name.
     """
 
     title: str
@@ -72,6 +76,7 @@ class ResponsiveTable:
     styles: tuple[str, ...]
     parts: tuple[Part, ...]
     splits: bool = True
+    sections: tuple[str, ...] = ()
 
     @property
     def width(self) -> int:
@@ -80,7 +85,11 @@ class ResponsiveTable:
 
     @property
     def _name_width(self) -> int:
-        return max(Cell(name).width for name in (self.name, *self.names))
+        return max(Cell(name).width for name in (self.name, *self._shown_names))
+
+    @property
+    def _shown_names(self) -> tuple[str, ...]:
+        return tuple(f"{_INDENT if self.sections else ''}{name}" for name in self.names)
 
     def __rich_console__(self, _: "Console", options: "ConsoleOptions") -> "Iterator[RenderableType]":
         from rich.text import Text
@@ -122,23 +131,41 @@ class ResponsiveTable:
             count = max(n for n in range(1, len(shown) + 1) if n == 1 or sum(p.width for p in shown[:n]) <= room)
             if count < len(shown) or len(shown) < len(self.parts):
                 yield Text(f"\n{' · '.join(dict.fromkeys(part.title for part in shown[:count]))}")
-            yield self._table(shown[:count])
+            yield from self._table(shown[:count])
             shown = shown[count:]
 
-    def _table(self, parts: Sequence[Part]) -> "Table":
-        from rich.box import SIMPLE_HEAD
-        from rich.table import Table
+    def _table(self, parts: Sequence[Part]) -> "Iterator[RenderableType]":
         from rich.text import Text
 
-        table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
-        table.add_column(self.name, no_wrap=True, vertical="bottom")
+        rows = [
+            (section, name, style, [cell for part in parts for cell in part.rows[number]])
+            for number, (section, name, style) in enumerate(
+                zip(self.sections or ("",) * len(self.names), self._shown_names, self.styles, strict=True)
+            )
+        ]
+        rows = [row for row in rows if any(cell.text for cell in row[3])]
+        table = self._columns(parts)
+        if not self.sections:
+            _fill(table, [row[1:] for row in rows])
+            yield table
+            return
+        yield table
+        for section, below in groupby(rows, key=lambda row: row[0]):
+            yield Text(section, style="bold")
+            table = self._columns(parts, heads=False)
+            _fill(table, [row[1:] for row in below])
+            yield table
+
+    def _columns(self, parts: Sequence[Part], heads: bool = True) -> "Table":
+        """An empty table, whose columns have the same width with and without their heads."""
+        from rich.box import SIMPLE_HEAD
+        from rich.table import Table
+
+        table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False, show_header=heads)
+        table.add_column(self.name, no_wrap=True, vertical="bottom", min_width=self._name_width)
         for part in parts:
-            for heading in part.headings:
-                table.add_column(heading, no_wrap=True)
-        for number, (name, style) in enumerate(zip(self.names, self.styles, strict=True)):
-            cells = [cell for part in parts for cell in part.rows[number]]
-            if any(cell.text for cell in cells):
-                table.add_row(Text(name), *(Text(cell.text, style=cell.style) for cell in cells), style=style)
+            for column, heading in enumerate(part.headings):
+                table.add_column(heading, no_wrap=True, min_width=part.only([column]).width - GAP)
         return table
 
     def _lists(self) -> "Iterator[RenderableType]":
@@ -146,13 +173,22 @@ class ResponsiveTable:
         from rich.text import Text
 
         for number, (name, style) in enumerate(zip(self.names, self.styles, strict=True)):
-            yield Text(f"{self.name} {name}", style=style or "underline")
+            section = f"{self.sections[number]}: " if self.sections else ""
+            yield Text(f"{section}{self.name} {name}", style=style or "underline")
             for part in self.parts:
                 for heading, cell in zip(part.headings, part.rows[number], strict=True):
                     if not cell.text:
                         continue
                     yield Text(" ".join(f"{heading}:".split()), style="dim")
                     yield Text(f"  {cell.text}", style=cell.style, overflow="fold")
+
+
+def _fill(table: "Table", rows: Iterable[tuple[str, str, Sequence[Cell]]]) -> None:
+    """Add rows of a name, a style and cells."""
+    from rich.text import Text
+
+    for name, style, cells in rows:
+        table.add_row(Text(name), *(Text(cell.text, style=cell.style) for cell in cells), style=style)
 
 
 def _split(part: Part, room: int) -> Iterator[Part]:

@@ -13,7 +13,6 @@ from probe_kit.study.planning.plan_lines import print_plan
 from probe_kit.train.command_options import Jobs
 
 if TYPE_CHECKING:
-    from probe_kit.retention.columns.text_table import TextTable
     from probe_kit.study import Failure, StudyPlan
     from probe_kit.study.running.model_task import Event
     from probe_kit.study.tables.named_table import NamedTable
@@ -176,6 +175,7 @@ def table(
 ) -> None:
     """Print a table of a study, or all, from its stored runs. Loads no model."""
     from probe_kit.retention.formats.latex import latex_table
+    from probe_kit.retention.formats.terminal import responsive_table
     from probe_kit.study import load_study, make_table
     from probe_kit.study.tables.formats import markdown_text, table_json
 
@@ -194,7 +194,7 @@ def table(
         return
     for own in made.values():
         if style == "table":
-            _print_table(own.text)
+            out.print(responsive_table(own.text))
         else:
             print_text(latex_table(own.text) if style == "latex" else markdown_text(own))
     if not name:
@@ -276,12 +276,3 @@ def publish(
     with err.status("uploading"):
         address = publish_data_set(out_folder, repository, pull_request, private)
     out.print(address, highlight=False, markup=False, soft_wrap=True)
-
-
-def _print_table(text: "TextTable") -> None:
-    from rich.table import Table
-
-    shown = Table(*text.columns, title=text.title, caption=f"{text.note}.", box=None)
-    for cells in text.cells:
-        shown.add_row(*(marked("{}", cell) for cell in cells))
-    out.print(shown)

@@ -38,6 +38,20 @@ def test_stages_count_items_that_are_right_in_both_layouts(tmp_path: Path) -> No
     assert shown[7].startswith(f"{100 * number['share_not_acted_on']:.1f} [")
 
 
+def test_stages_show_no_encoded_items_where_probes_have_no_signal(tmp_path: Path) -> None:
+    draw = np.random.default_rng(3)
+    known, used = ({name: draw.random((20, 2)) < 0.8 for name in ("color", "shape")} for _ in range(2))
+    vlm, policy = asked(tmp_path, known), acted(tmp_path, used)
+    found = probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75)
+    made = stages_table([match_runs(scored(vlm, "text"), policy, found)])
+    color, shape, whole = made.text.cells
+    assert shape[4:] == ("no signal", shape[5], "–", "–")
+    assert whole[4] == color[4]
+    assert whole[6:] == color[6:]
+    assert "probes are not shown to exceed chance" in made.text.note
+    assert [number["encoded"] for number in made.numbers][1:] == [None, int(color[4])]
+
+
 RIGHT = {"emotion": 0.5, "color": 0.9, "shape": 0.7, "traffic": 0.2}
 
 

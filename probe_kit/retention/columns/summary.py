@@ -140,6 +140,7 @@ def summary_table(
         ". ".join([*legend, f"{MARK} above every control that was run"]),
         tuple(headings[at] for at in shown),
         tuple(tuple(line[at] for at in shown) for line in lines),
+        names=2 if 1 in shown else 1,
     )
 
 

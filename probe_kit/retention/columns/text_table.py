@@ -22,7 +22,8 @@ from probe_kit.retention.rows.row import MEAN, RetentionRow
 class TextTable:
     """title and note: what it shows, and what to know when reading it. cells: a row of text per line.
 
-    heads: names over adjoining columns and how many these are, empty names included; drawn in LaTeX.
+    heads: names over adjoining columns and how many these are, empty names included. names: how many of the first
+    columns name the rows.
     """
 
     title: str
@@ -30,6 +31,7 @@ class TextTable:
     columns: tuple[str, ...]
     cells: tuple[tuple[str, ...], ...]
     heads: tuple[tuple[str, int], ...] = ()
+    names: int = 1
 
 
 def size_table(means: Sequence[RetentionRow]) -> TextTable | None:
@@ -56,6 +58,7 @@ def size_table(means: Sequence[RetentionRow]) -> TextTable | None:
         "mean over categories in %, with its 95 % interval",
         ("model", "prompt", *sizes),
         tuple((*name, *(found.get(size, "–") for size in sizes)) for name, found in lines.items()),
+        names=2,
     )
 
 

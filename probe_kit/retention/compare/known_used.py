@@ -71,7 +71,8 @@ class CategoryCounts:
     episodes: the same counts of single episodes; nothing is tested there. signal: whether the probes beat chance
     and every control that was run, without which encoded means nothing; None without probes, or over categories
     that differ in it. not_acted_on: of the items answered right and encoded those the action does not follow,
-    with the exact 95 % interval of their share. p_linked: whether answered and acted on go together among
+    with the exact 95 % interval of their share; None without signal, and over all categories only of those with
+    signal. p_linked: whether answered and acted on go together among
     encoded items: Fisher's exact test, over categories a permutation within them.
     """
 
@@ -156,7 +157,7 @@ def match_runs(
     rows = [_joined(str(name), own, signals.get(str(name))) for name, own in whole.groupby("category", sort=False)]
     if len(rows) > 1:
         rows.append(_over_all(whole, rows, seed))
-    notes = [*unprobed, *_missing(pairs, asked, acted), *_of_picture(asked), *_without_signal(rows)]
+    notes = [*unprobed, *_missing(pairs, asked, acted), *_of_picture(asked), *without_signal(rows)]
     score = str(getattr(asked, "score", "text"))
     joined = KnownUsedTable(asked.label, acted.label, score, chosen, tuple(rows), tuple(notes))
     return correct_joins([joined])[0]
@@ -335,7 +336,7 @@ def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Categor
         episodes={code: singles.count(code) for code in every},
         has_signal=clear if probed else None,
         comparisons=tuple(_comparisons(known, encoded, used, items["group"].to_numpy(str))),
-        **_kept(sets, encoded),
+        **({} if clear is False else _kept(sets, encoded)),
     )
 
 
@@ -376,12 +377,13 @@ def _kept(sets: Sequence[Bools], encoded: Bools | None) -> dict[str, Any]:
 def _over_all(items: "pd.DataFrame", rows: Sequence[CategoryCounts], seed: int) -> CategoryCounts:
     signals = {row.has_signal for row in rows}
     whole = _joined(OVERALL, items, signals.pop() if len(signals) == 1 else None)
-    if whole.encoded is None:
+    if whole.encoded is None or whole.has_signal is False:
         return whole
-    own = items[items["encoded"] == 1]
-    known, used = own["known"].to_numpy(bool), own["used"].to_numpy(bool)
-    p = overlap_p(known, used, own["category"].to_numpy(str), derive_seed("overlap", seed)) if len(own) else None
-    return replace(whole, p_linked=p)
+    items = items[items["category"].isin([row.category for row in rows if row.has_signal])]
+    known, encoded, used = (items[name].to_numpy(bool) for name in ("known", "encoded", "used"))
+    kept = items["category"].to_numpy(str)[encoded]
+    p = overlap_p(known[encoded], used[encoded], kept, derive_seed("overlap", seed)) if encoded.any() else None
+    return replace(whole, **{**_kept([known, encoded, used], encoded), "p_linked": p})
 
 
 # -- what a reader must know -----------------------------------------------------------------------------
@@ -405,7 +407,8 @@ def _of_picture(asked: RunReader) -> list[str]:
     return notes
 
 
-def _without_signal(rows: Sequence[CategoryCounts]) -> list[str]:
+def without_signal(rows: Sequence[CategoryCounts]) -> list[str]:
+    """A sentence about the categories whose probes have no signal; none if there is no such category."""
     dull = [row.category for row in rows if row.has_signal is False and row.category != OVERALL]
     if not dull:
         return []

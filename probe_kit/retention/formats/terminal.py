@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,7 +58,7 @@ def rich_tables(
     found = summarise_runs(rows)
     why = unpaired if details or len(found) > 1 else ()
     said = [Text(sentence, style="yellow") for sentence in (*why, *notes)]
-    return Group(*blocks, *map(_plain, plain), _Summary(found, differences), *said, *_sentences(found))
+    return Group(*blocks, *map(responsive_table, plain), _Summary(found, differences), *said, *_sentences(found))
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ class _Summary:
     differences: Sequence[Difference]
 
     def __rich_console__(self, _: "Console", options: "ConsoleOptions") -> "Iterator[RenderableType]":
-        whole, short = (_plain(summary_table(self.found, self.differences, wide)) for wide in (True, False))
+        tables = (summary_table(self.found, self.differences, wide) for wide in (True, False))
+        whole, short = map(responsive_table, tables)
         yield whole if options.max_width >= max(WIDE, whole.width) else short
 
 
@@ -113,23 +115,34 @@ def _block(table: Table, called: _Letters) -> ResponsiveTable:
     )
 
 
-def _plain(table: TextTable) -> ResponsiveTable:
-    """Its first columns name the rows."""
-    fixed = 1 if table.columns[0] == "category" and table.columns[1:2] != ("run",) else 2
+def responsive_table(table: TextTable) -> ResponsiveTable:
+    """As wide as the console allows. Columns below one head stay together where they can.
+
+    Where names of the first column repeat, the rows stand in sections of that name.
+    """
+    firsts = [cells[0] for cells in table.cells]
+    sections = table.names > 1 and any(one == other for one, other in pairwise(firsts))
+    named = slice(1 if sections else 0, table.names)
     return ResponsiveTable(
         title=table.title,
         caption=table.note,
-        name=" · ".join(table.columns[:fixed]),
-        names=tuple(" · ".join(cells[:fixed]) for cells in table.cells),
-        styles=tuple("bold" if MEAN in cells[:fixed] else "" for cells in table.cells),
-        parts=(
-            Part(
-                "",
-                table.columns[fixed:],
-                tuple(tuple(Cell(cell, "") for cell in cells[fixed:]) for cells in table.cells),
-            ),
-        ),
+        name=" · ".join(table.columns[: table.names]),
+        names=tuple(" · ".join(cells[named]) for cells in table.cells),
+        styles=tuple("bold" if MEAN in cells[: table.names] else "" for cells in table.cells),
+        parts=tuple(_parts(table)),
+        sections=tuple(firsts) if sections else (),
     )
+
+
+def _parts(table: TextTable) -> Iterator[Part]:
+    """The columns behind those that name the rows, a part for each head."""
+    heads = table.heads or (("", len(table.columns)),)
+    of_column = [at for at, (_, count) in enumerate(heads) for _ in range(count)]
+    behind = range(table.names, len(table.columns))
+    for at, found in groupby(behind, key=lambda column: of_column[column]):
+        columns = list(found)
+        cells = tuple(tuple(Cell(row[column]) for column in columns) for row in table.cells)
+        yield Part(heads[at][0], tuple(table.columns[column] for column in columns), cells)
 
 
 def _style(row: TableRow) -> str:

@@ -7,14 +7,14 @@ from probe_kit.retention.columns.text import (
     difference_interval,
     difference_test,
     models_test,
-    number,
+    p_text,
     percent,
     with_limits,
 )
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.common_items import MANY
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.compare.known_used import OVERALL, KnownUsedTable
+from probe_kit.retention.compare.known_used import OVERALL, CategoryCounts, KnownUsedTable, without_signal
 from probe_kit.retention.compare.vlm_vla import VlmVlaDifference
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.retention.table import RetentionTable
@@ -42,7 +42,8 @@ def difference_table(table: RetentionTable, title: str) -> NamedTable:
         for row in found
     )
     columns = ("systems", "category", "difference, points [95 %]", "p (Holm)", "items")
-    made = NamedTable(TextTable(title, caption(table, [_TEST]), columns, cells), tuple(map(_number, found)))
+    text = TextTable(title, caption(table, [_TEST]), columns, cells, names=2)
+    made = NamedTable(text, tuple(map(_number, found)))
     return made.with_note([*_remarks(found), *(sentence.removesuffix(".") for sentence in table.unpaired)])
 
 
@@ -88,7 +89,7 @@ def group_table(table: RetentionTable, title: str) -> NamedTable:
     )
     columns = ("groups", "category", "p over models (least)", "these models, points [95 %]")
     numbers = tuple({**_number(row), "p": None, "p_holm": None} for row in found)
-    return NamedTable(TextTable(title, caption(table, [note]), columns, cells), numbers)
+    return NamedTable(TextTable(title, caption(table, [note]), columns, cells, names=2), numbers)
 
 
 def vlm_vla_table(differences: Sequence[VlmVlaDifference]) -> NamedTable:
@@ -101,7 +102,7 @@ def vlm_vla_table(differences: Sequence[VlmVlaDifference]) -> NamedTable:
             percent(row.accuracy),
             percent(row.sr),
             with_limits(percent(row.difference), row.difference_ci, percent),
-            number(row.p_holm, 4),
+            p_text(row.p_holm),
             _items(row.n_items, row.of_items),
         )
         for row in found
@@ -128,18 +129,24 @@ def vlm_vla_table(differences: Sequence[VlmVlaDifference]) -> NamedTable:
     other = "; some pairs began with OTHER first frames" if any(row.same_frames is False for row in found) else ""
     note = f"{_TEST.replace('this comparison', 'the table')}{other}"
     columns = ("systems", "category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p (Holm)", "items")
-    return NamedTable(TextTable("VLM − VLA", note, columns, cells), tuple(numbers)).with_note(_remarks(found))
+    text = TextTable("VLM − VLA", note, columns, cells, names=2)
+    return NamedTable(text, tuple(numbers)).with_note(_remarks(found))
 
 
 def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
-    """Items that a VLM answers right, a probe decodes and a policy acts on right, each in both layouts."""
+    """Items that a VLM answers right, a probe decodes and a policy acts on right, each in both layouts.
+
+    Encoded items are counted where probes have signal.
+    """
     shown = [(join, row) for join in joins for row in join.rows]
     cells = tuple(
         (
             f"{join.asked} · {join.acted}",
             row.category if row.category == OVERALL else category_of(row.category).title,
             str(row.n_items),
-            *(_count(count) for count in (row.answered_correctly, row.encoded, row.acted_correctly)),
+            _count(row.answered_correctly),
+            "no signal" if row.has_signal is False else _count(_encoded(join, row)),
+            _count(row.acted_correctly),
             _count(row.answered_and_encoded),
             with_limits(percent(row.share_not_acted_on), row.share_not_acted_on_ci or (None, None), percent),
         )
@@ -153,7 +160,7 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
             "category": row.category,
             "items": row.n_items,
             "answered": row.answered_correctly,
-            "encoded": row.encoded,
+            "encoded": _encoded(join, row),
             "acted_on": row.acted_correctly,
             "answered_and_encoded": row.answered_and_encoded,
             "share_not_acted_on": row.share_not_acted_on,
@@ -164,8 +171,19 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
     ]
     note = "items right in both layouts, which guessing manages in 25 %; lost: share of answered and encoded ones"
     columns = ("systems", "category", "items", "answered", "encoded", "acted on", "answered and encoded", "lost %")
-    made = NamedTable(TextTable("Stages", note, columns, cells), tuple(numbers))
-    return made.with_note(list(dict.fromkeys(text.removesuffix(".") for join in joins for text in join.notes)))
+    made = NamedTable(TextTable("Stages", note, columns, cells, names=2), tuple(numbers))
+    notes = [text for join in joins for text in join.notes if text not in without_signal(join.rows)]
+    dull = any(row.has_signal is False for _, row in shown)
+    said = ["no signal: probes are not shown to exceed chance and every control"] if dull else []
+    return made.with_note([*said, *dict.fromkeys(text.removesuffix(".") for text in notes)])
+
+
+def _encoded(join: KnownUsedTable, row: CategoryCounts) -> int | None:
+    """Encoded items of categories whose probes have signal."""
+    if row.encoded is None or row.has_signal is False:
+        return None
+    inside = join.rows if row.category == OVERALL else (row,)
+    return sum(own.encoded or 0 for own in inside if own.has_signal and own.category != OVERALL)
 
 
 def _count(number: int | None) -> str:

@@ -10,15 +10,18 @@ from probe_kit.study.tables.named_table import NamedTable, Number
 from probe_kit.suite.categories import category_of
 
 _COLUMNS = (
-    "runs", "category", "verdict", "layer", "transfer %", "recentred % (p)", "back %", "recentred %",
-    "before %", "after %", "before − after, points [95 %]", "cosine (ceiling)", "CKA",
-)  # fmt: skip
+    ("", ("runs", "category")),
+    ("verdict and own probes", ("verdict", "before %", "after %", "before − after, points")),
+    ("transfer of probes", ("layer", "forth %", "recentred %", "p", "back %", "recentred %")),
+    ("likeness", ("cosine (ceiling)", "CKA")),
+)
 _NOTE = (
-    "transfer: accuracy of the first run's probes on the second run's activations, nothing is fitted",
-    "recentred: after centring and scaling on the second run's training folds, without labels",
-    "p: label permutations of whole groups, the best of all layers",
+    "before, after: cross-fitted accuracy of own probes, with its 95 % interval",
     "layer: where the first run's own probes are best",
-    "before, after: cross-fitted accuracy of own probes",
+    "forth: accuracy of the first run's probes on the second run's activations, nothing is fitted",
+    "back: the reverse",
+    "recentred: after centring and scaling on the other run's training folds, without labels",
+    "p: of the recentred transfer forth, label permutations of whole groups, the best of all layers",
     "cosine: of the probes' directions, where both sides have signal; ceiling: between folds of the first run",
     "CKA: unbiased, likeness of all features; it is no measure of loss",
 )
@@ -37,7 +40,9 @@ def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title:
     note += [f"{name}: own accuracies only, {why}" for name, why in alone.items()]
     heading = f"Drift: {title}" + (f" ({', '.join(dict.fromkeys(alone.values()))})" if alone else "")
     numbers = tuple(number for names, one in shown for number in _numbers(names, one, view))
-    return NamedTable(TextTable(heading, "; ".join(note), _COLUMNS, cells), numbers)
+    columns = tuple(name for _, names in _COLUMNS for name in names)
+    heads = tuple((head, len(names)) for head, names in _COLUMNS)
+    return NamedTable(TextTable(heading, "; ".join(note), columns, cells, heads, names=2), numbers)
 
 
 def _cells(one: CategoryDrift) -> tuple[str, ...]:
@@ -48,15 +53,16 @@ def _cells(one: CategoryDrift) -> tuple[str, ...]:
         "–" if gap is None else difference_interval(gap.backbone, gap.backbone_ci),
     )
     if not one.sites:
-        return ("–",) * 5 + own + ("–", "–")
+        return (*own, *["–"] * 8)
     site = one.sites[one.best]
     return (
+        *own,
         str(site.site.layer),
         percent(site.raw),
-        f"{percent(site.recentred)} ({p_text(one.p_transfer)})",
+        percent(site.recentred),
+        p_text(one.p_transfer),
         percent(site.raw_back),
         percent(site.recentred_back),
-        *own,
         _cosine(site),
         f"{site.cka:.2f}",
     )

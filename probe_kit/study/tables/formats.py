@@ -23,7 +23,7 @@ def table_of_record(record: dict[str, Any]) -> NamedTable:
     text = record["text"]
     cells = tuple(tuple(row) for row in text["cells"])
     heads = tuple((name, count) for name, count in text["heads"])
-    shown = TextTable(text["title"], text["note"], tuple(text["columns"]), cells, heads)
+    shown = TextTable(text["title"], text["note"], tuple(text["columns"]), cells, heads, text.get("names", 1))
     return NamedTable(shown, tuple(record["numbers"]))
 
 

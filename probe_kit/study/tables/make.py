@@ -102,9 +102,10 @@ def _made(study: LoadedStudy, table: TableTable, runs: StoredRuns, name: str) ->
         return stages_table(_joins(study, runs, labels))
     comparison = study.study.comparisons[table.comparison or ""]
     if comparison.groups is not None:
-        return group_table(retention_table(_groups(study, comparison.groups, runs), labels=labels), name)
-    pairs = _pairs(comparison, runs.found)
-    return difference_table(retention_table(opened, labels=labels, pairs=pairs), name)
+        found = retention_table(_groups(study, comparison.groups, runs), labels=labels)
+        return group_table(found, f"Groups of models: {name}")
+    pairs, what = _pairs(comparison, runs.found), "Ablation" if comparison.chain is None else "Chain"
+    return difference_table(retention_table(opened, labels=labels, pairs=pairs), f"{what}: {name}")
 
 
 def _wanted(study: LoadedStudy, table: TableTable) -> Callable[[Cell], Selection | None]:

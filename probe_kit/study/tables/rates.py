@@ -83,7 +83,7 @@ def sides_table(table: RetentionTable) -> NamedTable:
     sides = _pivot(table, title, note, [by_side, *_by_category(table, _sides)])
     layouts = _pivot(table, title, note, [by_layout, *_by_category(table, _layouts)])
     cells = tuple(row for both in zip(sides.text.cells, layouts.text.cells, strict=True) for row in both)
-    text = TextTable(sides.text.title, sides.text.note, sides.text.columns, cells, sides.text.heads)
+    text = TextTable(sides.text.title, sides.text.note, sides.text.columns, cells, sides.text.heads, names=2)
     return NamedTable(text, sides.numbers)
 
 
@@ -165,7 +165,7 @@ def probing_table(table: RetentionTable) -> NamedTable:
             row.category if row.category == MEAN else category_of(row.category).title,
             percent(row.backbone.score),
             percent(row.action.score),
-            retention_value(row),
+            "–" if row.action.score is None else retention_value(row),
             published_value(row),
         )
         for row in rows
@@ -189,10 +189,11 @@ def probing_table(table: RetentionTable) -> NamedTable:
     note = [
         "cross-fitted scores of the best sites",
         "n/a: the backbone's signal is not shown; such categories are not in the mean of retention",
+        "–: no site where the action is made has the view",
         "published: the paper's ratio of best accuracies, in the mean its mean over categories",
     ]
     columns = ("system", "view", "category", "backbone %", "action %", "retention [95 %]", "published")
-    return NamedTable(TextTable("Probes", caption(table, note), columns, cells), tuple(numbers))
+    return NamedTable(TextTable("Probes", caption(table, note), columns, cells, names=3), tuple(numbers))
 
 
 def once_per_run(rows: Sequence[RetentionRow]) -> list[RetentionRow]:

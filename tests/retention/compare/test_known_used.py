@@ -167,6 +167,10 @@ def test_probes_that_beat_nothing_are_said_to_encode_nothing(runs: tuple[SaidRun
     found = match_runs(vlm, policy, probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75))
     assert [row.has_signal for row in found.rows] == [True, False, None]
     assert any(note.startswith("In shape probes are not shown to exceed") for note in found.notes)
+    color, shape, whole = found.rows
+    assert (shape.answered_and_encoded, shape.share_not_acted_on) == (None, None)
+    for name in ("answered_and_encoded", "not_acted_on", "share_not_acted_on", "share_not_acted_on_ci"):
+        assert getattr(whole, name) == getattr(color, name), "shape's guesses do not count"
 
 
 def test_frames_that_differ_or_have_no_hash_are_refused(runs: tuple[SaidRun, SaidRun]) -> None:
