@@ -194,7 +194,7 @@ class SceneSpec:
         """A named scene, with fields replaced: `bridge` (default), `frontal`, `vl-think` or `act2answer`.
 
         Another arm than the preset's starts from the same pose of its tool, with joint angles of its own.
-        Raises SceneError for an unknown name or field.
+        Raises SceneError for an unknown name or field, and for a background that the rendering does not show.
         """
         if name not in PRESETS:
             raise SceneError(f"no scene preset {name!r}; there are {', '.join(PRESETS)}.")
@@ -207,7 +207,13 @@ class SceneSpec:
         other_arm = fields.get("arm", cls.arm) != PRESETS[name].get("arm", cls.arm)
         if other_arm and "home_joints" not in changes:
             fields["home_joints"] = None
-        return replace(cls(name=name), **fields)
+        scene = replace(cls(name=name), **fields)
+        if scene.background is not None and scene.rendering == "raw":
+            raise SceneError(
+                f"the background {str(scene.background)!r} would not be seen: the scene's rendering is 'raw'. "
+                "Give rendering='visual-matching' (--rendering visual-matching) too, or leave it out"
+            )
+        return scene
 
     @property
     def zone_radius(self) -> float:

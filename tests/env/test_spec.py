@@ -124,6 +124,13 @@ def test_the_record_names_a_photo_by_what_it_shows_and_not_by_where_it_lies(tmp_
         SceneSpec(background=tmp_path / "missing.jpg").to_json()
 
 
+def test_a_background_that_no_rendering_shows_is_refused(tmp_path: Path) -> None:
+    photo = tmp_path / "photo.jpg"
+    with pytest.raises(SceneError, match="would not be seen: the scene's rendering is 'raw'"):
+        SceneSpec.preset("bridge", background=photo)
+    assert SceneSpec.preset("bridge", background=photo, rendering="visual-matching").background == photo
+
+
 def test_the_record_cannot_be_changed():
     with pytest.raises(FrozenInstanceError):
         SceneSpec().epsilon = 0.08

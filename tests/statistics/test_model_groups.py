@@ -49,20 +49,26 @@ def test_p_is_below_five_percent_in_at_most_five_percent_of_equal_groups() -> No
     assert np.mean(np.array(found) <= 0.05) < 0.06
 
 
-def test_items_as_the_unit_take_differences_between_models_for_an_effect_of_their_group() -> None:
-    """Three and three models without any effect of the group, as different as the paper's six (8 points).
+@pytest.mark.parametrize(("models", "categories"), [(3, 1), (3, 12), (5, 1), (5, 12)])
+def test_items_as_the_unit_take_differences_between_models_for_an_effect_of_their_group(
+    models: int, categories: int
+) -> None:
+    """Two groups of models without any effect of the group, as different as the paper's six (8 points).
 
-    Why comparisons of groups lead with p over models: the p over items is small in half of all categories.
+    Why comparisons of groups lead with p over models: the p over items is small in half of all categories, and in
+    more of all means over categories.
     """
     generator = np.random.default_rng(0)
     over_items, over_models = [], []
-    for _ in range(200):
-        rates = generator.normal(0.6, 0.08, 6).clip(0, 1)
-        right = generator.binomial(2, rates[:, None], (6, 150))  # of two layouts, 150 items
-        over_items.append(flip_gains_p(right[:3].sum(axis=0) - right[3:].sum(axis=0), np.arange(150)))
-        over_models.append(exchange_p(*right.mean(axis=1).reshape(2, 3)).p)
-    assert 0.4 < np.mean(np.array(over_items) < 0.05) < 0.75
-    assert np.mean(np.array(over_models) <= 0.05) <= 0.06
+    for draw in range(400):
+        rates = generator.normal(0.6, 0.08, 2 * models).clip(0, 1)
+        right = generator.binomial(2, rates[:, None], (2 * models, 150 * categories))  # of two layouts
+        over_models.append(exchange_p(*right.mean(axis=1).reshape(2, models)).p)
+        if draw < 60:
+            gains = right[:models].sum(axis=0) - right[models:].sum(axis=0)
+            over_items.append(flip_gains_p(gains, np.arange(gains.size)))
+    assert np.mean(np.array(over_items) < 0.05) > (0.3 if categories == 1 else 0.6)
+    assert np.mean(np.array(over_models) <= 0.05) <= (0.06 if models == 5 else 0), "3 + 3: p is at least 0.10"
 
 
 def test_labels_of_very_many_models_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
