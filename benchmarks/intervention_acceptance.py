@@ -1,11 +1,12 @@
-"""What an intervention must find in the organisms: every property of the list, true or false.
+"""What an intervention must find in the organisms: every property of the list, true, inconclusive or false.
 
     python benchmarks/intervention_acceptance.py FOLDER [--seed 0] [--items 24] [--steps N] [--loop 4]
 
 Draws a suite of its own seed, has every organism of `probe_kit.demo.organisms` act on it, fits probes, intervenes.
 What is true of each is taken from there; places and layers from what is found. --steps plays shorter episodes:
 enough for all that is read off first actions, and the closed loop then repeats those. --loop: items per category
-that are played again. Finished work in FOLDER is reused. Exits with 1 if a property does not hold.
+that are played again. Finished work in FOLDER is reused. An inconclusive verdict is neither true nor false. Exits
+with 1 unless every property is true.
 """
 
 import argparse
@@ -13,7 +14,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from probe_kit.demo.organisms import ORGANISMS, TRAINED, UNTRAINED_NETWORK, Organism, findings, probed
+from probe_kit.demo.organisms import (
+    ORGANISMS,
+    TRAINED,
+    UNTRAINED_NETWORK,
+    Agreement,
+    Organism,
+    findings,
+    probed,
+)
 from probe_kit.demo.pipeline import PERMUTATIONS
 from probe_kit.errors import CaptureChangedActionError
 from probe_kit.extract import Run
@@ -35,14 +44,15 @@ ABSENT = "counting"
 
 @dataclass(frozen=True)
 class Property:
-    """Whether one property holds, and what was seen."""
+    """Whether one property holds, and what was seen. holds: None for a verdict that is inconclusive."""
 
     name: str
-    holds: bool
+    holds: bool | None
     seen: str
 
     def __str__(self) -> str:
-        return f"{'true ' if self.holds else 'FALSE'}  {self.name}: {self.seen}"
+        said = {True: "true", None: "inconclusive", False: "FALSE"}[self.holds]
+        return f"{said:12}  {self.name}: {self.seen}"
 
 
 @dataclass(frozen=True)
@@ -68,8 +78,12 @@ def acted(organism: Organism, suite: Suite, folder: Path, steps: int | None, unt
 
 def verdicts(runs: Sequence[tuple[Organism, Run]]) -> Iterator[Property]:
     """Every organism and category."""
+    holds: dict[Agreement, bool | None] = {"true": True, "inconclusive": None, "wrong": False}
     for one in findings(runs):
-        yield Property(f"verdict of {one.organism}, {one.category}", one.agrees, one.measured)
+        use = one.row.image_swap.use
+        moved = "" if use is None else f"; {use.reason}"
+        seen = f"{one.measured} (truth: {one.expected}){moved}"
+        yield Property(f"verdict of {one.organism}, {one.category}", holds[one.agreement], seen)
 
 
 def maps(trial: Trial, last: int) -> Iterator[Property]:
@@ -232,7 +246,9 @@ def main() -> int:
     for one in properties(trial, runs, arguments.loop):
         print(one, flush=True)
         found.append(one.holds)
-    print(f"{sum(found)} of {len(found)} hold")
+    print(
+        f"{found.count(True)} of {len(found)} hold, {found.count(None)} inconclusive, {found.count(False)} false"
+    )
     return 0 if all(found) else 1
 
 

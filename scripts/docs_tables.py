@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from probe_kit.demo.organisms import count_agreements
+
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "docs" / "demo.json"
 README = ROOT / "README.md"
@@ -36,7 +38,7 @@ def trained_table(data: Mapping[str, Any]) -> str:
 
 def organisms_table(data: Mapping[str, Any]) -> str:
     """The verdicts on all organisms; those of untrained ones in a line each, since nothing is to be seen."""
-    heading = ("policy", "category", "expected", "measured", "SR %", *PROBED)
+    heading = ("policy", "category", "expected", "measured", "agreement", "SR %", *PROBED)
     lines: list[tuple[str, ...]] = []
     for name in dict.fromkeys(row["organism"] for row in data["organisms"]):
         rows = _of(data, name)
@@ -44,11 +46,11 @@ def organisms_table(data: Mapping[str, Any]) -> str:
             lines.append(_joined(rows))
         else:
             lines += [_with_verdict(row) for row in rows]
-    true = sum(row["expected"] == row["measured"] for row in data["organisms"])
+    agreements = count_agreements([row["agreement"] for row in data["organisms"]])
     margin = _span(data["organisms"], "chance_margin")
     note = (
         f"{data['episodes']} episodes per category, Δ of {margin} points, {data['permutations']} "
-        f"permutations: {true} of {len(data['organisms'])} verdicts are true."
+        f"permutations: {agreements}."
     )
     return f"{_table(heading, lines)}\n\n{note}"
 
@@ -79,14 +81,15 @@ def _cells(row: Row) -> tuple[str, ...]:
 
 def _with_verdict(row: Row) -> tuple[str, ...]:
     category, *measures = _cells(row)
-    return row["organism"], category, row["expected"], row["measured"], *measures
+    return row["organism"], category, row["expected"], row["measured"], row["agreement"], *measures
 
 
 def _joined(rows: Sequence[Row]) -> tuple[str, ...]:
     first = rows[0]
     return (
-        first["organism"], f"the same {len(rows)}", first["expected"], first["measured"], _span(rows, "sr"),
-        f"{_span(rows, 'backbone')}, {_verdict(rows)}", _span(rows, "action"), _retention(first),
+        first["organism"], f"the same {len(rows)}", first["expected"], first["measured"], first["agreement"],
+        _span(rows, "sr"), f"{_span(rows, 'backbone')}, {_verdict(rows)}", _span(rows, "action"),
+        _retention(first),
     )  # fmt: skip
 
 

@@ -95,6 +95,7 @@ def _finding(finding: Finding) -> dict[str, object]:
         "category": finding.category,
         "expected": finding.expected,
         "measured": finding.measured,
+        "agreement": finding.agreement,
         "sr": row.success.sr,
         "chance_margin": row.success.chance_margin,
         "backbone": row.backbone.score,

@@ -3,14 +3,14 @@
 `vlm-tiny` answers and does not act: it was trained on questions of Color, Shape, State and Traffic (*known*),
 and of nothing else. `pi0-tiny` is made of its backbone: it was trained to act on Color and Shape (*used*), while
 the actions of State questions went to a random side (*not used*). `pi0-tiny-state` differs in that they
-followed the answer (*used*). The early checkpoint has the VLM's backbone and does not act on it; untrained
-networks know nothing (*absent*).
+followed the answer (*used*). The early checkpoint has the VLM's backbone and an action expert of random weights
+(*does not decide*); untrained networks know nothing (*absent*).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, get_args
 
 from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extract_run
 from probe_kit.extract.protocols import scene_of
@@ -28,7 +28,20 @@ if TYPE_CHECKING:
 
 NamedProgress = Callable[[str], Callable[..., None]]
 Truth = str
-"""A behaviour of `UseVerdict`, or `absent`, `known` or `unknown`."""
+"""A behaviour of `UseVerdict`, or `does not decide`, `absent`, `known` or `unknown`."""
+Agreement = Literal["true", "inconclusive", "wrong"]
+"""Of a verdict with the truth. An inconclusive verdict claims no behaviour: it is neither true nor wrong."""
+DOES_NOT_DECIDE: Truth = "does not decide"
+"""What is true of an action expert of random weights: nothing was trained to choose a side by the answer.
+
+Nothing was trained to ignore the answer either, and random weights pass some of it on. How much is not known.
+"""
+COMPATIBLE: Mapping[Truth, tuple[str, ...]] = {
+    DOES_NOT_DECIDE: (
+        "not used", "moves with it, does not decide", "against: moves with it, does not decide",
+    ),
+}  # fmt: skip
+"""By truth, every verdict that is true with it; of all others the truth's own words alone."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +82,7 @@ EARLY = Organism(
     "early",
     "run-early",
     "pi0-tiny-early",
-    truth=(("color", "not used"), ("shape", "not used"), ("state", "not used")),
+    truth=(("color", DOES_NOT_DECIDE), ("shape", DOES_NOT_DECIDE), ("state", DOES_NOT_DECIDE)),
     max_steps=SHORT,
     view="mean:language",  # where a VLM answers; nothing was trained that would take it from there
 )
@@ -101,9 +114,11 @@ class Finding:
     row: RetentionRow
 
     @property
-    def agrees(self) -> bool:
-        """Whether the instrument tells the truth."""
-        return self.expected == self.measured
+    def agreement(self) -> Agreement:
+        """Whether the verdict is true, inconclusive or wrong."""
+        if self.measured in COMPATIBLE.get(self.expected, (self.expected,)):
+            return "true"
+        return "inconclusive" if self.measured == "inconclusive" else "wrong"
 
 
 def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
@@ -204,17 +219,21 @@ def to_rich(findings: Sequence[Finding]) -> "ResponsiveTable":
     """One line per organism and category: the truth, the verdict, and the numbers behind it."""
     from probe_kit._terminal.responsive_table import Part, ResponsiveTable
 
-    agree = sum(finding.agrees for finding in findings)
+    counted = count_agreements([finding.agreement for finding in findings])
+    caption = f"{counted}; accuracies in %, retention with its interval"
+    if any(finding.expected == DOES_NOT_DECIDE for finding in findings):
+        either = " and ".join(f"*{verdict}*" for verdict in COMPATIBLE[DOES_NOT_DECIDE][:2])
+        caption += f". *{DOES_NOT_DECIDE}*: the action expert was not trained; {either} are both true of it"
     return ResponsiveTable(
         title="Model organisms",
-        caption=f"{agree} of {len(findings)} verdicts are true; accuracies in %, retention with its interval",
+        caption=caption,
         name="policy",
         names=tuple(finding.organism for finding in findings),
         styles=("",) * len(findings),
         parts=(
             Part(
                 "Verdicts",
-                ("category", "expected", "measured", ""),
+                ("category", "expected", "measured", "agreement"),
                 tuple(map(_verdict_cells, findings)),
             ),
             Part(
@@ -226,11 +245,22 @@ def to_rich(findings: Sequence[Finding]) -> "ResponsiveTable":
     )
 
 
+def count_agreements(found: Sequence[Agreement]) -> str:
+    """`20 of 24 verdicts are true, 4 inconclusive, none is wrong`."""
+    true, left_open, wrong = (found.count(agreement) for agreement in get_args(Agreement))
+    return (
+        f"{true} of {len(found)} verdicts are true, {left_open} inconclusive, "
+        f"{wrong or 'none'} {'are' if wrong > 1 else 'is'} wrong"
+    )
+
+
 def _verdict_cells(finding: Finding) -> "tuple[Cell, ...]":
     from probe_kit._terminal.responsive_table import Cell
 
-    mark = Cell("✓", "green") if finding.agrees else Cell("✗", "red")
-    return Cell(finding.category), Cell(finding.expected), Cell(finding.measured), mark
+    style = {"true": "green", "inconclusive": "yellow", "wrong": "red"}[finding.agreement]
+    return (
+        Cell(finding.category), Cell(finding.expected), Cell(finding.measured), Cell(finding.agreement, style),
+    )  # fmt: skip
 
 
 def _number_cells(finding: Finding) -> "tuple[Cell, ...]":

@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from probe_kit._terminal.console import out
 from probe_kit.demo.organisms import (
+    COMPATIBLE,
+    DOES_NOT_DECIDE,
     EARLY,
     ORGANISMS,
     OTHER_TWINS,
@@ -23,6 +26,7 @@ from probe_kit.demo.organisms import (
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import extract_run
 from probe_kit.intervene import ImageSwap, InstructionSwap, UseVerdict, run_intervention
+from probe_kit.intervene.kinds.image_swap.verdict import Behaviour
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.behaviour.success_rate import SuccessRate, regime
 from probe_kit.retention.columns.sentences import verdict
@@ -79,7 +83,7 @@ def test_what_does_not_exceed_a_control_is_not_shown(control: str) -> None:
 
 def test_organisms_differ_in_one_truth_at_a_time() -> None:
     assert (TRAINED.expected("color"), TRAINED.expected("state")) == ("used", "not used")
-    assert (EARLY.expected("color"), EARLY.expected("state")) == ("not used", "not used")
+    assert {EARLY.expected(category) for category in ("color", "shape", "state")} == {DOES_NOT_DECIDE}
     assert dict(STATE_USED.truth) == {**dict(TRAINED.truth), "state": "used"}
     assert {one.expected("counting") for one in ORGANISMS} == {"absent"}
     untrained = [one for one in ORGANISMS if one.random_weights]
@@ -142,12 +146,38 @@ def test_the_table_counts_the_true_verdicts() -> None:
     findings = [
         Finding("trained", "color", "used", "used", row(0.9, 0.005)),
         Finding("trained", "state", "not used", "absent", row(0.5, 0.3)),
+        Finding("early", "state", DOES_NOT_DECIDE, "inconclusive", row(0.5, 0.3)),
     ]
     with out.capture() as printed:
-        out.print(to_rich(findings), width=100)
-    text = printed.get()
-    assert "1 of 2 verdicts are true" in text
-    assert "not used" in text
+        out.print(to_rich(findings), width=160)
+    text = " ".join(printed.get().split())
+    assert "1 of 3 verdicts are true, 1 inconclusive, 1 is wrong" in text
+    assert "*not used* and *moves with it, does not decide* are both true of it" in text
+    assert [text.count(f" {own} ") for own in ("absent wrong", "inconclusive inconclusive")] == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("expected", "verdict", "agreement"),
+    [
+        (DOES_NOT_DECIDE, "not used", "true"),
+        (DOES_NOT_DECIDE, "moves with it, does not decide", "true"),
+        (DOES_NOT_DECIDE, "against: moves with it, does not decide", "true"),
+        (DOES_NOT_DECIDE, "inconclusive", "inconclusive"),
+        (DOES_NOT_DECIDE, "partly used, graded", "wrong"),
+        (DOES_NOT_DECIDE, "against: used", "wrong"),
+        (DOES_NOT_DECIDE, "absent", "wrong"),
+        ("not used", "moves with it, does not decide", "wrong"),
+        ("used", "inconclusive", "inconclusive"),
+    ],
+)
+def test_a_verdict_is_true_inconclusive_or_wrong(expected: str, verdict: str, agreement: str) -> None:
+    """An expert of random weights was not trained to choose by the answer, nor to ignore it."""
+    assert Finding("early", "state", expected, verdict, row(0.5, 0.3)).agreement == agreement
+
+
+def test_every_compatible_verdict_is_one_that_the_instrument_gives() -> None:
+    given = {f"{against}{own}" for own in get_args(Behaviour) for against in ("", "against: ")}
+    assert {own for verdicts in COMPATIBLE.values() for own in verdicts} <= given
 
 
 @pytest.mark.parametrize(("sr", "expected"), [(0.9, "known"), (0.6, "unknown"), (0.5, "unknown")])
