@@ -1,4 +1,4 @@
-"""Record a golden reference of pi0 or pi0.5: what lerobot's own code puts out for a tiny checkpoint.
+"""Record a golden reference of pi0, pi0.5 or pi0-FAST: what lerobot's own code puts out for a tiny checkpoint.
 
     uv run python scripts/record_reference.py CHECKPOINT FOLDER --cameras base
 
@@ -10,8 +10,10 @@ calls equal those of `predict_action_chunk`. `probe-kit verify FAMILY FOLDER` co
 import argparse
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import lerobot
@@ -20,15 +22,25 @@ import torch
 import transformers
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pi0 import modeling_pi0
+from lerobot.policies.pi0_fast import modeling_pi0_fast
 from lerobot.policies.pi05 import modeling_pi05
 from safetensors.torch import load_file
 from torch import Tensor
 from transformers import AutoTokenizer
 
+from probe_kit.models.building import replaced
 from probe_kit.models.lerobot.pi0 import Pi0Size, resized
+from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, sized
 
-MODULES: dict[str, Any] = {"pi0": modeling_pi0, "pi05": modeling_pi05}
-POLICIES: dict[str, Callable[[Any], Any]] = {"pi0": modeling_pi0.PI0Policy, "pi05": modeling_pi05.PI05Policy}
+MODULES: dict[str, Any] = {"pi0": modeling_pi0, "pi05": modeling_pi05, "pi0_fast": modeling_pi0_fast}
+POLICIES: dict[str, Callable[[Any], Any]] = {
+    "pi0": modeling_pi0.PI0Policy,
+    "pi05": modeling_pi05.PI05Policy,
+    "pi0_fast": modeling_pi0_fast.PI0FastPolicy,
+}
+WEIGHTS = {"pi0_fast": "tiny weights, trained until their tokens are whole chunks (`tests/support`)"}
+CAPTURED = 10
+"""Action tokens of pi0-FAST of which the streams are recorded."""
 TASKS = ("put the cube on the red shape", "put the cube on the star")
 EMBEDDING = "model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
 HEAD = "model.paligemma_with_expert.paligemma.lm_head.weight"
@@ -38,8 +50,13 @@ def lerobots_policy(checkpoint: Path) -> Any:
     """lerobot's policy with the checkpoint's weights, through torch's strict loading alone."""
     config: Any = PreTrainedConfig.from_pretrained(checkpoint)
     config.compile_model, config.device = False, "cpu"
-    with resized(MODULES[config.type], Pi0Size.from_file(checkpoint / "dims.json")):
-        policy = POLICIES[config.type](config)
+    if config.type == "pi0_fast":
+        config.text_tokenizer_name = str(checkpoint)
+        with sized(Pi0FastSize.from_file(checkpoint / "dims.json"), config), packaged_fast(checkpoint):
+            policy: Any = POLICIES[config.type](config)
+    else:
+        with resized(MODULES[config.type], Pi0Size.from_file(checkpoint / "dims.json")):
+            policy = POLICIES[config.type](config)
     tensors = load_file(checkpoint / "model.safetensors")
     tensors.setdefault(EMBEDDING, tensors[HEAD])
     lacking = policy.load_state_dict(tensors, strict=False)
@@ -47,6 +64,18 @@ def lerobots_policy(checkpoint: Path) -> Any:
     if lacking.unexpected_keys or set(lacking.missing_keys) - unused:
         raise SystemExit(f"other tensors than the network's: {lacking}")
     return policy.eval()
+
+
+@contextmanager
+def packaged_fast(checkpoint: Path) -> Iterator[None]:
+    """Inside, pi0-FAST's tokenizer is the class that lerobot ships for MolmoAct2, instead of remote code."""
+    from lerobot.policies.molmoact2.molmoact2_hf_model.action_tokenizer import UniversalActionProcessor
+
+    def read(name: str, **_: Any) -> Any:
+        return UniversalActionProcessor.from_pretrained_local(str(checkpoint / name))
+
+    with replaced(modeling_pi0_fast, {"AutoProcessor": SimpleNamespace(from_pretrained=read)}):
+        yield
 
 
 def stack(model: Any, entering: Tensor, mask: Tensor, positions: Tensor, **further: Any) -> tuple[Tensor, Tensor]:
@@ -112,6 +141,48 @@ def record(policy: Any, batch: dict[str, Tensor], noise: Tensor) -> dict[str, np
     return {name: value.detach().numpy() for name, value in found.items()}
 
 
+def record_tokens(policy: Any, batch: dict[str, Tensor]) -> dict[str, np.ndarray]:
+    """Every quantity of one inference of pi0-FAST; see `hooks.families.pi0_fast.verify`."""
+    model, joint = policy.model, policy.model.paligemma_with_expert
+    decoder, mask_of = joint.paligemma.model.language_model, modeling_pi0_fast.prepare_attention_masks_4d
+    images, image_masks = policy._preprocess_images(batch)
+    tokens, token_mask = batch["observation.language.tokens"], batch["observation.language.attention_mask"]
+    found: dict[str, Tensor] = {"prep_images": torch.stack(images)}
+    found["vision_resid"] = torch.stack([vision_streams(joint, image) for image in images])
+    rows, one = len(tokens), torch.ones((len(tokens), 1), dtype=torch.bool)
+    begin = torch.full((rows, 1), policy._paligemma_tokenizer.bos_token_id)
+    entering, pad, attends, _, _ = model.embed_prefix_fast(
+        images, image_masks, torch.cat([tokens, begin], dim=1), torch.cat([token_mask, one], dim=1)
+    )
+    cache, places = transformers.DynamicCache(), torch.cumsum(pad, dim=1) - 1
+    columns: dict[str, list[Tensor]] = {"action_resid": [], "action_final_norm": [], "logits": []}
+    chosen: list[Tensor] = []
+    end = policy._paligemma_tokenizer.convert_tokens_to_ids("|")
+    while not chosen or not bool((torch.stack(chosen) == end).any(dim=0).all()):
+        resid, normed = stack(decoder, entering, mask_of(attends), places, past_key_values=cache)
+        if not chosen:
+            found |= {"prefix_pad": pad[:, :-1], "backbone_resid": resid[:, :, :-1]}
+            found["backbone_final_norm"] = normed[:, :-1]
+        logits = joint.paligemma.lm_head(normed[:, -1])
+        for name, value in zip(columns, (resid[:, :, -1:], normed[:, -1:], logits), strict=True):
+            columns[name].append(value)
+        chosen.append(logits.argmax(dim=-1))
+        if len(chosen) == policy.config.max_decoding_steps:
+            break
+        entering, pad = joint.embed_language_tokens(chosen[-1][:, None]), torch.cat([pad, one], dim=1)
+        places, attends = pad.sum(dim=1, keepdim=True) - 1, pad[:, None]
+    found |= {name: torch.stack(values[:CAPTURED]) for name, values in columns.items()}
+    found["logits"] = torch.stack(columns["logits"])
+    found["tokens"] = torch.stack(chosen, dim=1)
+    theirs = model.sample_actions_fast_kv_cache(
+        images, image_masks, tokens, token_mask, policy.config.max_decoding_steps
+    )
+    if not torch.equal(theirs[:, : len(chosen)], found["tokens"]):
+        raise SystemExit("lerobot's blocks, called one by one, put out other tokens than lerobot's sampling")
+    found["actions"] = policy.predict_action_chunk(batch)
+    return {name: value.detach().numpy() for name, value in found.items()}
+
+
 def vision_streams(joint: Any, image: Tensor) -> Tensor:
     """(L + 1, B, N, D): the embeddings, then what each block of the tower puts out."""
     tower = joint.paligemma.model.vision_tower.vision_model
@@ -127,9 +198,14 @@ def prompts(policy: Any, state: np.ndarray) -> list[str]:
     if policy.config.type == "pi0":
         return [f"{task}\n" for task in TASKS]
     from lerobot.lerobot_types import TransitionKey
+    from lerobot.policies.pi0_fast.processor_pi0_fast import Pi0FastPrepareStateAndLanguageTokenizerProcessorStep
     from lerobot.policies.pi05.processor_pi05 import Pi05PrepareStateTokenizerProcessorStep
 
-    worded = Pi05PrepareStateTokenizerProcessorStep()(
+    steps = {
+        "pi05": Pi05PrepareStateTokenizerProcessorStep,
+        "pi0_fast": Pi0FastPrepareStateAndLanguageTokenizerProcessorStep,
+    }
+    worded = steps[policy.config.type]()(
         {
             TransitionKey.OBSERVATION: {"observation.state": torch.from_numpy(state)},
             TransitionKey.COMPLEMENTARY_DATA: {"task": list(TASKS)},
@@ -175,10 +251,12 @@ def main() -> None:
         generator=torch.Generator().manual_seed(chosen.seed),
     )
     with torch.inference_mode():
-        found = record(policy, batch, noise)
+        found = record_tokens(policy, batch) if config.type == "pi0_fast" else record(policy, batch, noise)
     least, most = quantiles(chosen.checkpoint, "postprocessor", "action")
     found["actions_unnormalized"] = (found["actions"] + 1) / 2 * (most - least) + least
-    found |= {"in_raw_state": raw, "in_state": state, "in_noise": noise.numpy(), "in_lang_mask": mask.numpy()}
+    found |= {"in_raw_state": raw, "in_state": state, "in_lang_mask": mask.numpy()}
+    if config.type != "pi0_fast":
+        found["in_noise"] = noise.numpy()
     found["in_lang_tokens"] = text["input_ids"].numpy()
     found |= {f"in_image_{name}": picture for name, picture in zip(chosen.cameras, pictures, strict=True)}
     chosen.folder.mkdir(parents=True, exist_ok=True)
@@ -191,7 +269,7 @@ def main() -> None:
     }
     (chosen.folder / "README.md").write_text(
         f"# Golden reference: {config.type}\n\nRecorded by `scripts/record_reference.py` with lerobot's own "
-        f"blocks, called one by one; random weights. {json.dumps(versions)}\n",
+        f"blocks, called one by one; {WEIGHTS.get(config.type, 'random weights')}. {json.dumps(versions)}\n",
         encoding="utf-8",
     )
 

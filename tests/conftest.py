@@ -120,6 +120,11 @@ def golden_pi05() -> Path:
 
 
 @pytest.fixture(scope="session")
+def golden_pi0_fast() -> Path:
+    return _golden("pi0_fast")
+
+
+@pytest.fixture(scope="session")
 def golden_smolvla() -> Path:
     return _golden("smolvla")
 

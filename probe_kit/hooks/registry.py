@@ -22,6 +22,7 @@ ENTRY_POINTS = "probe_kit.policies"
 FOLDERS = (
     "pi0",
     "pi05",
+    "pi0_fast",
     "smolvla",
     "openvla",
     "spatialvla",

@@ -29,6 +29,7 @@ FOLDERS = {
     "pi0-tiny": embedded_checkpoint("pi0-tiny"),
     "pi0": GOLDEN / "pi0" / "checkpoint",
     "pi05": GOLDEN / "pi05" / "checkpoint",
+    "pi0-fast": GOLDEN / "pi0_fast" / "checkpoint",
     "smolvla": GOLDEN / "smolvla" / "checkpoint",
     "openvla": GOLDEN / "openvla" / "checkpoint",
     "magma": GOLDEN / "magma" / "checkpoint",
@@ -37,7 +38,7 @@ FOLDERS = {
     "internvla-m1": GOLDEN / "internvla_m1" / "checkpoint",
 }
 REFUSALS = (CheckpointError, WeightsError)
-COPIED = ("pi0-tiny", "pi0", "pi05", "smolvla")
+COPIED = ("pi0-tiny", "pi0", "pi05", "pi0-fast", "smolvla")
 """Act as they lie there. To the others' golden references a tokenizer or units are missing: they are made here."""
 MADE = {
     "openvla": write_openvla,

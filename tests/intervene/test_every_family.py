@@ -29,6 +29,7 @@ from probe_kit.intervene import (
 from probe_kit.suite import Suite
 from tests.support.internvla_checkpoints import write_checkpoint as write_internvla
 from tests.support.magma_checkpoints import write_checkpoint as write_magma
+from tests.support.pi0_fast_checkpoints import write_pi0_fast
 from tests.support.pi05_checkpoints import write_pi05
 from tests.support.prismatic_checkpoints import write_checkpoint as write_openvla
 from tests.support.spatialvla_checkpoints import write_checkpoint as write_spatialvla
@@ -52,6 +53,7 @@ FAMILIES = {
     "pi0-tiny": Tiny(),
     "pi0": Tiny(golden="golden_pi0"),
     "pi05": Tiny(write_pi05),
+    "pi0-fast": Tiny(write_pi0_fast),
     "smolvla": Tiny(golden="golden_smolvla"),
     "openvla": Tiny(write_openvla, options={"tokenizer": "bytes"}),
     "spatialvla": Tiny(write_spatialvla),

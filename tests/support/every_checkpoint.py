@@ -8,6 +8,7 @@ from tests.support import (
     internvla_checkpoints,
     magma_checkpoints,
     pi0_checkpoints,
+    pi0_fast_checkpoints,
     pi05_checkpoints,
     prismatic_checkpoints,
     smolvla_checkpoints,
@@ -20,6 +21,7 @@ _BYTES = {"tokenizer": "bytes"}
 WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "pi0": (pi0_checkpoints.write_intact, {}),
     "pi05": (pi05_checkpoints.write_pi05, {}),
+    "pi0-fast": (pi0_fast_checkpoints.write_pi0_fast, {}),
     "smolvla": (smolvla_checkpoints.write_smolvla, {}),
     "openvla": (prismatic_checkpoints.write_checkpoint, _BYTES),
     "prismatic": (prismatic_checkpoints.write_checkpoint, _BYTES),

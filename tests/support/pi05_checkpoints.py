@@ -17,10 +17,10 @@ from probe_kit.models.embedded.words import WORDS
 from tests.support.lerobot_units import write_units
 
 STATES, ACTIONS = 8, 7
-_LOW = np.array([0.1, -0.3, -0.1, -1.0, -1.0, -1.0, -1.0, 0.0], np.float32)
-_LEAST = np.array([-0.03, -0.04, -0.02, -0.08, -0.09, -0.2, 0.0], np.float32)
-_MOST = np.array([0.02, 0.05, 0.04, 0.06, 0.07, 0.25, 1.0], np.float32)
-_HIGH = np.array([0.6, 0.3, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0], np.float32)
+LOW = np.array([0.1, -0.3, -0.1, -1.0, -1.0, -1.0, -1.0, 0.0], np.float32)
+LEAST = np.array([-0.03, -0.04, -0.02, -0.08, -0.09, -0.2, 0.0], np.float32)
+MOST = np.array([0.02, 0.05, 0.04, 0.06, 0.07, 0.25, 1.0], np.float32)
+HIGH = np.array([0.6, 0.3, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0], np.float32)
 
 
 def write_pi05(
@@ -70,8 +70,8 @@ def write_pi05(
     tensors.pop("model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight")
     assert head in tensors  # lerobot stores the tied embedding once
     save_file(tensors, folder / "model.safetensors", metadata={"format": "pt"})
-    write_units(folder, "observation.state", "QUANTILES", {"q01": _LOW, "q99": _HIGH})
-    write_units(folder, "action", "QUANTILES", {"q01": _LEAST, "q99": _MOST})
+    write_units(folder, "observation.state", "QUANTILES", {"q01": LOW, "q99": HIGH})
+    write_units(folder, "action", "QUANTILES", {"q01": LEAST, "q99": MOST})
     return folder
 
 

@@ -57,7 +57,7 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
         yield tape
     for hook in hooks:
         hook.check_count()
-        tape.fires[hook.name] = hook.count
+        tape.fires[hook.name] = hook.promised
     _check_non_finite(tape)
 
 
@@ -111,6 +111,10 @@ class _CountingHook:
     def name(self) -> str:
         return str(self.first).partition("@")[0]
 
+    @property
+    def promised(self) -> int:
+        return self.tap.first + self.tap.fires
+
     def attach(self) -> RemovableHandle:
         if isinstance(self.tap.module, torch._dynamo.OptimizedModule):
             raise CaptureError(
@@ -144,12 +148,13 @@ class _CountingHook:
         return None if instead is None else (instead, *passing[1:])
 
     def check_count(self) -> None:
-        expected = self.tap.first + self.tap.fires
-        if self.count == expected:
+        expected = self.promised
+        if self.count == expected or (self.tap.more and self.count > expected):
             return
         wrong = SiteNeverFiredError if self.count < expected else SiteFiredTooOftenError
+        least = "at least " if self.tap.more else ""
         raise wrong(
-            f"{self.first} fired {self.count} times in one inference; expected {expected}. The model does "
+            f"{self.first} fired {self.count} times in one inference; expected {least}{expected}. The model does "
             "not call this module the way the adapter declares: correct the tap, or run the model once per context"
         )
 

@@ -57,6 +57,8 @@ class Tap:
     argument: name of the keyword that carries the tensor, where the module is not called with it in first place.
     view: brings what passes to (B, T, D) where it has another form; it must share memory, so that an edit of the
     result edits what passes.
+    more: whether an inference may call `module` further times, which belong to no site: where the model itself
+    decides how many tokens it puts out.
 
     The residual stream is read at inputs, not outputs: some families drive their layers piecewise or add in
     place, and then a layer's output is never seen or seen too late. The first submodule of a block is always
@@ -71,6 +73,7 @@ class Tap:
     first: int = 0
     argument: str | None = None
     view: Callable[[Tensor], Tensor] | None = None
+    more: bool = False
 
     def select(self, passing: Tensor) -> Tensor:
         """The site's own (B, T, D), a view of what passes, or that itself where all of it is the site's."""

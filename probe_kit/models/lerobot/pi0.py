@@ -102,26 +102,35 @@ def resized(module: ModuleType, size: Pi0Size | None) -> Iterator[None]:
         return
     replacements: dict[str, Callable[..., Any]] = {
         "get_gemma_config": lambda variant: size.vlm if variant == "gemma_2b" else size.expert,
-        "PaliGemmaForConditionalGenerationWithPiGemma": _sized_paligemma(module, size),
+        "PaliGemmaForConditionalGenerationWithPiGemma": sized_paligemma(
+            module, size.vlm, size.vision, size.vocab_size
+        ),
         "PiGemmaForCausalLM": _sized_expert(module, size),
     }
     with replaced(module, replacements):
         yield
 
 
-def _sized_paligemma(module: Any, size: Pi0Size) -> Callable[..., Any]:
+def sized_paligemma(
+    module: Any, vlm: GemmaSize, vision: SiglipSize, vocab_size: int, image_side: int | None = None
+) -> Callable[..., Any]:
+    """What stands for lerobot's PaliGemma in `module` while a network of these sizes is built.
+
+    image_side: in pixels, where lerobot leaves it at that of the released tower.
+    """
     real = module.PaliGemmaForConditionalGenerationWithPiGemma
 
     def build(config: Any) -> Any:
-        config._vocab_size = size.vocab_size
-        config.text_config.vocab_size = size.vocab_size
-        vision = config.vision_config
-        vision.hidden_size = size.vision.hidden
-        vision.num_hidden_layers = size.vision.layers
-        vision.num_attention_heads = size.vision.heads
-        vision.intermediate_size = size.vision.inter
-        vision.patch_size = size.vision.patch
-        vision.projection_dim = size.vlm.width
+        config._vocab_size = vocab_size
+        config.text_config.vocab_size = vocab_size
+        tower = config.vision_config
+        tower.hidden_size = vision.hidden
+        tower.num_hidden_layers = vision.layers
+        tower.num_attention_heads = vision.heads
+        tower.intermediate_size = vision.inter
+        tower.patch_size = vision.patch
+        tower.projection_dim = vlm.width
+        tower.image_size = image_side or tower.image_size
         return real(config=config)
 
     return build

@@ -1,4 +1,4 @@
-"""Names of the tensors of pi0 and pi0.5 in older files, brought to the names lerobot 0.6 builds."""
+"""Names of the tensors of pi0, pi0.5 and pi0-FAST in older files, brought to the names lerobot 0.6 builds."""
 
 from collections.abc import Mapping, Sequence
 
@@ -31,6 +31,14 @@ def current_pi0_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def current_pi05_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The same tensors of a pi0.5 under the names lerobot 0.6 uses; see `current_pi0_keys`."""
     return _renamed(tensors, (*_MOVED, *_TIME_OF_PI05))
+
+
+def current_pi0_fast_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The same tensors of a pi0-FAST, whose head puts out tokens; head and embedding may be stored as one."""
+    found = _renamed(tensors, _MOVED)
+    if _EMBEDDING in found:
+        found.setdefault(_LM_HEAD, found[_EMBEDDING])
+    return found
 
 
 def _renamed(tensors: Mapping[str, Tensor], names: Sequence[tuple[str, str]]) -> dict[str, Tensor]:

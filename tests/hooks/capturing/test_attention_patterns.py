@@ -126,7 +126,10 @@ def test_patterns_of_half_precision_are_those_of_the_same_weights_in_full(family
         torch.testing.assert_close(found[0][site], found[1][site], rtol=0, atol=0.05)
 
 
-@pytest.mark.parametrize("family", ["pi0", "pi05", "smolvla", "openvla", "spatialvla", "magma", "xiaomi-r0"])
+@pytest.mark.filterwarnings("ignore:the model put out tokens")
+@pytest.mark.parametrize(
+    "family", ["pi0", "pi05", "pi0-fast", "smolvla", "openvla", "spatialvla", "magma", "xiaomi-r0"]
+)
 def test_the_acting_streams_patterns_on_the_prompt_are_its_recorded_attention(family: str, tmp_path: Path) -> None:
     """Each family records that in code of its own."""
     write, options = WRITERS[family]

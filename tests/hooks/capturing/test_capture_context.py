@@ -147,3 +147,20 @@ def test_an_edit_of_another_shape_is_refused(pi0_tiny: Pi0, observation: Observa
         edit(pi0_tiny, {Site("backbone", 1): lambda activation: activation[:, :1]}),
     ):
         pi0_tiny.act([observation], [0])
+
+
+def test_a_module_that_may_be_called_more_often_is_captured_at_its_first_calls(
+    pi0_tiny: Pi0, observation: Observation, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the model itself decides how many tokens it puts out; fewer calls than are captured stay an error."""
+    sites, whole = pi0_tiny.streams["expert"].sites()[:1], pi0_tiny.tap(Site("expert", 0, iteration=0))
+    with capture(pi0_tiny, sites) as plain:
+        pi0_tiny.act([observation], [0])
+    monkeypatch.setattr(pi0_tiny, "tap", lambda _: replace(whole, fires=3, more=True))
+    with capture(pi0_tiny, sites) as cache:
+        pi0_tiny.act([observation], [0])
+    assert torch.equal(cache[sites[0]], plain[sites[0]])
+    assert cache.fires == {"expert.00.residual": 3}
+    monkeypatch.setattr(pi0_tiny, "tap", lambda _: replace(whole, fires=11, more=True))
+    with pytest.raises(SiteNeverFiredError, match="expected at least 11"), capture(pi0_tiny, sites):
+        pi0_tiny.act([observation], [0])

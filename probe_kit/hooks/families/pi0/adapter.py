@@ -7,45 +7,23 @@ Suffix: the state, then the action chunk.
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor, nn
-from transformers import AutoTokenizer
 
-from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import side_files
-from probe_kit.hooks.checkpoints.hub import unreachable
-from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.pi0.evaluated import EvaluatedPi0
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights, returned
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
+from probe_kit.hooks.families.shared.lerobot.paligemma import PaliGemmaPolicy, sizes_file
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, flow_stacks
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.models.lerobot.pi0 import Pi0Size, build_pi0
 from probe_kit.models.lerobot.pi0_keys import current_pi0_keys
 
-_TOKENIZER = "google/paligemma-3b-pt-224"
 
-
-LEAST_BYTES = 1_000_000_000
-"""Of weights in the released size, which have 3.5 billion parameters."""
-
-
-def _check_small_weights(folder: Path) -> None:
-    """A small network that lost its `dims.json` would be built at full size, for minutes, before it is refused."""
-    found = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
-    if 0 < found < LEAST_BYTES:
-        raise CheckpointError(
-            f"{folder} has {found / 1e6:,.1f} MB of weights and no dims.json; pi0 in its released size has "
-            "several GB. Put the dims.json beside its config.json, or download the checkpoint again"
-        )
-
-
-class Pi0(EvaluatedPi0):
+class Pi0(PaliGemmaPolicy, EvaluatedPi0):
     """A loaded pi0."""
 
     family = "pi0"
@@ -58,10 +36,8 @@ class Pi0(EvaluatedPi0):
     @classmethod
     def build(cls, config: Any, folder: Path) -> nn.Module:
         """lerobot's policy at the size `dims.json` gives, or at the released size."""
-        sizes = [place / "dims.json" for place in (folder, folder.parent) if (place / "dims.json").is_file()]
-        if not sizes:
-            _check_small_weights(folder)
-        return cls.network_of(config, Pi0Size.from_file(sizes[0]) if sizes else None)
+        sizes = sizes_file(folder)
+        return cls.network_of(config, None if sizes is None else Pi0Size.from_file(sizes))
 
     @classmethod
     def network_of(cls, config: Any, size: Pi0Size | None) -> nn.Module:
@@ -89,43 +65,6 @@ class Pi0(EvaluatedPi0):
         """Flow-matching steps per inference."""
         return int(self.config.num_inference_steps)
 
-    @cached_property
-    def tokenizer(self) -> Any:
-        """PaliGemma's, from the checkpoint folder or the hub."""
-        if (place := self._tokenizer_folder()) is not None:
-            return AutoTokenizer.from_pretrained(place)
-        try:
-            return AutoTokenizer.from_pretrained(_TOKENIZER, local_files_only=bool(unreachable()))
-        except OSError as error:
-            raise CheckpointError(
-                f"{self.folder} has no tokenizer.json and the gated {_TOKENIZER} cannot be fetched. Run "
-                "`hf auth login`, or put its tokenizer.json and tokenizer_config.json into the checkpoint folder"
-            ) from error
-
-    def _tokenizer_folder(self) -> Path | None:
-        places = (self.folder, self.folder.parent / "tokenizer")
-        return next((place for place in places if (place / "tokenizer.json").is_file()), None)
-
-    def side_files(self) -> dict[str, Path]:
-        """Also the sizes and the tokenizer, where they lie beside the folder."""
-        found = super().side_files()
-        sizes, text = self.folder.parent / "dims.json", self._tokenizer_folder()
-        if "dims.json" not in found and sizes.is_file():
-            found["dims.json"] = sizes
-        if text is not None and text != self.folder:
-            found |= side_files(text, "tokenizer/")
-        return found
-
-    @property
-    def masked_cameras(self) -> int:
-        """All that are not shown."""
-        return len(self.config.image_features) - len(self.shown)
-
-    def prefix_labels(self, language: Sequence[str]) -> list[str]:
-        """Cameras without a picture are masked and lie behind the shown ones."""
-        images = [f"image.{camera}" for camera in self.shown for _ in range(self.tokens_per_camera)]
-        return [*images, *[PADDING] * self.tokens_per_camera * self.masked_cameras, *language]
-
     def suffix_labels(self) -> list[str]:
         """The state, then the chunk."""
         return ["state", *["action"] * self.config.chunk_size]
@@ -140,16 +79,6 @@ class Pi0(EvaluatedPi0):
         return recording_weights(
             [layer.self_attn for layer in self._joint.gemma_expert.model.layers], own, returned
         )
-
-    def patch_order(self) -> NDArray[np.int64]:
-        """A token per patch, row by row."""
-        return np.arange(self.tokens_per_camera)
-
-    @property
-    def tokens_per_camera(self) -> int:
-        """Patches of one picture."""
-        vision = self.network.model.paligemma_with_expert.paligemma.model.vision_tower.vision_model
-        return int(vision.embeddings.num_patches)
 
 
 def load_pi0(

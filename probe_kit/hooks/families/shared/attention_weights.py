@@ -45,7 +45,7 @@ def returned(_: Any, __: tuple[Any, ...], ___: dict[str, Any], output: Any) -> T
     return weights
 
 
-def recomputed(attention: Any, _: tuple[Any, ...], given: dict[str, Any], __: Any) -> Tensor:
+def recomputed(attention: Any, inputs: tuple[Any, ...], given: dict[str, Any], _: Any) -> Tensor:
     """(B, H, 1, K) of the last position, of Llama's kind of attention, whose fast kernels return no weights.
 
     Computed once more from the module's inputs and the keys it left. Raises UnsupportedInterventionError for an
@@ -56,7 +56,7 @@ def recomputed(attention: Any, _: tuple[Any, ...], given: dict[str, Any], __: An
             f"{type(attention).__name__} rotates and projects in a way of its own, and its attention cannot be "
             "computed once more here. Patch `kv` instead"
         )
-    states: Tensor = given["hidden_states"][:, -1:]
+    states: Tensor = (inputs[0] if inputs else given["hidden_states"])[:, -1:]
     cosines, sines = (part[:, None, -1:] for part in given["position_embeddings"])
     queries = attention.q_proj(states).unflatten(-1, (-1, attention.head_dim)).transpose(1, 2)
     below, above = queries.chunk(2, dim=-1)

@@ -122,7 +122,7 @@ def test_the_protocols_checkpoint_by_its_name_gets_the_shipped_statistics(
     """The hub is stood in for by a folder: what is proved is what follows from the name."""
     name = find_family("pi0").default_checkpoint
     assert name in evaluated.EVALUATED_WITH
-    monkeypatch.setattr("probe_kit.hooks.families.shared.lerobot.flow.checkpoint_folder", lambda _: folder)
+    monkeypatch.setattr("probe_kit.hooks.families.shared.lerobot.policy.checkpoint_folder", lambda _: folder)
     policy = adapter.load_pi0(str(name))
     assert policy.embodiment_mismatch() is None
     assert policy.state_units.source == "bridge statistics shipped with probe_kit"

@@ -1,12 +1,12 @@
 """The transformer stacks of lerobot's flow policies, and the modules of their sites."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from torch import nn
 
-from probe_kit.hooks.contract.model import Tap
+from probe_kit.hooks.contract.model import EVERY, Tap
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 
 
@@ -39,6 +39,21 @@ class Stack:
         attention: Any = self.layers[0].self_attn
         heads = int(_projection(attention).in_features) // int(attention.head_dim)
         return Stream(name, len(self.layers) + 1, self.width, self.iterations, heads=heads)
+
+
+@dataclass(frozen=True)
+class TokenStack(Stack):
+    """A decoder that puts out as many tokens as it likes, in one of its two roles.
+
+    tokens: the positions of its first pass that belong to the stream. iterations: the captured tokens, or None for
+    the prompt.
+    """
+
+    tokens: slice = EVERY
+
+    def tap(self, site: Site) -> Tap:
+        """Calls behind those of the captured tokens belong to no site."""
+        return replace(super().tap(site), tokens=self.tokens, more=True)
 
 
 def _projection(attention: Any) -> Any:

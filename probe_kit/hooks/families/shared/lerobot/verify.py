@@ -15,7 +15,8 @@ from torch import Tensor, nn
 
 from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.contract.sites import Site, Stream
-from probe_kit.hooks.families.shared.lerobot.flow import IMAGES, MASK, STATE, TOKENS, LerobotFlow
+from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow
+from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, MASK, STATE, TOKENS
 from probe_kit.hooks.verification.verify import Comparison, Produce, compare
 
 TOLERANCE = 1e-5

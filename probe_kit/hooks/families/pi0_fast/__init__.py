@@ -1,0 +1,55 @@
+"""pi0-FAST through lerobot."""
+
+from dataclasses import replace
+
+from probe_kit.hooks.contract.card import SourceWeights
+from probe_kit.hooks.contract.declared import backbone, chosen_tokens
+from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.families.shared.capabilities import TOKENS
+from probe_kit.hooks.family import Family
+
+CAPTURED = 10
+"""Action tokens whose positions are sites: "Action: ", and the lowest frequency of about seven dimensions."""
+FAST = replace(TOKENS, readout="first-chunk")
+"""One decoder puts out the tokens of a whole chunk."""
+
+FAMILIES = (
+    Family(
+        "pi0-fast",
+        "pi0-FAST (PaliGemma 3B, actions as compressed tokens) through lerobot",
+        "lerobot/pi0fast-base",
+        "probe_kit.hooks.families.pi0_fast.adapter:load_pi0_fast",
+        streams=f"backbone 19 layers, action 19 layers x {CAPTURED} action tokens of a variable number",
+        embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
+        hub=(
+            ("google/paligemma-3b-pt-224", "tokenizer.json"),
+            ("lerobot/fast-action-tokenizer", "processor_config.json"),
+        ),
+        notes=(
+            "Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated. The FAST tokenizer is read as data, "
+            "without its remote code. The base can be captured without acting (--no-act)"
+        ),
+        verifier="probe_kit.hooks.families.pi0_fast.verify:verify_pi0_fast",
+        config_types=("pi0_fast",),
+        source="paligemma",
+        source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
+        words="probe_kit.hooks.families.pi0_fast.adapter:check_pi0_fast_words",
+        declared={
+            "": (
+                backbone(19, 2048, 968, "state", camera="base_0_rgb"),
+                chosen_tokens("action", 19, 2048, CAPTURED),
+            )
+        },
+        full_size="probe_kit.models.lerobot.pi0_fast:full_size_pi0_fast",
+        options=(
+            Option("captured_tokens", int, "Action tokens whose positions are sites.", str(CAPTURED)),
+            Option(
+                "temperature",
+                float,
+                "0: the likeliest token; above: drawn by each row's seed.",
+                "the checkpoint's",
+            ),
+        ),
+        interventions=FAST,
+    ),
+)

@@ -1,0 +1,237 @@
+"""The adapter for pi0-FAST: actions as text, a number of tokens that the network decides.
+
+Sequence: every camera's patches, then a prompt with the instruction and the state as digits: one bidirectional
+block, whose last token begins the actions. Action tokens follow, each reading all before it, until one is the end.
+Iteration k of the stream `action` is the position that chooses the k-th token. The first ones are captured; the
+others are decoded and belong to no site.
+
+Source: arXiv 2501.09747, through lerobot's `PI0FastPolicy`.
+"""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.checkpoints.checkpoint import side_files
+from probe_kit.hooks.contract.model import Tap
+from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.unembedding import Unembedding
+from probe_kit.hooks.families.pi0_fast import CAPTURED, FAST
+from probe_kit.hooks.families.pi0_fast.actions import ActionText, DecodedChunk, FastTokenizer, fast_folder
+from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
+from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
+from probe_kit.hooks.families.shared.lerobot.paligemma import PaliGemmaPolicy, sizes_file
+from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
+from probe_kit.hooks.families.shared.lerobot.stacks import Stack, TokenStack, flow_stacks
+from probe_kit.hooks.families.shared.lerobot.state_prompt import StatePrompt
+from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, kv_tap
+from probe_kit.hooks.families.shared.sampling import chooser
+from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, TokenPrompt, build_pi0_fast, decode_tokens
+from probe_kit.models.lerobot.pi0_keys import current_pi0_fast_keys
+
+_LAST = slice(-1, None)
+
+
+@dataclass(frozen=True)
+class Decoding(Evaluation):
+    """How action tokens are put out. captured: those that are sites. temperature: None for the checkpoint's."""
+
+    captured: int = CAPTURED
+    temperature: float | None = None
+
+
+class Pi0Fast(StatePrompt, PaliGemmaPolicy):
+    """A loaded pi0-FAST."""
+
+    family = "pi0-fast"
+    config_type = "pi0_fast"
+    interventions = FAST
+
+    acting_stream = "action"
+    suffix_roles = ("action",)
+
+    def __init__(self, network: Any, folder: Path, decoding: Decoding | None = None) -> None:
+        self.decoding = decoding or Decoding()
+        super().__init__(network, folder)
+        self.prompt_kv: Stream | None = kept_prompt(self._decoder.config)
+
+    @classmethod
+    def build(cls, config: Any, folder: Path) -> nn.Module:
+        """lerobot's policy at the size `dims.json` gives, or at the released size."""
+        sizes = sizes_file(folder)
+        network: nn.Module = build_pi0_fast(config, None if sizes is None else Pi0FastSize.from_file(sizes))
+        return network
+
+    @classmethod
+    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Old layouts brought to today's."""
+        return current_pi0_fast_keys(tensors)
+
+    def prepare(self, checkpoint: str, evaluation: Evaluation) -> None:
+        """Count the captured tokens. Raises UsageError for a number of them that an inference cannot put out."""
+        super().prepare(checkpoint, evaluation)
+        if isinstance(evaluation, Decoding):
+            most = int(self.config.max_decoding_steps)
+            if not 1 <= evaluation.captured <= most:
+                raise UsageError(f"captured_tokens is {evaluation.captured}; expected 1 to {most}")
+            chooser(evaluation.temperature or 0, ())
+            self.decoding = evaluation
+            self.stacks |= self._stacks()
+            self._show(self.shown)
+            self.streams = {name: self.stacks[name].stream(name) for name in ("backbone", "action")}
+
+    @property
+    def temperature(self) -> float:
+        """0 for the likeliest token."""
+        asked = self.decoding.temperature
+        return float(self.config.temperature if asked is None else asked)
+
+    def further_settings(self) -> dict[str, str]:
+        """How tokens are put out."""
+        return {"captured_tokens": str(self.decoding.captured), "temperature": repr(self.temperature)}
+
+    def _notes(self) -> tuple[str, ...]:
+        most = self.config.max_decoding_steps
+        return (
+            *super()._notes(),
+            f"of up to {most} action tokens the first {self.decoding.captured} are captured",
+        )
+
+    def side_files(self) -> dict[str, Path]:
+        """Also the FAST tokenizer."""
+        return {**super().side_files(), **side_files(self._fast_folder, "fast/")}
+
+    @cached_property
+    def _fast_folder(self) -> Path:
+        return fast_folder(self.folder, self.config.action_tokenizer_name)
+
+    @cached_property
+    def action_text(self) -> ActionText:
+        """What the network's tokens mean."""
+        fast, checked = FastTokenizer.from_folder(self._fast_folder), self.config.validate_action_token_prefix
+        return ActionText.of(self.tokenizer, fast, self.config.fast_skip_tokens, checked)
+
+    # -- acting ------------------------------------------------------------------------------------------
+
+    def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """The chunks in the tokens; a row whose tokens are no whole chunk is flagged, with a warning."""
+        chunks = self.chunks(self.tokens(batch, seeds))
+        self.flagged = np.array([bool(chunk.problems) for chunk in chunks])
+        if self.flagged.any():
+            _warn_of_problems(chunks)
+        return np.stack([chunk.values for chunk in chunks]).astype(np.float32)
+
+    def tokens(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> Tensor:
+        """(B, n) ids that the network puts out for a batch in lerobot's keys; one inference."""
+        self.check_pictures(batch)
+        text = self.action_text
+        choose = chooser(self.temperature, seeds, top=None)
+        with torch.inference_mode():
+            pictures, masks = self.network._preprocess_images(batch)
+            begin = int(self.tokenizer.bos_token_id)
+            prompt = TokenPrompt(pictures, masks, batch[TOKENS], batch[MASK], begin, text.end)
+            most = int(self.config.max_decoding_steps)
+            return decode_tokens(self.network.model, prompt, self.decoding.captured, most, choose)
+
+    def chunks(self, ids: Tensor) -> list[DecodedChunk]:
+        """The normalised chunk in every row of (B, n) ids.
+
+        It has as many actions as the network was trained to put out. lerobot decodes as many as it executes, which
+        is another transform where the two numbers differ.
+        """
+        dimensions = int(self.config.output_features["action"].shape[0])
+        return [self.action_text.decode(row, self.config.chunk_size, dimensions) for row in ids.tolist()]
+
+    def record_attention(self, note: Note) -> AbstractContextManager[None]:
+        """Computed once more for the position that chooses a token."""
+        return of_decoder(self._decoder.layers, note)
+
+    # -- capture -----------------------------------------------------------------------------------------
+
+    @property
+    def _decoder(self) -> Any:
+        return self.network.model.paligemma_with_expert.paligemma.model.language_model
+
+    def _stacks(self) -> dict[str, Stack]:
+        decoder = self._decoder
+        vision = self.network.model.paligemma_with_expert.paligemma.model.vision_tower.vision_model
+        layers, norm, width = decoder.layers, decoder.norm, decoder.config.hidden_size
+        return {
+            "backbone": TokenStack(layers, norm, width, None, tokens=ALL_BUT_LAST),
+            "action": TokenStack(layers, norm, width, self.decoding.captured, tokens=_LAST),
+            "vision": flow_stacks(decoder, decoder, vision, 1)["vision"],
+        }
+
+    def suffix_labels(self) -> list[str]:
+        """One position at every iteration."""
+        return ["action"]
+
+    def tap(self, site: Site) -> Tap:
+        """As in every decoder; the prompt's keys and values pass once it is read."""
+        stream = self.stream_of(site)
+        if stream is self.prompt_kv:
+            return kv_tap(self.network.model.paligemma_with_expert.prompt_kv, site, ALL_BUT_LAST)
+        return self.stacks[site.stream].tap(site)
+
+    @property
+    def unembedding(self) -> Unembedding:
+        """PaliGemma's final norm and head."""
+        head = self.network.model.paligemma_with_expert.paligemma.lm_head
+        return Unembedding(("backbone", "action"), _FinalNorm(self._decoder.norm), head)
+
+
+class _FinalNorm(nn.Module):
+    """lerobot's norm without the gate that it returns beside what is normed."""
+
+    def __init__(self, norm: nn.Module) -> None:
+        super().__init__()
+        self.norm = norm
+
+    def forward(self, residual: Tensor) -> Tensor:
+        """(…, D)."""
+        normed: Tensor = self.norm(residual)[0]
+        return normed
+
+
+def _warn_of_problems(chunks: Sequence[DecodedChunk]) -> None:
+    problems = dict.fromkeys(problem for chunk in chunks for problem in chunk.problems)
+    warnings.warn(
+        f"the model put out tokens that are no whole chunk of actions: {'; '.join(problems)}. What is missing "
+        "counts as zero before units are restored, and the step as flagged. Random weights do this; if trained "
+        "ones do, prompt, tokenizers or max_decoding_steps are wrong",
+        stacklevel=3,
+    )
+
+
+def load_pi0_fast(
+    checkpoint: str,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    captured_tokens: int = CAPTURED,
+    temperature: float | None = None,
+    weights_seed: int = 0,
+) -> Pi0Fast:
+    """Load a lerobot pi0-FAST checkpoint; see `LerobotPolicy.load`.
+
+    captured_tokens: how many of the action tokens are sites. temperature: 0 for the likeliest token; above, drawn
+    by each row's seed; None for the checkpoint's. Raises UsageError for values outside of these.
+    """
+    decoding = Decoding(captured=captured_tokens, temperature=temperature)
+    return Pi0Fast.load(checkpoint, device, dtype, random_weights, weights_seed, decoding)
+
+
+def check_pi0_fast_words(checkpoint: str, instructions: Sequence[str], **_: Any) -> None:
+    """See `Family.words`."""
+    Pi0Fast.check_words(checkpoint, instructions)

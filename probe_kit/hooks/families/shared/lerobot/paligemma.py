@@ -1,0 +1,92 @@
+"""What lerobot's policies on PaliGemma share: sizes, tokenizer, pictures in the prompt."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from transformers import AutoTokenizer
+
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.checkpoints.checkpoint import side_files
+from probe_kit.hooks.checkpoints.hub import unreachable
+from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
+
+_TOKENIZER = "google/paligemma-3b-pt-224"
+LEAST_BYTES = 1_000_000_000
+"""Of weights in the released sizes, which have 3 billion parameters or more."""
+
+
+def _check_small_weights(folder: Path) -> None:
+    """A small network that lost its `dims.json` would be built at full size, for minutes, before it is refused."""
+    found = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
+    if 0 < found < LEAST_BYTES:
+        raise CheckpointError(
+            f"{folder} has {found / 1e6:,.1f} MB of weights and no dims.json; the released size has "
+            "several GB. Put the dims.json beside its config.json, or download the checkpoint again"
+        )
+
+
+def sizes_file(folder: Path) -> Path | None:
+    """The `dims.json` of a small checkpoint; None for one of the released size.
+
+    Raises CheckpointError for a small one that lost it.
+    """
+    sizes = [place / "dims.json" for place in (folder, folder.parent) if (place / "dims.json").is_file()]
+    if not sizes:
+        _check_small_weights(folder)
+    return sizes[0] if sizes else None
+
+
+class PaliGemmaPolicy(LerobotPolicy):
+    """A lerobot policy whose prompt is read by PaliGemma."""
+
+    @cached_property
+    def tokenizer(self) -> Any:
+        """PaliGemma's, from the checkpoint folder or the hub."""
+        if (place := self._tokenizer_folder()) is not None:
+            return AutoTokenizer.from_pretrained(place)
+        try:
+            return AutoTokenizer.from_pretrained(_TOKENIZER, local_files_only=bool(unreachable()))
+        except OSError as error:
+            raise CheckpointError(
+                f"{self.folder} has no tokenizer.json and the gated {_TOKENIZER} cannot be fetched. Run "
+                "`hf auth login`, or put its tokenizer.json and tokenizer_config.json into the checkpoint folder"
+            ) from error
+
+    def _tokenizer_folder(self) -> Path | None:
+        places = (self.folder, self.folder.parent / "tokenizer")
+        return next((place for place in places if (place / "tokenizer.json").is_file()), None)
+
+    def side_files(self) -> dict[str, Path]:
+        """Also the sizes and the tokenizer, where they lie beside the folder."""
+        found = super().side_files()
+        sizes, text = self.folder.parent / "dims.json", self._tokenizer_folder()
+        if "dims.json" not in found and sizes.is_file():
+            found["dims.json"] = sizes
+        if text is not None and text != self.folder:
+            found |= side_files(text, "tokenizer/")
+        return found
+
+    @property
+    def masked_cameras(self) -> int:
+        """All that are not shown."""
+        return len(self.config.image_features) - len(self.shown)
+
+    def prefix_labels(self, language: Sequence[str]) -> list[str]:
+        """Cameras without a picture are masked and lie behind the shown ones."""
+        images = [f"image.{camera}" for camera in self.shown for _ in range(self.tokens_per_camera)]
+        return [*images, *[PADDING] * self.tokens_per_camera * self.masked_cameras, *language]
+
+    def patch_order(self) -> NDArray[np.int64]:
+        """A token per patch, row by row."""
+        return np.arange(self.tokens_per_camera)
+
+    @property
+    def tokens_per_camera(self) -> int:
+        """Patches of one picture."""
+        vision = self.network.model.paligemma_with_expert.paligemma.model.vision_tower.vision_model
+        return int(vision.embeddings.num_patches)

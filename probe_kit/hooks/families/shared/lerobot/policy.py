@@ -1,0 +1,451 @@
+"""Base adapter of lerobot's policies: loading, batches, units, prompts, roles.
+
+Never lerobot's own `from_pretrained`: it returns partly or fully random models without an error.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import CheckpointError, InstructionError, ObservationError
+from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, content_hashes, side_files
+from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
+from probe_kit.hooks.contract.card import ModelCard
+from probe_kit.hooks.contract.model import Policy
+from probe_kit.hooks.contract.observation import Observation, checked_picture
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
+from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
+from probe_kit.hooks.families.shared.lerobot.normaliser import (
+    Normaliser,
+    Units,
+    from_buffers,
+    read_buffers,
+    read_normaliser,
+)
+from probe_kit.hooks.families.shared.lerobot.stacks import Stack
+from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
+from probe_kit.models.initialisation import initialise
+
+IMAGES, STATE = "observation.images.", "observation.state"
+TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
+_DIMENSIONS = 7
+"""Of the arm's actions."""
+
+
+class LerobotPolicy(Policy):
+    """A lerobot policy behind the Policy contract; subclasses say how it packs its sequence and puts out actions.
+
+    cameras: those that a picture can be given for. shown: those that get one, in the configuration's order.
+    """
+
+    family: ClassVar[str]
+    config_type: ClassVar[str]
+    unread: ClassVar[tuple[str, ...]] = ()
+    """Parameters that inference never reads and a file may lack."""
+    other_roles: ClassVar[tuple[str, ...]]
+    """What positions of the backbone hold besides pictures and padding."""
+    acting_stream: ClassVar[str]
+    suffix_roles: ClassVar[tuple[str, ...]]
+    """What positions of the acting stream hold."""
+
+    def __init__(self, network: Any, folder: Path) -> None:
+        self.checkpoint, self.evaluation = str(folder), AS_STORED
+        self.network, self.folder, self.config = network, folder, network.config
+        self.stacks = self._stacks()
+        self.streams = {name: self.stacks[name].stream(name) for name in ("backbone", self.acting_stream)}
+        keys = [key.removeprefix(IMAGES) for key in self.config.image_features]
+        self.cameras = tuple(key for key in keys if not key.startswith("empty_camera"))
+        self._show(self.cameras[:1])
+
+    def showing(self, cameras: Sequence[str]) -> Self:
+        """The same policy, given pictures of several cameras; all but the first from `Observation.cameras`.
+
+        Raises ObservationError unless they are the first ones of the configuration, in its order: lerobot moves
+        present cameras to the front.
+        """
+        if tuple(cameras) != self.cameras[: len(cameras)] or not cameras:
+            raise ObservationError(
+                f"cameras {list(cameras)} given; this checkpoint expects {list(self.cameras)}, in order"
+            )
+        other = copy(self)
+        other.stacks = dict(self.stacks)
+        other._show(tuple(cameras))
+        needs = frozenset(f"camera.{name}" for name in cameras[1:])
+        other.card = replace(self.card, needs=needs, notes=other._notes())
+        return other
+
+    def _show(self, cameras: tuple[str, ...]) -> None:
+        self.shown = cameras
+        self.stacks["vision"] = replace(self.stacks["vision"], iterations=len(cameras) + self.masked_cameras)
+        self.further_streams = {"vision": self.stacks["vision"].stream("vision")}
+        images = tuple(f"image.{camera}" for camera in cameras)
+        self.role_names = {
+            "backbone": (*images, *self.other_roles, PADDING),
+            self.acting_stream: self.suffix_roles,
+        }
+
+    # -- what a family decides -------------------------------------------------------------------------
+
+    @classmethod
+    @abstractmethod
+    def build(cls, config: Any, folder: Path) -> nn.Module:
+        """The network with uninitialised weights."""
+
+    @classmethod
+    @abstractmethod
+    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """A file's tensors under the names the network has."""
+
+    @abstractmethod
+    def _stacks(self) -> dict[str, Stack]:
+        """The stacks `backbone`, `vision` and the acting one."""
+
+    @property
+    @abstractmethod
+    def masked_cameras(self) -> int:
+        """Cameras without a picture that still occupy positions, masked, after the shown ones."""
+
+    @property
+    @abstractmethod
+    def tokens_per_camera(self) -> int:
+        """Patches of one picture in the backbone."""
+
+    @abstractmethod
+    def prefix_labels(self, language: Sequence[str]) -> list[str]:
+        """The role of every backbone position of one row, from those of its language positions."""
+
+    @abstractmethod
+    def suffix_labels(self) -> list[str]:
+        """The role of every suffix position."""
+
+    @cached_property
+    @abstractmethod
+    def tokenizer(self) -> Any:
+        """The checkpoint's tokenizer."""
+
+    @abstractmethod
+    def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """(B, chunk, action numbers) as the network puts them out, of a batch in lerobot's keys; one inference."""
+
+    # -- loading -----------------------------------------------------------------------------------------
+
+    @classmethod
+    def load(
+        cls,
+        checkpoint: str,
+        device: str = "cpu",
+        dtype: str | None = None,
+        random_weights: bool = False,
+        weights_seed: int = 0,
+        evaluation: Evaluation = AS_STORED,
+    ) -> Self:
+        """Load a lerobot checkpoint from a folder or hub id.
+
+        dtype: float32 or bfloat16; default what the checkpoint's config says.
+        random_weights: same architecture, tokenizer and statistics, but random weights of `weights_seed`.
+        evaluation: what its files do not say.
+        Raises CheckpointError for missing files, WeightsError for weights that are not exactly the model's.
+        """
+        folder = checkpoint_folder(checkpoint)
+        config = cls._read_config(folder, evaluation)
+        if dtype is not None:
+            config.dtype = dtype
+        network = cls.build(config, folder)
+        if random_weights:
+            initialise(network, weights_seed)
+            weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
+        else:
+            weights = read_weights(folder)
+        audit = load_weights(network, weights, cls.current_keys(weights.tensors), cls.unread)
+        config.device = device
+        policy = cls(network.to(device), folder)
+        policy.prepare(checkpoint, evaluation)
+        policy.card = ModelCard(
+            family=cls.family,
+            checkpoint=checkpoint,
+            weights_sha256=audit.sha256,
+            random_weights=audit.random,
+            parameters=audit.parameters,
+            dtype=str(getattr(config, "dtype", "float32")),
+            device=device,
+            embodiment="7-DoF end-effector delta, one third-person camera",
+            cameras=policy.cameras,
+            chunk=config.chunk_size,
+            execute=min(config.n_action_steps, config.chunk_size),
+            notes=policy._notes(),
+            audit=audit.to_json(),
+            settings={**content_hashes(policy.side_files()), **policy.further_settings()},
+            weights_seed=weights_seed if audit.random and random_weights else None,
+        )
+        return policy
+
+    @classmethod
+    def _read_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+        if not (folder / "config.json").is_file():
+            raise CheckpointError(f"{folder / 'config.json'} is missing; {folder} is not a lerobot checkpoint")
+        config: Any = cls.parse_config(folder, evaluation)
+        if config.type != cls.config_type:
+            raise CheckpointError(
+                f"{folder} holds a {config.type!r} policy; expected {cls.config_type}. Pass the right --model"
+            )
+        # Compiled graphs drop hooks, and real-time chunking mixes in actions of the chunk before.
+        config.compile_model = False
+        config.rtc_config = None
+        return config
+
+    @classmethod
+    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+        """lerobot's configuration object of the folder's `config.json`."""
+        del evaluation
+        return PreTrainedConfig.from_pretrained(folder)
+
+    def prepare(self, checkpoint: str, evaluation: Evaluation) -> None:
+        """What is looked at once, before the card is written. checkpoint: the name it was asked for by."""
+        self.checkpoint, self.evaluation = checkpoint, evaluation
+
+    def further_settings(self) -> dict[str, str]:
+        """What numbers depend on besides weights and side files; empty where a checkpoint says everything."""
+        return {}
+
+    def side_files(self) -> dict[str, Path]:
+        """Every file besides the weights that loading and acting read: configuration, units, window, text."""
+        return side_files(self.folder)
+
+    def _notes(self) -> tuple[str, ...]:
+        masked = self.cameras[len(self.shown) :]
+        cameras = (f"cameras without a picture: {', '.join(masked)}",) if masked else ()
+        return (*cameras, f"units: {self._units()}")
+
+    def _units(self) -> str:
+        """Where the statistics come from that turn actions into metres, or why there are none."""
+        try:
+            action, state = self.action_units, self.state_units
+        except CheckpointError as error:
+            return f"cannot act in metres: {error}"
+        return f"action {action.mode} from {action.source}, state {state.mode} from {state.source}"
+
+    # -- acting ------------------------------------------------------------------------------------------
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One chunk of actions per observation; see the contract."""
+        self.check(seen, seeds)
+        if (reason := self._action_misfit()) is not None:
+            raise CheckpointError(reason)
+        return self.action_units.restore(self.put_out(self.batch(seen), seeds))
+
+    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """(B, chunk, action numbers) as the network puts them out, without units."""
+        self.check(seen, seeds)
+        zeros = np.zeros((len(seen), self._state_numbers), np.float32) if self.zero_filled_inputs() else None
+        return self.put_out(self.batch(seen, zeros), seeds)
+
+    def embodiment_mismatch(self) -> str | None:
+        """Other actions than an end-effector delta, another state, or no units for either."""
+        return self._action_misfit() or self._state_misfit()
+
+    def zero_filled_inputs(self) -> tuple[str, ...]:
+        """The state, where it has other numbers than the arm's, or no units."""
+        return ("state",) if self._state_misfit() else ()
+
+    def _action_misfit(self) -> str | None:
+        dimensions = self.config.output_features["action"].shape[0]
+        if dimensions != _DIMENSIONS:
+            return f"{self.checkpoint} acts in {dimensions} dimensions; the arm needs a 7-DoF end-effector delta"
+        return _problem(lambda: self.action_units)
+
+    def _state_misfit(self) -> str | None:
+        example = self.laid_out(np.zeros((1, ARM_NUMBERS), np.float32)).shape[1]
+        if example != self._state_numbers:
+            return f"{self.checkpoint} reads {self._state_numbers} numbers as its state; the arm's are {example}"
+        return _problem(lambda: self.state_units)
+
+    @property
+    def _state_numbers(self) -> int:
+        return int(self.config.input_features[STATE].shape[0])
+
+    def check_pictures(self, batch: Mapping[str, Tensor]) -> None:
+        """Raise ObservationError unless a batch in lerobot's keys has pictures in [0, 1]: lerobot never rescales.
+
+        Its cameras must be those that are shown, in the configuration's order.
+        """
+        given = [key.removeprefix(IMAGES) for key in batch if key.startswith(IMAGES)]
+        if given != list(self.shown):
+            raise ObservationError(
+                f"cameras {given} given; this policy is shown {list(self.shown)} of {list(self.cameras)}, in order"
+            )
+        for camera in given:
+            picture = batch[f"{IMAGES}{camera}"]
+            if not picture.is_floating_point() or picture.min() < 0 or picture.max() > 1:
+                raise ObservationError(
+                    f"pictures of {camera} are {picture.dtype} outside [0, 1]; divide bytes by 255"
+                )
+
+    def batch(self, seen: Sequence[Observation], state: NDArray[np.float32] | None = None) -> dict[str, Tensor]:
+        """The observations in lerobot's keys; the environment's picture goes to the first camera.
+
+        state: (B, numbers) as the network reads them; None for that of the observations.
+        """
+        device = self.config.device
+        numbers = self.state(seen) if state is None else state
+        tokens, mask = self.tokenise([o.instruction for o in seen], numbers)
+        return {
+            **{f"{IMAGES}{camera}": self._pictures(camera, seen) for camera in self.shown},
+            STATE: torch.from_numpy(numbers).to(device),
+            TOKENS: tokens.to(device),
+            MASK: mask.to(device),
+        }
+
+    def state(self, seen: Sequence[Observation]) -> NDArray[np.float32]:
+        """(B, numbers) as the network reads them. Raises ObservationError for another count of numbers."""
+        rows = self.laid_out(np.stack([np.asarray(o.state, np.float32) for o in seen]))
+        if rows.shape[1] != self._state_numbers:
+            raise ObservationError(
+                f"the state has {rows.shape[1]} numbers; this checkpoint reads {self._state_numbers}"
+            )
+        return self.state_units.normalise(rows)
+
+    def laid_out(self, state: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(B, numbers) of (B, 8): the state in the order this checkpoint was given it."""
+        return state
+
+    def _pictures(self, camera: str, seen: Sequence[Observation]) -> Tensor:
+        """(B, 3, H, W) in [0, 1]: each picture as this checkpoint looks at it."""
+        own = [o.image if camera == self.cameras[0] else o.cameras[camera] for o in seen]
+        return self.look(camera, [checked_picture(image) for image in own])
+
+    def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:
+        """(B, 3, H, W) in [0, 1]: the part of each picture (H, W, 3) that this checkpoint looks at."""
+        rows = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2)
+        return self.window(camera)(rows.to(self.config.device).float() / 255)
+
+    def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
+        """The text that is read, per instruction. state: (B, numbers) as the network reads them."""
+        del state
+        return [text if text.endswith("\n") else f"{text}\n" for text in instructions]
+
+    def tokenise(
+        self, instructions: Sequence[str], state: NDArray[np.float32] | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """(B, tokenizer_max_length) ids and mask; never truncates and never drops a word.
+
+        state: (B, numbers) as the network reads them, for prompts that hold it; None for zeros.
+        """
+        if state is None:
+            state = np.zeros((len(instructions), self._state_numbers), np.float32)
+        prompts, length = self.prompts(instructions, state), self.config.tokenizer_max_length
+        rows = [self.tokenizer(text)["input_ids"] for text in prompts]
+        for text, row in zip(prompts, rows, strict=True):
+            if len(row) > length:
+                raise InstructionError(
+                    f"{text!r} is {len(row)} tokens; this checkpoint reads {length}. Shorten it"
+                )
+            if self.tokenizer.unk_token_id in row:
+                raise InstructionError(
+                    f"{text!r} has a word this checkpoint's tokenizer does not know; it would act without "
+                    f"reading it. Tokens: {self.tokenizer.convert_ids_to_tokens(row)}"
+                )
+        tokens = torch.full((len(rows), length), self.tokenizer.pad_token_id or 0)
+        mask = torch.zeros((len(rows), length), dtype=torch.bool)
+        for index, row in enumerate(rows):
+            tokens[index, : len(row)] = torch.tensor(row)
+            mask[index, : len(row)] = True
+        return tokens, mask
+
+    @classmethod
+    def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
+        """Raise InstructionError as `tokenise` would, from configuration and tokenizer alone."""
+        text = cls.__new__(cls)  # what tokenises needs no network
+        text.folder = checkpoint_folder(checkpoint)
+        text.config = cls._read_config(text.folder, evaluation)
+        text.tokenise(instructions)
+
+    def window(self, camera: str) -> PictureWindow:
+        """The part of one camera's picture that this checkpoint looks at."""
+        if camera not in self._windows:
+            size = tuple(self.config.image_features[f"{IMAGES}{camera}"].shape[-2:])
+            self._windows[camera] = read_window(self.folder, f"{IMAGES}{camera}", size)
+        return self._windows[camera]
+
+    @cached_property
+    def _windows(self) -> dict[str, PictureWindow]:
+        return {}
+
+    @cached_property
+    def state_units(self) -> Units:
+        """Metres and radians to what the network reads. Raises CheckpointError if nothing says."""
+        return self.units_of(STATE, "STATE")
+
+    @cached_property
+    def action_units(self) -> Units:
+        """What the network writes to metres and radians. Raises CheckpointError if nothing says."""
+        return self.units_of("action", "ACTION")
+
+    def units_of(self, feature: str, kind: str) -> Units:
+        """The units of one feature, STATE or ACTION."""
+        if (own := self.own_units(feature, kind)) is not None:
+            return own
+        raise CheckpointError(
+            f"{self.checkpoint} does not normalise its {feature} and no policy_preprocessor.json says so: "
+            "its units are unknown"
+        )
+
+    def own_units(self, feature: str, kind: str) -> Normaliser | None:
+        """What the checkpoint itself says: its processor files, or old buffers; None if it normalises nothing."""
+        pipeline = "policy_preprocessor" if kind == "STATE" else "policy_postprocessor"
+        if (self.folder / f"{pipeline}.json").is_file():
+            return read_normaliser(self.folder, pipeline, feature, kind)
+        return from_buffers(self._buffers, self.config.normalization_mapping, feature, kind, self.checkpoint)
+
+    @cached_property
+    def _buffers(self) -> dict[str, NDArray[np.float32]]:
+        return read_buffers(self.folder)
+
+    # -- capture -----------------------------------------------------------------------------------------
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Prefix and suffix as the family packs them."""
+        state = None if self.zero_filled_inputs() else self.state(seen)
+        return self.packed_roles(*self.tokenise([o.instruction for o in seen], state))
+
+    def packed_roles(self, tokens: Tensor, mask: Tensor) -> dict[str, list[Roles]]:
+        """The roles for instructions as (B, tokenizer_max_length) ids and mask."""
+        suffix = Roles.from_labels(self.suffix_labels())
+        language = [
+            self.text_labels(row, valid) for row, valid in zip(tokens.tolist(), mask.tolist(), strict=True)
+        ]
+        return {
+            "backbone": [Roles.from_labels(self.prefix_labels(row)) for row in language],
+            self.acting_stream: [suffix] * len(language),
+        }
+
+    def text_labels(self, ids: Sequence[int], valid: Sequence[bool]) -> list[str]:
+        """The role of every position of a prompt."""
+        special = frozenset(self.tokenizer.all_special_ids)
+        labels = ["special" if one in special else "language" for one in ids]
+        return [label if kept else PADDING for label, kept in zip(labels, valid, strict=True)]
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each instruction, without padding."""
+        tokens, mask = self.tokenise(instructions)
+        return [tuple(row[kept].tolist()) for row, kept in zip(tokens, mask, strict=True)]
+
+
+def _problem(read: Callable[[], object]) -> str | None:
+    """What is wrong with the checkpoint, as far as `read` finds out."""
+    try:
+        read()
+    except CheckpointError as error:
+        return str(error)
+    return None

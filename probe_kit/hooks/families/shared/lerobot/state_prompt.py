@@ -1,0 +1,68 @@
+"""Prompts that hold the state as digits, as lerobot words them for pi0.5 and pi0-FAST."""
+
+import re
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
+
+BINS = np.linspace(-1, 1, 256 + 1)[:-1]
+"""Lower edges of the 256 bins of a normalised state."""
+_PROMPT = re.compile(
+    r"Task: ?(?P<language>.*), ?State: ?(?P<state>[-\d ]*);\s*(?:Action:\s*)?\Z", re.DOTALL | re.IGNORECASE
+)
+_LEFT_OUT = (PADDING, "state")
+
+
+def digits(state: NDArray[np.float32]) -> list[str]:
+    """(B, numbers) normalised to the numbers of their bins: 0 to 255, and -1 below the range."""
+    return [" ".join(map(str, row)) for row in np.digitize(state, BINS) - 1]
+
+
+class StatePrompt(LerobotPolicy):
+    """A lerobot policy that reads its state in its prompt."""
+
+    other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
+    prompt_end: ClassVar[str] = ""
+    """What follows the state."""
+
+    def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
+        """As lerobot's processor steps of these policies word it."""
+        tasks = [text.strip().replace("_", " ").replace("\n", " ") for text in instructions]
+        return [
+            f"Task: {task}, State: {own};\n{self.prompt_end}"
+            for task, own in zip(tasks, digits(state), strict=True)
+        ]
+
+    def text_labels(self, ids: Sequence[int], valid: Sequence[bool]) -> list[str]:
+        """The instruction is `language`, the digits are `state`, and the words around them are `special`."""
+        special = frozenset(self.tokenizer.all_special_ids)
+        pieces = [
+            "" if one in special or not kept else piece.replace("\u2581", " ")
+            for one, kept, piece in zip(ids, valid, self.tokenizer.convert_ids_to_tokens(list(ids)), strict=True)
+        ]
+        ends = np.cumsum([len(piece) for piece in pieces])
+        labels = ["special" if kept else PADDING for kept in valid]
+        if (found := _PROMPT.search("".join(pieces))) is None:
+            return labels
+        for role in ("language", "state"):
+            first, last = found.span(role)
+            for position, (piece, end) in enumerate(zip(pieces, ends, strict=True)):
+                if piece and end - len(piece) < last and end > first:
+                    labels[position] = role
+        return labels
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each prompt without padding and without the digits, which change at every inference."""
+        tokens, mask = self.tokenise(instructions)
+        rows = zip(tokens.tolist(), mask.tolist(), strict=True)
+        return [
+            tuple(
+                one for one, label in zip(ids, self.text_labels(ids, valid), strict=True) if label not in _LEFT_OUT
+            )
+            for ids, valid in rows
+        ]
