@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from itertools import combinations
-from math import comb, sqrt
+from math import comb, inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -46,11 +46,13 @@ def exchange_p(first: Sequence[float], second: Sequence[float], seed: int = 0) -
     return ModelsP((hits + 1) / (DRAWS + 1), 1 / (DRAWS + 1), False)
 
 
-def welch_interval(first: Sequence[float], second: Sequence[float]) -> Interval:
+def welch_interval(first: Sequence[float], second: Sequence[float], largest: float = inf) -> Interval:
     """95 % interval of the first group's mean minus the second's, by Welch's t over models.
 
     A group of one model has no spread of its own, and is given that of the other one (Student's t). No limits
-    where both have one model, or where no model differs from its group. Raises UsageError as `exchange_p` does.
+    where both have one model, or where no model differs from its group. largest: the difference that no two means
+    can exceed, 1 for rates; limits beyond it are cut there, and where both are, there are none. Raises UsageError
+    as `exchange_p` does.
     """
     from scipy.special import stdtrit  # type: ignore[import-untyped]
 
@@ -67,7 +69,9 @@ def welch_interval(first: Sequence[float], second: Sequence[float]) -> Interval:
         df = float(of_mean.sum() ** 2 / (of_mean**2 / (sizes - 1)).sum())
     gap = float(np.mean(first) - np.mean(second))
     spread = float(stdtrit(df, 1 - SIGNIFICANCE / 2)) * sqrt(of_mean.sum())
-    return Interval(gap - spread, gap + spread)
+    if spread >= largest + abs(gap):
+        return NO_LIMITS
+    return Interval(max(gap - spread, -largest), min(gap + spread, largest))
 
 
 def _values(first: Sequence[float], second: Sequence[float]) -> NDArray[np.float64]:

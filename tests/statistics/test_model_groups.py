@@ -9,6 +9,7 @@ from scipy.stats import permutation_test, ttest_ind
 from probe_kit.errors import UsageError
 from probe_kit.statistics import model_groups
 from probe_kit.statistics.estimates.mover import NO_LIMITS
+from probe_kit.statistics.fieller import Interval
 from probe_kit.statistics.model_groups import exchange_p, welch_interval
 from probe_kit.statistics.paired_tests import flip_gains_p
 
@@ -104,6 +105,19 @@ def test_a_single_model_is_given_the_spread_of_the_other_group() -> None:
 def test_models_without_any_spread_give_no_limits() -> None:
     assert welch_interval([0.5], [0.6]) == NO_LIMITS
     assert welch_interval([0.5, 0.5], [0.6, 0.6]) == NO_LIMITS
+
+
+def test_limits_stay_within_what_is_possible() -> None:
+    """Two models and one: by Welch's t, rates would differ by −706 to +577 points."""
+    wide = welch_interval([0.0, 1.0], [0.4, 0.9])
+    assert wide.low < -1 < 1 < wide.high
+    assert welch_interval([0.0, 1.0], [0.4, 0.9], largest=1.0) == NO_LIMITS
+    one_sided = welch_interval([0.9, 1.0], [0.4], largest=1.0)
+    free = welch_interval([0.9, 1.0], [0.4])
+    assert one_sided == Interval(free.low, 1.0)
+    assert welch_interval([0.4], [0.9, 1.0], largest=1.0) == Interval(-1.0, -free.low)
+    narrow = [0.9, 0.91, 0.92], [0.5, 0.51, 0.52]
+    assert welch_interval(*narrow, largest=1.0) == welch_interval(*narrow)
 
 
 def test_empty_groups_and_missing_values_are_refused() -> None:

@@ -174,10 +174,15 @@ def difference_test(row: Difference) -> str:
 
 
 def models_test(test: ModelTest | None, scale: float, digits: int) -> str:
-    """p over models, the least possible one, and Welch's interval; empty without groups of models."""
+    """p over models, the least possible one, and Welch's interval, a dash where it has no limits.
+
+    Empty without groups of models.
+    """
     if test is None:
         return ""
-    limits = with_limits("", test.ci, lambda value: f"{scale * (value or 0):+.{digits}f}").strip()
+    limits = "–"
+    if None not in test.ci:
+        limits = with_limits("", test.ci, lambda value: f"{scale * (value or 0):+.{digits}f}").strip()
     return f"{p_text(test.p)} ({p_text(test.smallest_p)}) {limits}"
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from math import isfinite
+from math import inf, isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,13 +49,16 @@ class ModelTest:
     smallest_p: float
 
     @classmethod
-    def of(cls, first: Sequence[float], second: Sequence[float]) -> "ModelTest | None":
-        """From one value per model; None for two single models, or where one has no value."""
+    def of(cls, first: Sequence[float], second: Sequence[float], largest: float = inf) -> "ModelTest | None":
+        """From one value per model; None for two single models, or where one has no value.
+
+        largest: the difference that no two groups can exceed, see `welch_interval`.
+        """
         if len(first) + len(second) < 3 or not (first and second and all(map(isfinite, (*first, *second)))):
             return None
         test = exchange_p(first, second)
         gap = float(np.mean(first) - np.mean(second))
-        return cls(len(first), len(second), gap, limits(welch_interval(first, second)), test.p, test.smallest)
+        return cls(len(first), len(second), gap, limits(welch_interval(first, second, largest)), test.p, test.smallest)
 
 
 @dataclass(frozen=True)
@@ -294,7 +297,7 @@ def _row(
         view,
         all(gap.paired for gap in gaps),
         **numbers,  # type: ignore[arg-type]
-        sr_models=_models(rows, _sr_of_model),
+        sr_models=_models(rows, _sr_of_model, largest=1.0),
         retention_models=None if ratio is None else _models(rows, _retention_of_model),
         p=tested[0],
         n_groups=tested[1],
@@ -322,15 +325,16 @@ def _retention(gaps: Sequence[_Gap]) -> Ratio | None:
 def _models(
     sides: Sequence[Sequence[Sequence[RowWithEstimates]]],
     value: Callable[[Sequence[RowWithEstimates]], float | None],
+    largest: float = inf,
 ) -> ModelTest | None:
-    """sides: per category, the row of each run. A value per run, over its categories."""
+    """sides: per category, the row of each run. A value per run, over its categories. largest: see `ModelTest`."""
     found = [
         [value(of_run) for of_run in zip(*side, strict=True)] if len({len(one) for one in side}) == 1 else []
         for side in sides
     ]
     known = [[one for one in side if one is not None] for side in found]
     complete = all(len(some) == len(every) > 0 for some, every in zip(known, found, strict=True))
-    return ModelTest.of(*known) if complete else None
+    return ModelTest.of(*known, largest=largest) if complete else None
 
 
 def _sr_of_model(rows: Sequence[RowWithEstimates]) -> float | None:

@@ -7,6 +7,8 @@ import pytest
 from rich.console import Console
 
 from probe_kit.retention import RetentionTable, retention_table
+from probe_kit.retention.columns.text import models_test
+from probe_kit.retention.compare.differences import ModelTest
 from probe_kit.train import ArrayRun
 
 ProbedRun = Callable[..., ArrayRun]
@@ -43,3 +45,31 @@ def test_single_runs_have_no_p_over_models(probed_run: ProbedRun) -> None:
     table = retention_table(runs)
     assert [row.sr_models for row in table.differences] == [None, None]
     assert "over models" not in table.to_markdown()
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "written"),
+    [
+        ([0.0, 1.0], [0.4, 0.9], "–"),  # Welch: −9 to +9 times all that rates can differ by
+        ([0.9, 1.0], [0.4], "+100.0]"),
+        ([0.9, 0.91, 0.92], [0.5, 0.51, 0.52], "+42.3]"),
+    ],
+)
+def test_an_interval_of_rates_stays_within_a_hundred_points(
+    first: list[float], second: list[float], written: str
+) -> None:
+    test = ModelTest.of(first, second, largest=1.0)
+    assert test is not None
+    assert models_test(test, 100, 1).endswith(f" {written}")
+    assert all(limit is None or abs(limit) <= 1 for limit in test.ci)
+
+
+def test_rates_of_a_table_are_given_their_bound(probed_run: ProbedRun) -> None:
+    """Two models and one: their retention can differ by any amount, their success rates cannot."""
+    runs = []
+    for name, wrong in (("one", 200), ("two", 0), ("three", 100)):
+        runs.append(run := probed_run({"color": ([0.5, 0.8], [[0.6, 0.7]])}, name))
+        run.episodes["outcome"] = ["wrong"] * wrong + ["correct"] * (len(run.episodes) - wrong)
+    (row, *_) = retention_table({"first": runs[:2], "second": runs[2:]}).differences
+    assert row.sr_models is not None
+    assert row.sr_models.ci == (None, None)
