@@ -13,19 +13,23 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UnsupportedInterventionError
 from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.hooks import Policy
 from probe_kit.hooks.registry import find_family, own_families
 from probe_kit.intervene import (
     AttentionReadout,
+    AttributionPatching,
     ClosedLoop,
     ConceptErasure,
     ImageSwap,
     InstructionSwap,
     Interchange,
     InterventionResult,
+    JointPlaces,
     ReplaySource,
     Steering,
     run_intervention,
 )
+from probe_kit.intervene.replay.conditions import Intervention
 from probe_kit.suite import Suite
 from tests.support.internvla_checkpoints import write_checkpoint as write_internvla
 from tests.support.magma_checkpoints import write_checkpoint as write_magma
@@ -103,9 +107,7 @@ def knowing(golden: Path, suite: Suite, copy: Path) -> Path:
     return copy
 
 
-def asked_of(
-    run: Run, kind: str
-) -> AttentionReadout | ImageSwap | InstructionSwap | Interchange | Steering | ConceptErasure | ClosedLoop:
+def asked_of(run: Run, kind: str) -> Intervention:
     last = f"backbone.{run.streams['backbone'].layers - 1:02d}"
     acting = next(stream for stream in run.streams.values() if stream.part == "action")
     late = f"{acting.name}.01@0-{(acting.iterations or 1) - 1}"
@@ -124,6 +126,14 @@ def asked_of(
         "tiles": lambda: Interchange(**COMMON, sites=("backbone.00",), roles=("image.left", "image.right")),
         "steer": lambda: Steering(**COMMON, sites=("backbone.01",), role="all", coefficients=(2.0,), controls=1),
         "erase": lambda: ConceptErasure(**COMMON, sites=("backbone.01",), roles=("all",), controls=1),
+        "joint": lambda: JointPlaces(**COMMON | {"items": 2}, sites=("backbone.01",), roles=("image", "language")),
+        "attribution": lambda: AttributionPatching(
+            **COMMON | {"items": 2},
+            sites=("backbone.01", late),
+            roles=("image", "language", role),
+            top=1,
+            controls=1,
+        ),
         "attention": lambda: AttentionReadout(**COMMON | {"items": 2}),
         "attention-shadow": lambda: AttentionReadout(**COMMON | {"items": 1}, readout="per-step"),
         "closed-loop": lambda: ClosedLoop(
@@ -144,6 +154,8 @@ def asked_of(
         "per-step",
         "steer",
         "erase",
+        "joint",
+        "attribution",
         "attention",
         "attention-shadow",
         "closed-loop",
@@ -154,7 +166,7 @@ def test_every_kind_runs_or_is_refused_by_name(made: tuple[Run, ReplaySource], k
     intervention, supported = asked_of(run, kind), find_family(run.model).interventions
     if any(not supported.supports(needed) for needed in intervention.required_capabilities):
         with pytest.raises(UnsupportedInterventionError, match=f"{run.model} does not support"):
-            run_intervention(run, intervention, source)
+            run_intervention(run, intervention, source, load=not_loaded)
         return
     effects = run_intervention(run, intervention, source)
     check = effects.certificate["replay"]
@@ -163,6 +175,10 @@ def test_every_kind_runs_or_is_refused_by_name(made: tuple[Run, ReplaySource], k
     assert effects.to_csv().count("\n") > 1
     assert effects.to_rich() is not None
     _check_ledger(run, effects)
+
+
+def not_loaded(run: Run, _: ReplaySource) -> Policy:
+    raise AssertionError(f"{run.model} was loaded before it was refused")
 
 
 def _check_ledger(run: Run, effects: InterventionResult) -> None:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks.capturing.head_outputs import project_heads
     from probe_kit.hooks.capturing.logit_lens import logit_lens
     from probe_kit.intervene.kinds.joint.cells import Cell, all_but
+    from probe_kit.intervene.patching.attribution import Screen, attribute_cells
     from probe_kit.intervene.patching.cells import find_cells
     from probe_kit.intervene.patching.inference import HookPoint, run_with_cache, run_with_hooks
     from probe_kit.intervene.patching.pairs import Pair, find_pairs
@@ -37,9 +38,11 @@ __all__ = [
     "HookPoint",
     "MinimalCells",
     "Pair",
+    "Screen",
     "Sweep",
     "all_but",
     "attention_patterns",
+    "attribute_cells",
     "compare_alone_and_without",
     "find_cells",
     "find_minimal_cells",
@@ -61,9 +64,11 @@ __getattr__, __dir__ = lazy_names(
         "HookPoint": "inference",
         "MinimalCells": "sets",
         "Pair": "pairs",
+        "Screen": "attribution",
         "Sweep": "sweep",
         "all_but": "probe_kit.intervene.kinds.joint.cells",
         "attention_patterns": "patterns",
+        "attribute_cells": "attribution",
         "compare_alone_and_without": "sets",
         "find_cells": "cells",
         "find_minimal_cells": "sets",

@@ -13,7 +13,7 @@ from probe_kit.intervene.kinds.joint.minimal_set import KEEP, find_minimal_set
 from probe_kit.intervene.kinds.joint.search import choosing_half
 from probe_kit.intervene.kinds.swap_shares import SwapShare, share_of_whole
 from probe_kit.intervene.patching.pairs import Pair, groups_and_items
-from probe_kit.intervene.patching.sweep import Metric, Sweep, sweep_cells
+from probe_kit.intervene.patching.sweep import DRAWS, Metric, Sweep, sweep_cells
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,7 +57,7 @@ def compare_alone_and_without(
     rows = []
     for at, cell in enumerate(own):
         lost = swept.patched[0] - swept.patched[1 + len(own) + at]
-        needed = share_of_whole(lost, swept.whole, swept.groups, "patching") if alone.shares[at] else None
+        needed = share_of_whole(lost, swept.whole, swept.groups, DRAWS) if alone.shares[at] else None
         p = float(alone.table["p_fwe"][at])
         rows.append(
             {

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 Metric = Callable[[Any, Given], float]
 """From the output of an inference and what was given to it to a number, such as metres to the left."""
-_DRAWS = "patching"
+DRAWS = "patching"
+"""Name of the seed of all draws over pairs."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Sweep:
         """Per set its share of the source's effect with a 95 % interval by groups; see `table`."""
         if self.source_p >= SIGNIFICANCE:
             return (None,) * len(self.cells)
-        return tuple(share_of_whole(own - self.clean, self.whole, self.groups, _DRAWS) for own in self.patched)
+        return tuple(share_of_whole(own - self.clean, self.whole, self.groups, DRAWS) for own in self.patched)
 
     @cached_property
     def table(self) -> "pd.DataFrame":
@@ -81,7 +82,7 @@ class Sweep:
         import pandas as pd
 
         moved = self.toward * (self.patched - self.clean)
-        seed = derive_seed(_DRAWS, "sign flips", *np.unique(self.groups).tolist())
+        seed = derive_seed(DRAWS, "sign flips", *np.unique(self.groups).tolist())
         _, p, p_fwe = max_t(moved, self.items, self.groups, seed)
         shares = [(np.nan,) * 3 if own is None else tuple(own) for own in self.shares]
         return pd.DataFrame(

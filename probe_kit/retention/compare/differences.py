@@ -58,7 +58,9 @@ class ModelTest:
             return None
         test = exchange_p(first, second)
         gap = float(np.mean(first) - np.mean(second))
-        return cls(len(first), len(second), gap, limits(welch_interval(first, second, largest)), test.p, test.smallest)
+        return cls(
+            len(first), len(second), gap, limits(welch_interval(first, second, largest)), test.p, test.smallest
+        )
 
 
 @dataclass(frozen=True)

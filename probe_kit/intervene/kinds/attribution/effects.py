@@ -96,7 +96,7 @@ class Anchored:
         toward = np.array([-self.outcomes.correct_sign * self._moved(name) for name in exact])
         seed = derive_seed("sign flips", self.suite, self.category)
         p_fwe = dict(zip(exact, max_t(toward, self.outcomes.items, self.outcomes.groups, seed)[2], strict=True))
-        return _ordered([self._row(name, p_fwe) for name in names])
+        return order_cells([self._row(name, p_fwe) for name in names])
 
     def _row(self, name: str, p_fwe: Mapping[str, float]) -> AttributionEffect:
         place, _, role = name.partition("|")
@@ -111,8 +111,8 @@ class Anchored:
             is_drawn=condition in self.drawn,
             n_episodes=self.outcomes.items.size,
             n_groups=np.unique(self.outcomes.groups).size,
-            **_columns("estimate", estimate),
-            **_columns("exact", exact),
+            **share_fields("estimate", estimate),
+            **share_fields("exact", exact),
             p_fwe=float(p_fwe[condition]) if condition in p_fwe else None,
             rank=None,
             finding="n/a",
@@ -126,8 +126,8 @@ class Anchored:
         return share_of_swap(self.outcomes, self._moved(condition), self.suite)
 
 
-def _columns(name: str, share: SwapShare | None) -> dict[str, Any]:
-    """A share and its interval."""
+def share_fields(name: str, share: SwapShare | None) -> dict[str, Any]:
+    """A share and its interval, as fields of an `AttributionEffect`."""
     if share is None:
         return {name: None, f"{name}_ci": None}
     return {name: share.value, f"{name}_ci": (share.low, share.high)}
@@ -145,8 +145,8 @@ def _agreement(row: AttributionEffect) -> float:
     return 0.0 if ratio <= 0 else min(ratio, 1 / ratio)
 
 
-def _ordered(rows: Sequence[AttributionEffect]) -> list[AttributionEffect]:
-    """Of one category, with rank and finding."""
+def order_cells(rows: Sequence[AttributionEffect]) -> list[AttributionEffect]:
+    """Rows of one category with rank and finding: the anchors, then the cells of each kind, see `Anchored`."""
     worst = worst_anchor(rows)
     finding = "n/a" if worst is None else "anchored" if _agreement(worst) * AGREEMENT >= 1 else "void"
     rows = [replace(row, finding=finding) for row in rows]

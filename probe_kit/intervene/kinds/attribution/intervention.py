@@ -12,10 +12,9 @@ from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.edits.sites import ALL, SiteGroup, resolve_sites, roles_of
+from probe_kit.intervene.edits.sites import ALL, resolve_sites, roles_of
 from probe_kit.intervene.kinds.attribution.effects import (
     ESTIMATE,
-    EVERY_BLOCK,
     EXACT,
     Anchored,
     kind_of_place,
@@ -25,6 +24,7 @@ from probe_kit.intervene.kinds.attribution.screen import (
     Ends,
     EpisodeEstimates,
     Estimated,
+    complete_cuts,
     estimate_patches,
     shares_by_category,
 )
@@ -109,7 +109,7 @@ class AttributionPatching(Intervention):
             for place in places.values()
             for role in roles_of(session.policy, place.stream, self.roles)
         ]
-        anchors = _anchors(session, list(places.values()))
+        anchors = complete_cuts(session.policy, list(places.values()))
         every = [*anchors, *cells]
         rows, found = self._estimates(session, every)
         top, drawn = self._chosen(cells, shares_by_category(found), len(anchors))
@@ -184,16 +184,3 @@ class AttributionPatching(Intervention):
 def name_of(part: str, cell: Cell) -> str:
     """Of the condition: `exact|kv.02|image`."""
     return f"{part}|{cell.place.name}|{cell.role}"
-
-
-def _anchors(session: ReplaySession, places: Sequence[SiteGroup]) -> list[Cell]:
-    """Complete cuts: all of `kv`, and all tokens of every layer of the backbone in which a place lies."""
-    streams = {name: stream for name, stream in session.policy.streams.items() if stream.part == "backbone"}
-    layers = [f"{place.stream}.{place.sites[0].layer:02d}" for place in places if place.stream in streams]
-    whole = [place for name in dict.fromkeys(layers) for place in resolve_sites(name, session.policy)]
-    if session.policy.prompt_kv is not None:
-        blocks = resolve_sites(f"{KV_STREAM}.*", session.policy)
-        whole.insert(0, SiteGroup(EVERY_BLOCK, tuple(site for block in blocks for site in block.sites)))
-    elif not whole:
-        whole = resolve_sites(f"{next(iter(streams))}.00", session.policy)
-    return [Cell(place, ALL) for place in whole]

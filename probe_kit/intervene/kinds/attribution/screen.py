@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.intervene.edits.sites import SiteGroup
+from probe_kit.intervene.edits.sites import ALL, SiteGroup, resolve_sites
+from probe_kit.intervene.kinds.attribution.effects import EVERY_BLOCK
 from probe_kit.intervene.kinds.joint.cells import Cell
 from probe_kit.intervene.replay.conditions import ConditionContext, ConditionResult
 from probe_kit.intervene.replay.image_tokens import role_token_mask
@@ -16,7 +17,7 @@ from probe_kit.intervene.replay.session import ReplayInput, ReplaySession
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from probe_kit.hooks import ActivationCache, Observation
+    from probe_kit.hooks import ActivationCache, Model, Observation
 
 Ends = Literal["clean", "both"]
 """Where gradients are taken: at the clean images, or as the mean of those and of the swapped images."""
@@ -72,16 +73,48 @@ def estimate_patches(
         )[1]
 
     taken = [slopes(seen) for seen in (replay_input.seen, replay_input.swapped)[: 1 + (ends == "both")]]
+    memo: dict[Any, Any] = {}
+    masks = [role_token_mask(session.policy, replay_input, cell.place.stream, cell.role, memo) for cell in cells]
+    return EpisodeEstimates(
+        replay_input.category, swapped - clean, sum_over_cells(own, source, taken, cells, masks)
+    )
+
+
+def sum_over_cells(
+    own: "ActivationCache",
+    source: "ActivationCache",
+    slopes: "Sequence[ActivationCache]",
+    cells: Sequence[Cell],
+    masks: Sequence[NDArray[np.bool_]],
+) -> NDArray[np.float64]:
+    """(C,) Σ (source − own) · slope over the tokens and features of every cell, in one inference.
+
+    slopes: the gradients at the same sites, of which the mean is taken. masks: (T,) the tokens of every cell.
+    """
+    sites = dict.fromkeys(site for cell in cells for site in cell.place.sites)
     products = {
-        site: (source[site].float() - own[site].float())[0] * sum(one[site][0] for one in taken) / len(taken)
+        site: (source[site].float() - own[site].float())[0] * sum(one[site][0] for one in slopes) / len(slopes)
         for site in sites
     }
-    memo: dict[Any, Any] = {}
-    found = np.zeros(len(cells))
-    for at, cell in enumerate(cells):
-        tokens = role_token_mask(session.policy, replay_input, cell.place.stream, cell.role, memo)
-        found[at] = sum(float(_of_head(products[site], cell.place)[tokens].sum()) for site in cell.place.sites)
-    return EpisodeEstimates(replay_input.category, swapped - clean, found)
+    return np.array(
+        [
+            sum(float(_of_head(products[site], cell.place)[tokens].sum()) for site in cell.place.sites)
+            for cell, tokens in zip(cells, masks, strict=True)
+        ]
+    )
+
+
+def complete_cuts(model: "Model", places: Sequence[SiteGroup]) -> list[Cell]:
+    """The anchors of a screen: all of `kv`, and all tokens of each layer of the backbone in which a place lies."""
+    streams = {name: stream for name, stream in model.streams.items() if stream.part == "backbone"}
+    layers = [f"{place.stream}.{place.sites[0].layer:02d}" for place in places if place.stream in streams]
+    whole = [place for name in dict.fromkeys(layers) for place in resolve_sites(name, model)]
+    if model.prompt_kv is not None:
+        blocks = resolve_sites(EVERY_BLOCK, model)
+        whole.insert(0, SiteGroup(EVERY_BLOCK, tuple(site for block in blocks for site in block.sites)))
+    elif not whole:
+        whole = resolve_sites(f"{next(iter(streams))}.00", model)
+    return [Cell(place, ALL) for place in whole]
 
 
 def _of_head(product: "Tensor", place: SiteGroup) -> NDArray[np.float64]:

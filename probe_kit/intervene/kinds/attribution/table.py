@@ -43,7 +43,7 @@ def attribution_table(rows: Sequence[AttributionEffect], context: TableContext) 
 
 def attribution_sentences(rows: Sequence[AttributionEffect], _: TableContext) -> list[str]:
     """One per category: whether the screen holds, and what it puts first."""
-    return [f"{category_of(name).title}: {_finding(own)}." for name, own in _by_category(rows).items()]
+    return [f"{category_of(name).title}: {describe_screen(own)}." for name, own in _by_category(rows).items()]
 
 
 def _by_category(rows: Sequence[AttributionEffect]) -> dict[str, list[AttributionEffect]]:
@@ -53,10 +53,11 @@ def _by_category(rows: Sequence[AttributionEffect]) -> dict[str, list[Attributio
     return found
 
 
-def _finding(rows: Sequence[AttributionEffect]) -> str:
+def describe_screen(rows: Sequence[AttributionEffect]) -> str:
+    """Of one category: what the anchors show, and the first cells of each kind unless the screen is void."""
     worst = worst_anchor(rows)
     if worst is None:
-        return "no anchor carries the effect of the image swap, so that there is no order"
+        return "no anchor carries the effect, so that there is no order"
     if worst.finding == "void":
         return f"{_void(rows)}; no order is shown"
     firsts = [
