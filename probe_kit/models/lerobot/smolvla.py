@@ -29,9 +29,8 @@ def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> S
     """
     config.device = device
     config.load_vlm_weights = False
-    local = folder / config.vlm_model_name
     name = config.vlm_model_name
-    config.vlm_model_name = str(local.resolve()) if local.is_dir() else name
+    config.vlm_model_name = locate_vlm(config, folder)
     try:
         # lerobot prints while it builds; stdout belongs to results.
         with torch.device(device), redirect_stdout(sys.stderr):
@@ -43,6 +42,12 @@ def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> S
         ) from error
     policy.eval()
     return cast(SmolVLAPolicy, policy)
+
+
+def locate_vlm(config: SmolVLAConfig, folder: Path) -> str:
+    """The folder of a checkpoint's VLM, where it lies relative to that of the checkpoint, or its hub id."""
+    local = folder / config.vlm_model_name
+    return str(local.resolve()) if local.is_dir() else config.vlm_model_name
 
 
 def current_smolvla_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -22,7 +22,7 @@ from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.attention_weights import Note, shares
 from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, flow_stacks
-from probe_kit.models.lerobot.smolvla import build_smolvla, current_smolvla_keys
+from probe_kit.models.lerobot.smolvla import build_smolvla, current_smolvla_keys, locate_vlm
 
 
 class SmolVLA(LerobotFlow):
@@ -67,8 +67,12 @@ class SmolVLA(LerobotFlow):
 
     @cached_property
     def tokenizer(self) -> Any:
-        """The VLM's."""
-        return self.network.model.vlm_with_expert.processor.tokenizer
+        """The VLM's; found by its name where words are checked without a network."""
+        if hasattr(self, "network"):
+            return self._joint.processor.tokenizer
+        from transformers import AutoTokenizer
+
+        return AutoTokenizer.from_pretrained(locate_vlm(self.config, self.folder))
 
     def side_files(self) -> dict[str, Path]:
         """Also the VLM's configuration and tokenizer, where they lie in a folder here."""

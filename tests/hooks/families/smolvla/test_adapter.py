@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from probe_kit.errors import ObservationError
-from probe_kit.hooks.families.smolvla.adapter import load_smolvla
+from probe_kit.errors import InstructionError, ObservationError
+from probe_kit.hooks.families.smolvla.adapter import check_smolvla_words, load_smolvla
 from probe_kit.hooks.testing import example_observations
 from tests.support.smolvla_checkpoints import write_smolvla
 
@@ -45,3 +45,11 @@ def test_a_second_camera_is_needed_once_it_is_shown(tmp_path: Path) -> None:
         policy.act(example_observations(["Put the cube on the star"]), [0])
     with pytest.raises(ObservationError, match="in order"):
         policy.showing(["wrist"])
+
+
+def test_words_are_checked_without_the_network(tmp_path: Path) -> None:
+    """An AttributeError refused every instruction before anything was loaded."""
+    checkpoint = str(write_smolvla(tmp_path))
+    check_smolvla_words(checkpoint, ["Put the cube on the star"])
+    with pytest.raises(InstructionError, match=r"does not know|tokens; this checkpoint reads"):
+        check_smolvla_words(checkpoint, ["Put the cube on the zebra " * 40])
