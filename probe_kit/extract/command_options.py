@@ -152,8 +152,8 @@ Prompts = Annotated[
         "--prompt",
         parser=_prompts,
         metavar="A,B,…",
-        help="Prompts, comma-separated: seen, p1, p2 (from the paper) or text files. A file contains {object}, "
-        "and {A} and {B} for the sides.",
+        help="Prompts, comma-separated: seen, p1, p2 (from the paper), instruction (the words of the policies) "
+        "or text files. A file contains {object}, and {A} and {B} for the sides.",
     ),
 ]
 P1_P2_SEEN = Names(("p1", "p2", "seen"))

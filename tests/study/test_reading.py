@@ -217,7 +217,7 @@ def test_the_embedded_study_needs_no_download(tmp_path: Path, monkeypatch: pytes
     study = load_study("embedded")
     assert all(cell.settings.checkpoint is None for cell in study.cells)
     assert {cell.model for cell in study.cells} == set(study.study.models)
-    assert plan_study(study).totals()["episodes"] == 1536
+    assert plan_study(study).totals()["episodes"] == 1728
 
 
 def test_paths_are_relative_to_the_working_directory_also_in_studies_of_the_package(

@@ -71,8 +71,10 @@ class AnswerController:
     def __init__(self, model: "AnswerModel", settings: AskSettings, suite: Suite, blank: Observation) -> None:
         """blank: an observation as the scene will show them."""
         self.model, self._settings, self.template = model, settings, settings.prompt
+        self._choose_positions()
         self._phrases = phrases(suite, settings.query, settings.seed)
         self._item_has_side_word = {item.item_id: item.side_word for item in suite.items}
+        self._instructions = sorted({item.instruction for item in suite.items})
         card = model.card
         self.script: str | None = None
         self.limit = settings.inference_limit
@@ -103,6 +105,7 @@ class AnswerController:
 
     def ask(self, turns: Sequence[AskTurn]) -> list[dict[str, Any]]:
         """Per turn the columns of its outcome."""
+        self._choose_positions()
         shown = [self._shown(turn) for turn in turns]
         phrases_asked = [self._phrases[turn.planned.episode.item.item_id] for turn in turns]
         buffers = {row: turn.buffers for row, turn in enumerate(turns)} if self.streams else {}
@@ -121,6 +124,15 @@ class AnswerController:
             for row, turn in enumerate(turns)
         ]
 
+    def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
+        """The ids of the words around a picture, where the prompt is the instruction; None for a question."""
+        ids = self.model.token_ids([instruction]) if self.template.is_instruction else None
+        return None if ids is None else tuple(map(int, ids[0]))
+
+    def _choose_positions(self) -> None:
+        """Those of the backbone's stream; the model may serve other prompts too."""
+        self.model.match_policies(self.template.is_instruction)
+
     # -- what is asked -----------------------------------------------------------------------------------
 
     def _shown(self, turn: AskTurn) -> Observation:
@@ -136,7 +148,7 @@ class AnswerController:
         pictured = self._settings.picture != "none"
         options = tuple(self._spoken_options(order))
         return [
-            Prompt(seen, self.template.render(phrase, order), options, pictured=pictured)
+            Prompt(seen, self.template.render(phrase, order, seen.instruction), options, pictured=pictured)
             for seen, phrase in zip(shown, named, strict=True)
         ]
 
@@ -217,10 +229,10 @@ class AnswerController:
         }
 
     def _sizes(self, questions: Sequence["Prompt"]) -> list[dict[str, int]]:
-        """How long each prompt was; the last position lies outside the backbone's stream."""
-        rows = self._backbone_roles(questions)
+        """How long each prompt was; its last position can lie outside the backbone's stream."""
+        rows, after = self._backbone_roles(questions), int(not self.model.whole_prompt)
         return [
-            {"prompt_tokens": int(row.valid.sum()) + 1, "picture_tokens": int(row.mask("image").sum())}
+            {"prompt_tokens": int(row.valid.sum()) + after, "picture_tokens": int(row.mask("image").sum())}
             for row in rows
         ]
 
@@ -232,6 +244,9 @@ class AnswerController:
 
     def _blank_questions(self, blank: Observation) -> list["Prompt"]:
         named = sorted(set(self._phrases.values()), key=lambda phrase: (phrase.text, phrase.article))
+        if self.template.is_instruction:
+            blanks = [replace(blank, instruction=text) for text in self._instructions]
+            return self._questions(blanks, named[:1] * len(blanks), "original")
         return self._questions([blank] * len(named), named, "original")
 
     def _streams(self, blank: Observation) -> list[StoredStream]:

@@ -84,6 +84,7 @@ class Asking:
         for (chair, turn, seen), outcome in zip(due, outcomes, strict=True):
             yield Rollout(
                 turn.planned, {**outcome, **seen.facts}, turn.buffers, [], seen.ends,
+                instruction_ids=controller.instruction_ids(turn.seen.instruction),
                 control_steps=[0], seconds=Seconds(seconds, seen.seconds),
             )  # fmt: skip
             self._begin_next(chair)

@@ -2,7 +2,8 @@
 
 Places in a template: `the {object}` is the object with its article, if it has one, `{object}` without; `{A}` and
 `{B}` are the words for the two sides, in either order. A letter A in front of `{A}` and a letter B in front of
-`{B}` make them options that are answered by their letter; without letters they are answered in words.
+`{B}` make them options that are answered by their letter; without letters they are answered in words. A template
+with `{instruction}` shows a VLM the words of the policies, to compare activations with theirs.
 """
 
 import re
@@ -42,9 +43,12 @@ class Template:
 
     def __post_init__(self) -> None:
         found = _PLACES.findall(self.text)
+        if found == ["instruction"]:
+            return
         if unknown := sorted(set(found) - {"object", "A", "B"}):
             raise UsageError(
-                f"the prompt {self.name} has a place {{{unknown[0]}}}; expected {{object}}, {{A}} and {{B}}"
+                f"the prompt {self.name} has a place {{{unknown[0]}}}; expected {{object}}, {{A}} and {{B}}, or "
+                "{instruction} and no other"
             )
         if found.count("object") != 1 or (found.count("A"), found.count("B")) not in ((0, 0), (1, 1)):
             raise UsageError(
@@ -58,6 +62,11 @@ class Template:
     def sha256(self) -> str:
         """Of the text, places and all."""
         return sha256_text(self.text)
+
+    @property
+    def is_instruction(self) -> bool:
+        """Whether it has the instruction that policies get, and asks for no object."""
+        return "{instruction}" in self.text
 
     @property
     def lettered(self) -> bool:
@@ -79,8 +88,10 @@ class Template:
         """How many tokens an answer may have."""
         return LETTER_TOKENS if self.lettered else SIDE_TOKENS
 
-    def render(self, named: Phrase, order: Order = "original") -> str:
-        """The question about an object, with the sides named in this order."""
+    def render(self, named: Phrase, order: Order = "original", instruction: str = "") -> str:
+        """The question about an object, with the sides named in this order. instruction: of the episode."""
+        if self.is_instruction:
+            return self.text.replace("{instruction}", instruction)
         first, second = sides(order)
         words = {"the {object}": named.with_article, "{object}": named.text, "{A}": first, "{B}": second}
         return _FILLED.sub(lambda place: words[place[0]], self.text)
@@ -96,8 +107,11 @@ _CHOICE = "\n\nA {A}\nB {B}\n\nAnswer with the option's letter from the given ch
 SEEN = Template("seen", "Do you see the {object}? Answer yes or no. If yes, specify where: {A}, center, or {B}.")
 P1 = Template("p1", 'Do you see the {object}? If yes, specify where: "left" or "right".' + _CHOICE)
 P2 = Template("p2", "Put cube on {object}" + _CHOICE)
-TEMPLATES: Mapping[str, Template] = MappingProxyType({template.name: template for template in (SEEN, P1, P2)})
-"""Those of the paper, by name."""
+INSTRUCTION = Template("instruction", "{instruction}")
+TEMPLATES: Mapping[str, Template] = MappingProxyType(
+    {template.name: template for template in (SEEN, P1, P2, INSTRUCTION)}
+)
+"""Those of the paper, and the instruction, by name."""
 
 
 def find_template(name: str) -> Template:

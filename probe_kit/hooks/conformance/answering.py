@@ -3,10 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from probe_kit.errors import ObservationError, UsageError
+from probe_kit.hooks.capturing.capture_context import capture
 from probe_kit.hooks.conformance.check import SkipTest, check, refused, require, require_bits, require_close
 from probe_kit.hooks.conformance.subject import AnswerSubject
+from probe_kit.hooks.contract.roles import Roles
 
 
 @check(
@@ -118,6 +121,33 @@ def a_choice_that_rounding_decides_is_a_near_tie(subject: AnswerSubject) -> None
     require(not ties(replace(reading, option_logits=apart)).any(), "a near tie at a margin of 9", "none")
     near = ties(replace(reading, option_logits=apart * 1e-6))
     require(bool(near.all()), "no near tie at a margin of 0.000009", "a near tie")
+
+
+@check(
+    "With the positions of policies, the backbone's stream has at most one position more, the last.",
+    "Slice the taps and the roles of `backbone` by the same positions in `match_policies`.",
+)
+def the_positions_of_policies_add_at_most_the_last_one(subject: AnswerSubject) -> None:
+    model, asked = subject.answer_model, subject.led(subject.asked[:1])
+    site = model.streams["backbone"].sites()[-1]
+
+    def captured() -> tuple[torch.Tensor, Roles]:
+        with capture(model, [site]) as cache:
+            model.read(asked)
+        return cache[site], model.asked_roles(asked)["backbone"][0]
+
+    own, own_roles = captured()
+    model.match_policies(True)
+    try:
+        (whole, roles), added = captured(), int(model.whole_prompt)
+    finally:
+        model.match_policies(False)
+    require(len(roles) == whole.shape[1], f"{len(roles)} roles", f"{whole.shape[1]}, one per position")
+    require(whole.shape[1] == own.shape[1] + added, f"{whole.shape[1]} positions", f"{own.shape[1] + added}")
+    require(
+        bool(torch.equal(whole[:, : own.shape[1]], own)), "other activations", "those without the last position"
+    )
+    require(roles.spans[0] == own_roles.spans[0], f"roles {roles.spans}", f"those of {own_roles.spans}")
 
 
 def _needs_batches(subject: AnswerSubject) -> None:

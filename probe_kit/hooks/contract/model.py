@@ -335,7 +335,18 @@ Measured on small models, batches against single rows: logits move by 1e-5 in fl
 
 
 class AnswerModel(Model):
-    """A model that answers questions in text. Being asked is one inference, as `capture` counts it."""
+    """A model that answers questions in text. Being asked is one inference, as `capture` counts it.
+
+    whole_prompt: whether the backbone's stream has the last position of the prompt, where the answer begins.
+    """
+
+    whole_prompt: bool = False
+
+    def match_policies(self, matched: bool) -> None:
+        """Give the backbone's stream the positions that it has in policies grown from this model, or its own.
+
+        Both are the same where such policies too begin their output at the last position of the prompt.
+        """
 
     @property
     def lead(self) -> str:

@@ -336,7 +336,8 @@ def _models(
     ]
     known = [[one for one in side if one is not None] for side in found]
     complete = all(len(some) == len(every) > 0 for some, every in zip(known, found, strict=True))
-    return ModelTest.of(*known, largest=largest) if complete else None
+    first, second = known
+    return ModelTest.of(first, second, largest) if complete else None
 
 
 def _sr_of_model(rows: Sequence[RowWithEstimates]) -> float | None:

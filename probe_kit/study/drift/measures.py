@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.contract.views import PADDING
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.compare.common_items import common_items, wording_of
 from probe_kit.retention.compare.differences import Difference
@@ -103,7 +104,7 @@ def measure_drift(
     rows = {(row.run.location, row.category): row for row in table.rows if row.view == view}
     gaps = {row.category: row for row in table.differences if row.view == view}
     names = dict.fromkeys(row.category for row in table.rows)
-    why = why_alone(before, after)
+    why = why_alone(before, after, view)
     return [
         _category(
             name, (sides[0], sides[1]), view, (rows[places[0], name], rows[places[1], name]), gaps.get(name), why
@@ -113,10 +114,50 @@ def measure_drift(
     ]
 
 
-def why_alone(before: RunReader, after: RunReader) -> str:
-    """Why probes of one run are not used on the other: other words or other frames; empty if they are."""
-    if ask_of(before) != ask_of(after) or wording_of(before) != wording_of(after):
+def why_alone(before: RunReader, after: RunReader, view: str = "mean") -> str:
+    """Why probes of one run are not used on the other: other words or other frames; empty if they are.
+
+    A VLM and a policy are compared where the VLM was shown the instruction and the frame in the size that the
+    policy gets, both were delivered the same tokens, and the view has the same positions in both.
+    """
+    if wording_of(before) != wording_of(after):
         return "other words"
+    if ask_of(before) != ask_of(after):
+        return _why_alone_beside_vlm(before, after, view)
+    return _why_other_frames(before, after)
+
+
+def _why_alone_beside_vlm(before: RunReader, after: RunReader, view: str) -> str:
+    asked, acted = (before, after) if ask_of(before) is not None else (after, before)
+    ask = ask_of(asked) or {}
+    if ask_of(acted) is not None or "{instruction}" not in ask["template"]:
+        return "other words"
+    if ask["picture"] != "frame" or _picture_size(asked) != _picture_size(acted):
+        return "other pictures"
+    there, here = _delivered(asked, view), _delivered(acted, view)
+    if any(None in there[name] or there[name] != here[name] for name in there.keys() & here.keys()):
+        return "other tokens"
+    return _why_other_frames(before, after)
+
+
+def _picture_size(run: Any) -> list[int]:
+    """Width and height in pixels of what the model is handed."""
+    scene = run.settings["scene"]
+    return list(scene.get("picture_size") or (scene["camera"]["width"], scene["camera"]["height"]))
+
+
+def _delivered(run: Any, view: str) -> dict[str, tuple[Any, list[int]]]:
+    """By episode, the instruction's tokens as the model was delivered them, and the positions of a view."""
+    role, found = view.partition(":")[2], {}
+    for commit in run.commits():
+        spans = [span for span in commit["roles"][0]["backbone"] if span[0] != PADDING]
+        first = min(start for _, start, _ in spans)
+        pooled = [range(start - first, end - first) for name, start, end in spans if role in ("", name)]
+        found[commit["episode_id"]] = commit.get("instruction_ids"), [at for span in pooled for at in span]
+    return found
+
+
+def _why_other_frames(before: RunReader, after: RunReader) -> str:
     tables = [run.episodes for run in (before, after)]
     if not all(FRAME in table for table in tables):
         return "frames unknown"

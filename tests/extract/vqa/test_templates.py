@@ -6,7 +6,7 @@ import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.vqa.phrases import Phrase
-from probe_kit.extract.vqa.templates import P1, P2, SEEN, TEMPLATES, Template, find_template, sides
+from probe_kit.extract.vqa.templates import INSTRUCTION, P1, P2, SEEN, TEMPLATES, Template, find_template, sides
 
 RED = Phrase("red shape", "the")
 CHOICE = "\n\nA left\nB right\n\nAnswer with the option's letter from the given choices directly."
@@ -18,14 +18,23 @@ def test_the_three_prompts_read_as_in_the_paper() -> None:
     )
     assert P1.render(RED) == ('Do you see the red shape? If yes, specify where: "left" or "right".' + CHOICE)
     assert P2.render(RED) == "Put cube on red shape" + CHOICE
-    assert list(TEMPLATES) == ["seen", "p1", "p2"]
+    assert list(TEMPLATES) == ["seen", "p1", "p2", "instruction"]
 
 
 def test_a_name_without_an_article_gets_none() -> None:
     assert SEEN.render(Phrase("Ada Lovelace", "")).startswith("Do you see Ada Lovelace?")
 
 
-@pytest.mark.parametrize("template", TEMPLATES.values(), ids=TEMPLATES)
+def test_the_prompt_of_the_instruction_is_the_instruction_alone() -> None:
+    assert INSTRUCTION.is_instruction
+    assert INSTRUCTION.orders == ("original",)
+    assert INSTRUCTION.render(RED, instruction="Put the {cube} on it") == "Put the {cube} on it"
+    framed = Template("openvla", "What action should the robot take to {instruction}?")
+    assert framed.is_instruction
+    assert framed.render(RED, instruction="go") == "What action should the robot take to go?"
+
+
+@pytest.mark.parametrize("template", [SEEN, P1, P2], ids=("seen", "p1", "p2"))
 def test_the_swapped_order_exchanges_the_sides_and_nothing_else(template: Template) -> None:
     plain, swapped = (template.render(RED, order) for order in template.orders)
     exchanged = swapped.replace("left", "#").replace("right", "left").replace("#", "right")
@@ -35,7 +44,7 @@ def test_the_swapped_order_exchanges_the_sides_and_nothing_else(template: Templa
 
 
 def test_which_prompts_take_letters_and_which_take_no() -> None:
-    assert [(one.lettered, one.yes_or_no, one.tokens) for one in TEMPLATES.values()] == [
+    assert [(one.lettered, one.yes_or_no, one.tokens) for one in (SEEN, P1, P2)] == [
         (False, True, 24),
         (True, False, 8),
         (True, False, 8),
@@ -61,6 +70,7 @@ def test_a_file_is_a_prompt_of_its_own_name(tmp_path: Path) -> None:
         ("Where is it? A {A} B {B}", "places A, B; expected {object} once"),
         ("Where is {object}? A {A}", "{A} and {B} once each or not at all"),
         ("Where is {object} of {color}?", "place {color}"),
+        ("{instruction} Where is {object}?", "place {instruction}; expected .* or {instruction} and no other"),
         ("{object}, {object}", "once"),
         ("Is {object} B {B} or A {A}? A {A}", "once each"),
     ],

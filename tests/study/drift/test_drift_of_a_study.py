@@ -4,7 +4,16 @@ from pathlib import Path
 
 import pytest
 
-from probe_kit.study import conduct_study, fit_probes, load_study, make_figures, make_table, pack_study, plan_study
+from probe_kit.study import (
+    LoadedStudy,
+    conduct_study,
+    fit_probes,
+    load_study,
+    make_figures,
+    make_table,
+    pack_study,
+    plan_study,
+)
 
 TEXT = """
 schema = 1
@@ -22,6 +31,17 @@ family = "pi0-tiny"
 [models.early]
 family = "pi0-tiny-early"
 
+[models.vlm]
+family = "vlm-tiny"
+
+[asks.words]
+prompt = "instruction"
+picture_size = "640x480"
+
+[asks.question]
+prompt = "p2"
+picture_size = "640x480"
+
 [conditions.captured]
 no_act = true
 
@@ -30,12 +50,34 @@ name = "main"
 models = ["base", "early"]
 conditions = ["captured"]
 
+[[runs]]
+name = "words"
+models = ["vlm"]
+asks = ["words", "question"]
+tokens = "pooled"
+
 [probes.main]
-runs = ["main"]
+runs = ["main", "words"]
+views = ["mean", "mean:language"]
 permutations = 39
 
 [drift.training]
 pairs = [["early", "base"], ["base", "base/captured"]]
+
+[drift.vlm]
+pairs = [["vlm/words", "early"], ["vlm/question", "early"]]
+
+[drift.language]
+pairs = [["vlm/words", "early"]]
+view = "mean:language"
+
+[tables.vlm]
+kind = "drift"
+drift = "vlm"
+
+[tables.language]
+kind = "drift"
+drift = "language"
 
 [tables.drift]
 kind = "drift"
@@ -67,8 +109,10 @@ def test_a_file_names_pairs_and_an_archive_prints_their_table_without_activation
     ]  # fmt: skip
     color, counting = made.text.cells[2:]
     assert (color[2], counting[2]) == ("kept", "not shown in either")
-    assert color[4] == color[5].split()[0] == color[6], "a run transfers to itself as it decodes"
-    assert color[12] == "1.00"
+    named = dict(zip(made.text.columns, color, strict=True))
+    assert named["forth %"] == named["back %"] == named["recentred %"], "a run transfers to itself as it decodes"
+    assert named["CKA"] == "1.00"
+    _check_vlm(study)
     chosen = make_table(study, "counting").text.cells
     assert [cells[1] for cells in chosen] == ["Counting", "Counting"]
     assert chosen[0] == made.text.cells[1], "probes are those of the whole runs"
@@ -78,3 +122,17 @@ def test_a_file_names_pairs_and_an_archive_prints_their_table_without_activation
     assert all(title.startswith("Color") for title in titles)
     pack_study(study, tmp_path / "study.zip")
     assert make_table(load_study(tmp_path / "study.zip"), "drift").text == made.text
+
+
+def _check_vlm(study: LoadedStudy) -> None:
+    """The early policy has the VLM's weights: with its words, picture and tokens, nothing differs."""
+    numbers = make_table(study, "vlm").numbers
+    sites = [one for one in numbers if "cka" in one]
+    assert {one["before"].partition(" ")[0] for one in sites} == {"vlm"}
+    assert len(sites) == 2 * 4, "of the pair with the policies' words alone"
+    assert min(one["cka"] for one in sites) >= 0.999
+    own = {one["category"]: one for one in numbers if "verdict" in one and not one["why_alone"]}
+    assert own["color"]["verdict"] == "kept"
+    assert [one["why_alone"] for one in numbers if "verdict" in one] == [None, None, "other words", "other words"]
+    apart = [one["why_alone"] for one in make_table(study, "language").numbers]
+    assert apart == ["other tokens"] * 2, "the last token is no word to the VLM"

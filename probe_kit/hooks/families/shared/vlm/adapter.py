@@ -230,15 +230,23 @@ class VisionLanguageModel(AnswerModel):
         longest = max(len(prompt.ids) for prompt in prompts)
         rows = [[PADDING] * (longest - len(prompt.ids)) + _labels(prompt) for prompt in prompts]
         return {
-            "backbone": [Roles.from_labels(labels[:-1]) for labels in rows],
+            "backbone": [Roles.from_labels(labels[self._backbone_tokens]) for labels in rows],
             ANSWER: [Roles.from_labels([ANSWER])] * len(rows),
         }
+
+    def match_policies(self, matched: bool) -> None:
+        """Policies that read the keys and values of a prompt have all of it in their backbone."""
+        self.whole_prompt = matched
+
+    @property
+    def _backbone_tokens(self) -> slice:
+        return slice(None) if self.whole_prompt else _PROMPT
 
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the final norm, or a block's output."""
         if self.stream_of(site).part == "vision":
             return self.vision_tap(site.layer)
-        tokens = _PROMPT if site.stream == "backbone" else _LAST
+        tokens = self._backbone_tokens if site.stream == "backbone" else _LAST
         norm: nn.Module = self.language.norm
         if site.quantity == "final_norm":
             return Tap(norm, 1, "output", tokens)
