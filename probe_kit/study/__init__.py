@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from probe_kit.study.packing.data_set import write_data_set
     from probe_kit.study.packing.pack import pack_study
     from probe_kit.study.packing.publishing import publish_data_set
+    from probe_kit.study.packing.trackers import track_study
     from probe_kit.study.planning.plan import StudyPlan, plan_study
     from probe_kit.study.reading import LoadedStudy, load_study
     from probe_kit.study.running.calibrating import calibrate_study
@@ -42,6 +43,7 @@ __all__ = [
     "pack_study",
     "plan_study",
     "publish_data_set",
+    "track_study",
     "write_data_set",
 ]
 
@@ -57,6 +59,7 @@ __getattr__, __dir__ = lazy_names(
         "make_figures": "figures",
         "pack_study": "packing.pack",
         "publish_data_set": "packing.publishing",
+        "track_study": "packing.trackers",
         "write_data_set": "packing.data_set",
         "StudyPlan": "planning.plan",
         "plan_study": "planning.plan",

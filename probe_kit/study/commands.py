@@ -30,6 +30,7 @@ probe-kit study table embedded success
 """
 app = typer.Typer(help=HELP, no_args_is_help=True)
 UNFINISHED = 1
+Tracker = Literal["mlflow", "wandb"]
 Style = Literal["table", "markdown", "latex", "json"]
 File = Annotated[
     str,
@@ -246,6 +247,22 @@ def pack(
     out.print(f"{out_file}: {len(made.keys)} runs, without {', '.join(made.left_out)}", soft_wrap=True)
     for name, reason in made.missing.items():
         out.print(f"not packed: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
+
+
+@app.command("track")
+def track(
+    file: File,
+    tracker: Annotated[Tracker, typer.Option("--to", help="Tracker; its own settings say where it logs to.")],
+    project: Annotated[
+        str, typer.Option("--project", metavar="NAME", help="Project, or MLflow's experiment.")
+    ] = "probe-kit",
+    partial: Partial = False,
+) -> None:
+    """Log all tables of a study to MLflow or Weights & Biases, once. Loads no model."""
+    from probe_kit.study import load_study, track_study
+
+    logged, is_new = track_study(load_study(file), tracker, project, partial)
+    out.print(f"{logged}{'' if is_new else ' (was logged before)'}", highlight=False, markup=False)
 
 
 @app.command("publish")
