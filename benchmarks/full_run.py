@@ -55,14 +55,16 @@ def play(plan: Plan, scene: SceneSpec, per_script: int) -> dict[str, list[Played
     found: dict[str, list[Played]] = defaultdict(list)
     stride = max(1, len(plan.episodes) // per_script)
     for script in SCRIPTS:
-        stage = Stage(scene, script, keep_ends=True)
+        stage = Stage(scene, script, frames="ends")
         try:
             for planned in plan.episodes[::stride][:per_script]:
                 ending = stage.begin(planned, False)
                 assert isinstance(ending, Ending)
-                assert ending.ends is not None
+                assert ending.small_frames
                 assert ending.trajectory is not None
-                found[ending.outcome["side_placed"]].append(Played(ending.outcome, ending.ends, ending.trajectory))
+                found[ending.outcome["side_placed"]].append(
+                    Played(ending.outcome, ending.small_frames, ending.trajectory)
+                )
         finally:
             stage.close()
     return found

@@ -34,7 +34,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         suite = build_suite(Path(folder) / "suite", None, options.items)
         planned = make_plan(suite, [], 0, 1, True).episodes
-        stage = Stage(SceneSpec(max_steps=options.actions), "idle", keep_ends=True)
+        stage = Stage(SceneSpec(max_steps=options.actions), "idle", frames="ends")
         began, every = time.process_time(), max(1, options.episodes // options.lines)
         print(f"{len(planned)} episodes in the suite, {resident_megabytes():.0f} MB before the first", flush=True)
         for number, episode in enumerate(islice(cycle(planned), options.episodes), start=1):

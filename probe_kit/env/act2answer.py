@@ -97,6 +97,13 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         # What a caller paints into it must not be what the next one sees.
         return self._picture.copy()
 
+    def render_small(self, height: int) -> Picture:
+        """The picture (height, w, 3) uint8 of the scene now, drawn at this height: for films, and no model.
+
+        Drawing takes a quarter of the time of `render` at half the height.
+        """
+        return self.scene.small_picture(height)
+
     def close(self) -> None:
         """Free the simulator; a second call does nothing."""
         if self._scene is not None:

@@ -224,7 +224,11 @@ CapturedCalls = Annotated[
 ]
 Frames = Annotated[
     FrameChoice,
-    _storage_option("--frames", help="ends: store thumbnails of first and last frames for the report."),
+    _storage_option(
+        "--frames",
+        help="ends: store the first and last frame of every episode in small. all: store every frame, for the "
+        "viewer and for films.",
+    ),
 ]
 Video = Annotated[VideoChoice, _storage_option("--video", help="Store a GIF of the first episode or of all.")]
 StorageCodec = Annotated[Codec, _storage_option("--codec", help="Compression of stored activations.")]

@@ -11,6 +11,8 @@ EPISODE = 40_000
 """Bytes of an episode's commit, trajectory and files of the file system (measured: 12 to 30 kB)."""
 THUMBNAILS = 15_000
 """Bytes of the first and last frame of an episode."""
+FRAME = 7_000
+"""Bytes of a small frame where all are kept (measured: 5 to 6 kB)."""
 FILM = 1_500_000
 """Bytes of a film of sixty actions."""
 DECISION = 16
@@ -28,12 +30,12 @@ def space_of(streams: Sequence[StoredStream], episodes: int, settings: RunSettin
     """The same for a number of episodes that store these streams."""
     calls, with_tokens = int(getattr(settings, "captured_calls", 1)), settings.tokens == "all"
     films = {"all": episodes, "first": 1}.get(str(getattr(settings, "video", "none")), 0)
-    thumbnails = 0 if settings.frames == "none" else episodes * THUMBNAILS
+    pictures = {"none": 0, "ends": THUMBNAILS, "all": FRAME * (settings.scene.max_steps + 1)}[settings.frames]
     sites = sum(len(stream.stream.sites()) for stream in streams)
     return {
         "activations": sum(stream.raw_bytes(with_tokens) for stream in streams) * calls * episodes,
         "columns": sum(stream.raw_bytes(False) for stream in streams) * calls * episodes,
-        "episodes": episodes * EPISODE + thumbnails + films * FILM,
+        "episodes": episodes * (EPISODE + pictures) + films * FILM,
         "probes": sites * episodes * DECISION,
         "report": REPORT if streams else 0,
     }

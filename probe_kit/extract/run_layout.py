@@ -15,7 +15,7 @@ RUN/
   probes/            results of `probe-kit train`
   interventions/     results of `probe-kit intervene`
   videos/            GIFs, if asked for
-  frames/<n>.webp    first and last frame of an episode, see `thumbnails`
+  frames/<n>.webp    first and last frame of an episode, or all of them, see `thumbnails`
 
 Every object is bound to the root by hashes, see `hashes`.
 """
@@ -53,8 +53,12 @@ AskTokens = Literal["none", "pooled", "all"]
 """What is stored of the streams: nothing, the pooled views, or these and every token."""
 VideoChoice = Literal["none", "first", "all"]
 """Episodes of which a GIF is stored."""
-FrameChoice = Literal["ends", "none"]
-"""Frames of an episode of which a thumbnail is stored."""
+FrameChoice = Literal["ends", "all", "none"]
+"""Frames of an episode of which a small copy is stored."""
+FRAME_COLUMNS = 8
+"""Frames to a row of the picture that holds them."""
+MOST_FRAMES = FRAME_COLUMNS * 68
+"""In one picture: a WebP may not exceed 16,383 pixels a side, and a frame of a film is 240 high."""
 ExportFormat = Literal["h5", "safetensors", "parquet"]
 CAPTURE_ONLY = "capture_only"
 """Outcome of an episode whose model was captured and did not act: there is no success rate."""

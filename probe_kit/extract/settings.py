@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal, Self, get_args
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.extract.protocols import has_network, protocol_identity, protocol_row, scene_of
-from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, Tokens, VideoChoice
+from probe_kit.extract.run_layout import MOST_FRAMES, AskTokens, Codec, FrameChoice, Tokens, VideoChoice
 from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.extract.vqa.templates import P1, Template, find_template
 from probe_kit.hashing import sha256_json
@@ -86,7 +86,8 @@ class RunSettings:
     The rest changes no stored number, only how fast it comes:
     batch: observations per call of the model. With 1, bytes repeat exactly; with more, up to float rounding.
     calibrate: choose batch and env_workers by a measurement of some seconds, see `extract.calibration`.
-    frames: `ends` keeps a thumbnail of the first and last frame of every episode, `none` does not.
+    frames: `ends` keeps small copies of the first and last frame of every episode, `all` of every frame, `none` of
+    none.
     env_workers: processes that simulate and draw; None for two per observation of a batch, 0 for this process.
     workers: processes with a model each, one per GPU where there are several; 0 for this process.
     ray: address of a Ray cluster, or `auto`; the workers then run there.
@@ -111,7 +112,7 @@ class RunSettings:
     codec: str = "zstd"
     device: str = "cpu"
     dtype: str | None = None
-    frames: str = "ends"
+    frames: FrameChoice = "ends"
     batch: int = 1
     calibrate: bool = False
     env_workers: int | None = None
@@ -128,6 +129,11 @@ class RunSettings:
         self._check_one_of("tokens", self.tokens_allowed)
         self._check_one_of("codec", get_args(Codec))
         self._check_one_of("frames", get_args(FrameChoice))
+        if self.frames == "all" and self.scene.max_steps >= MOST_FRAMES:
+            raise UsageError(
+                f"--frames all keeps at most {MOST_FRAMES} frames, and episodes of {self.scene.max_steps} actions "
+                f"have one more than actions; use --max-steps {MOST_FRAMES - 1} or --frames ends"
+            )
         for name, bound in {"items": 1, "batch": 1, "workers": 0, "env_workers": 0}.items():
             self._check_at_least(name, bound)
         self._check_limit()

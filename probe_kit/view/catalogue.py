@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from probe_kit.extract import Run
-from probe_kit.extract.store.thumbnails import read_thumbnail
+from probe_kit.extract.store.thumbnails import read_sheet
 from probe_kit.hashing import sha256_json
 from probe_kit.view.payloads.coding import payload_script
 from probe_kit.view.payloads.episode_payload import episode_payload
@@ -68,7 +68,8 @@ class Catalogue:
         """The committed frames of an episode, None without any. Raises KeyError; RunDamagedError if changed."""
         viewed = self.runs[key]
         _ = viewed.position_of[number]
-        return read_thumbnail(viewed.run.location, number)
+        sheet = read_sheet(viewed.run.location, number)
+        return None if sheet is None else sheet.content
 
     def _payload(self, name: str) -> Any:
         if name == "index":

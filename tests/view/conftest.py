@@ -5,11 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from probe_kit.env import SceneSpec
+from probe_kit.env.scoring.trajectory import CHANNELS
 from probe_kit.extract import Run, label_run, open_run, seal
 from probe_kit.extract.plan import make_plan
 from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.writer import RunWriter
+from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from probe_kit.view import write_viewer
@@ -17,6 +21,8 @@ from probe_kit.view.catalogue import Catalogue
 from tests.support.little_run import STREAMS, certify, episode, little_settings
 
 CALLS = 2
+FILMED, FILM_STEPS = 2, 9
+"""An episode that keeps every frame, and its steps."""
 HOSTILE = "</script><img src=x onerror=alert(1)>"
 """A label that a page may not obey."""
 
@@ -40,14 +46,39 @@ def exported(little_runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return write_viewer(runs, tmp_path_factory.mktemp("viewer") / "page")
 
 
+def film() -> tuple[NDArray[np.uint8], ...]:
+    """Frames that get lighter on the left and darker on the right."""
+    frames = []
+    for number in range(FILM_STEPS + 1):
+        frame = np.full((60, 80, 3), 20 * number, np.uint8)
+        frame[:, 40:] = 250 - 20 * number
+        frames.append(frame)
+    return tuple(frames)
+
+
+def filmed(record: EpisodeRecord) -> EpisodeRecord:
+    """The record as `--frames all` makes it, where it is that of the filmed episode."""
+    number, frames = record.planned.index, film()
+    if number != FILMED:
+        return record
+    return replace(
+        record,
+        outcome={**record.outcome, "steps": FILM_STEPS},
+        trajectory=np.random.default_rng(number).normal(size=(len(frames), len(CHANNELS))).astype(np.float32),
+        pictures={thumbnail_key(number): as_thumbnail(frames, "all")},
+        frames=len(frames),
+    )
+
+
 def write_run(where: Path, suite: Suite, seed: int) -> Run:
     """24 episodes of two captured inferences. The backbone's last layer holds the answer at the first of them."""
     settings = {**little_settings(), "captured_calls": CALLS, "tokens": "pooled", "light": str(seed)}
+    settings["scene"] = SceneSpec(max_steps=FILM_STEPS).to_json()
     plan = make_plan(suite, list(STREAMS), 0, CALLS, True)
     writer = RunWriter(locate(where), plan, settings)
     certify(writer)
     for number in writer.remaining():
-        record = episode(plan, number, seed)
+        record = filmed(episode(plan, number, seed))
         draw = np.random.default_rng([seed, number])
         pooled = {}
         for stream in STREAMS:

@@ -13,14 +13,14 @@ from PIL import Image
 
 from probe_kit.extract import Run, open_run
 from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.thumbnails import read_thumbnail
+from probe_kit.extract.store.thumbnails import decode_frames, read_sheet, read_thumbnail
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
 from probe_kit.view import write_viewer
 from probe_kit.view.catalogue import Catalogue
 from tests.support.browser import CHROMIUM, WHY_SKIPPED, Browser, Page
 from tests.support.little_run import episode, little_plan, little_writer
-from tests.view.conftest import HOSTILE
+from tests.view.conftest import FILM_STEPS, FILMED, HOSTILE
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=WHY_SKIPPED)]
 
@@ -121,13 +121,40 @@ def test_the_frame_that_is_shown_is_the_stored_one(page: Page, address: str, run
         page.open(f"{address}#/episodes?ep=1&t={step}")
         page.read("document.querySelector('.stamp').remove()")
         page.read("new Promise(done => setTimeout(done, 300))")
-        box = page.read(
-            "(() => { const b = document.querySelector('.film').getBoundingClientRect(); "
-            "return [b.left, b.top, b.right, b.bottom].map(Math.round); })()"
-        )
-        seen = Image.open(BytesIO(page.picture(whole=False))).convert("RGB").crop(box)
-        middle = np.asarray(seen, int)[box[3] // 4 : -box[3] // 4, 40:-40].reshape(-1, 3)
+        seen = picture_of(page, ".film")
+        middle = seen[len(seen) // 4 : -len(seen) // 4, 40:-40].reshape(-1, 3)
         assert np.abs(np.median(middle, axis=0) - np.median(half.reshape(-1, 3), axis=0)).max() <= 3
+
+
+def test_the_film_shows_every_stored_frame_at_its_step(page: Page, address: str, runs: list[Run]) -> None:
+    sheet = read_sheet(runs[0].location, FILMED)
+    assert sheet is not None
+    assert sheet.count == FILM_STEPS + 1
+    page.open(f"{address}#/episodes?ep={FILMED}&t=0")
+    page.read("new Promise(done => setTimeout(done, 300))")
+    for step, frame in enumerate(decode_frames(sheet.content, sheet.count)):
+        assert text(page, ".scrub output") == f"{step} / {FILM_STEPS}"
+        seen = picture_of(page, ".film")
+        for half in (slice(0, 0.5), slice(0.5, 1)):
+            assert np.abs(median_of(seen, half) - median_of(frame, half)).max() <= 3, step
+        page.press("ArrowRight")
+    assert page.read("document.querySelector('.stamp')") is None
+
+
+def picture_of(page: Page, selector: str) -> np.ndarray:
+    """The pixels of an element, (H, W, 3)."""
+    box = page.read(
+        f"(() => {{ const b = document.querySelector({json.dumps(selector)}).getBoundingClientRect(); "
+        "return [b.left, b.top, b.right, b.bottom].map(Math.round); })()"
+    )
+    return np.asarray(Image.open(BytesIO(page.picture(whole=False))).convert("RGB").crop(box), int)
+
+
+def median_of(pixels: np.ndarray, share: slice) -> np.ndarray:
+    """Median colour of a part of the width, without its edges."""
+    height, width = pixels.shape[:2]
+    start, stop = (int(width * (place + shift)) for place, shift in ((share.start, 0.05), (share.stop, -0.05)))
+    return np.median(pixels[height // 8 : -height // 8, start:stop].reshape(-1, 3), axis=0)
 
 
 def test_every_cell_of_a_map_shows_its_stored_scores(page: Page, address: str, runs: list[Run]) -> None:

@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -13,14 +14,17 @@ from probe_kit.env.scoring.events import EVENTS, Events
 from probe_kit.env.scoring.rules import RULES
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.extract import Run, open_run
-from probe_kit.extract.store.thumbnails import thumbnail_key
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention import retention_table
+from probe_kit.suite import Suite
 from probe_kit.train import load_results
 from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_directions import read_directions
 from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.payloads.coding import pack_floats, pack_log_odds, payload_script
+from tests.support.little_run import episode, little_plan, little_writer
 from tests.view.payload_reader import floats, log_odds, read_payload, words
 
 
@@ -33,12 +37,26 @@ def payload(catalogue: Catalogue, name: str):
 def test_log_odds_at_inference_0_are_the_stored_out_of_fold_decisions(catalogue: Catalogue) -> None:
     viewed = catalogue.runs["run"]
     curve = load_results(viewed.run).curves["color", "mean"]
-    for place, (episode, label) in enumerate(zip(curve.episodes, curve.labels, strict=True)):
-        position = viewed.run.episodes["episode_id"].tolist().index(episode)
+    for place, (name, label) in enumerate(zip(curve.episodes, curve.labels, strict=True)):
+        position = viewed.run.episodes["episode_id"].tolist().index(name)
         found = viewed.probes["color"].log_odds(position)
         expected = curve.decisions[:, place] * (1 if label else -1)
         assert found.held_out
         np.testing.assert_allclose(found.values, [expected], rtol=1e-6, atol=1e-6)
+
+
+def test_an_episode_says_how_the_sheet_of_its_frames_is_divided(small_suite: Suite, tmp_path: Path) -> None:
+    plan = little_plan(small_suite)
+    writer = little_writer(locate(tmp_path / "run"), plan)
+    frames = tuple(np.zeros((60, 80, 3), np.uint8) for _ in range(10))
+    pictures = {thumbnail_key(0): as_thumbnail(frames, "all")}
+    writer.write(replace(episode(plan, 0), pictures=pictures, frames=10))
+    writer.write(episode(plan, 1))
+    catalogue = Catalogue([open_run(tmp_path / "run", allow_partial=True)])
+    size = {"width": 80, "height": 60}
+    assert payload(catalogue, "run/e/00000")["frames"] == {"count": 10, "columns": 8, **size, "all": True}
+    assert payload(catalogue, "run/e/00001")["frames"] == {"count": 2, "columns": 2, **size, "all": False}
+    assert catalogue.picture("run", 0) == pictures[thumbnail_key(0)]
 
 
 def test_an_item_that_no_fold_tests_takes_the_mean_of_the_folds_and_is_marked(little: Run) -> None:

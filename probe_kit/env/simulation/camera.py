@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
 
 from probe_kit.env.rotations import Array
 from probe_kit.env.simulation.bullet import BulletClient
@@ -57,6 +58,11 @@ class Camera:
         """The same view with `factor` times the pixels in each direction."""
         spec = self.spec
         return Camera(replace(spec, width=factor * spec.width, height=factor * spec.height))
+
+    def at_height(self, height: int) -> "Camera":
+        """The same view with so many rows of pixels."""
+        spec = self.spec
+        return Camera(replace(spec, width=round(spec.width * height / spec.height), height=height))
 
     def widened(self) -> "Camera":
         """The same view at the same scale, twice as wide and high: with what lies just outside of it."""
@@ -113,6 +119,13 @@ class Backdrop:
 
     rgb: Picture
     depth: NDArray[np.float32]
+
+    def at_size(self, spec: CameraSpec) -> "Backdrop":
+        """The same with the pixels of `spec`: mean colours, and the depth of the nearest pixel."""
+        size = (spec.width, spec.height)
+        rgb = Image.fromarray(self.rgb).resize(size, Image.Resampling.BOX)
+        depth = Image.fromarray(self.depth).resize(size, Image.Resampling.NEAREST)
+        return Backdrop(np.asarray(rgb), np.asarray(depth))
 
     def under(self, frame: Frame) -> Picture:
         """The picture (H, W, 3) of `frame` composed with the backdrop: the nearer surface is visible."""

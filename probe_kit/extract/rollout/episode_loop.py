@@ -14,15 +14,15 @@ from probe_kit.extract.rollout.controllers import ActingController, Turn
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.events import traceback_of
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, StageRequest
-from probe_kit.extract.store.frame_ends import Ends
 from probe_kit.extract.store.seconds import Seconds
+from probe_kit.extract.store.small_frames import SmallFrames
 from probe_kit.extract.store.writer import EpisodeRecord
 from probe_kit.hooks.contract.observation import Observation
 
 
 @dataclass(frozen=True)
 class Rollout:
-    """What one episode left: its outcome record, its activations, and its frames and thumbnails if asked for.
+    """What one episode left: its outcome record, its activations, and its frames and small frames if asked for.
 
     trajectory: (T + 1, C) float32 frames of the whole episode. instruction_ids: what the policy was delivered
     as its instruction, None if it reads none or cannot say. control_steps: of every inference, how many actions of
@@ -33,7 +33,7 @@ class Rollout:
     outcome: dict[str, Any]
     buffers: EpisodeBuffers
     frames: list[NDArray[np.uint8]]
-    ends: Ends | None = None
+    small_frames: SmallFrames = ()
     trajectory: NDArray[np.float32] | None = None
     instruction_ids: Sequence[int] | None = None
     control_steps: Sequence[int] = ()
@@ -200,7 +200,7 @@ class EpisodeLoop:
                     assert isinstance(answer, Ending)
                     outcome = {**answer.outcome, **slot.counts}
                     yield Rollout(
-                        slot.planned, outcome, slot.buffers, answer.frames, answer.ends, answer.trajectory,
+                        slot.planned, outcome, slot.buffers, answer.frames, answer.small_frames, answer.trajectory,
                         slot.instruction_ids, slot.control_steps, Seconds(slot.seconds, answer.seconds),
                     )  # fmt: skip
                     self._begin_next(slot, ended=True)

@@ -83,7 +83,7 @@ class Asking:
             return
         for (chair, turn, seen), outcome in zip(due, outcomes, strict=True):
             yield Rollout(
-                turn.planned, {**outcome, **seen.facts}, turn.buffers, [], seen.ends,
+                turn.planned, {**outcome, **seen.facts}, turn.buffers, [], seen.small_frames,
                 instruction_ids=controller.instruction_ids(turn.seen.instruction),
                 control_steps=[0], seconds=Seconds(seconds, seen.seconds),
             )  # fmt: skip

@@ -23,8 +23,8 @@ from probe_kit.errors import (
     StageDiedError,
 )
 from probe_kit.extract.plan import PlannedEpisode
-from probe_kit.extract.run_layout import CAPTURE_ONLY
-from probe_kit.extract.store.frame_ends import Ends, shrink
+from probe_kit.extract.run_layout import CAPTURE_ONLY, FrameChoice
+from probe_kit.extract.store.small_frames import FILM_HEIGHT, SmallFrames, shrink
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite.items import Side
 
@@ -43,7 +43,7 @@ EPISODE_ERRORS = (
 
 @dataclass(frozen=True)
 class Ending:
-    """The end of an episode: its record as flat columns, a frame per action if it was filmed, its thumbnails.
+    """The end of an episode: its record as flat columns, a frame per action if it was filmed, its small frames.
 
     trajectory: (T + 1, C) float32; see `probe_kit.env.scoring.trajectory`. seconds: that the stage worked on the
     episode, by the wall clock.
@@ -51,7 +51,7 @@ class Ending:
 
     outcome: dict[str, Any]
     frames: list[NDArray[np.uint8]]
-    ends: Ends | None = None
+    small_frames: SmallFrames = ()
     trajectory: NDArray[np.float32] | None = None
     seconds: float = 0.0
 
@@ -65,7 +65,7 @@ class Seen:
 
     observation: Observation
     facts: dict[str, Any]
-    ends: Ends | None = None
+    small_frames: SmallFrames = ()
     seconds: float = 0.0
 
 
@@ -95,11 +95,11 @@ class Stage(TimedStage):
     """Plays episodes in this process.
 
     script: `expert`, `expert-mirrored` or `idle` to let that script play every episode to its end at once.
-    keep_ends: whether every episode ends with small pictures of its first and last frame.
+    frames: which frames of an episode it ends with, in small.
     """
 
-    def __init__(self, scene: SceneSpec, script: str | None, keep_ends: bool = False) -> None:
-        self.script, self._keep_ends = script, keep_ends
+    def __init__(self, scene: SceneSpec, script: str | None, frames: FrameChoice = "none") -> None:
+        self.script, self._kept = script, frames
         self._env, self._intrinsics = Act2AnswerEnv(scene), scene.intrinsics
 
     def begin(self, planned: PlannedEpisode, film: bool) -> Answer:
@@ -119,7 +119,7 @@ class Stage(TimedStage):
         self._planned = planned
         try:
             self._set_up(planned)
-            return Seen(self._see(), self._facts, None if self._first is None else (self._first,))
+            return Seen(self._see(), self._facts, tuple(self._small_frames))
         except ProbeKitError as error:
             raise self._named(error) from None
 
@@ -136,7 +136,8 @@ class Stage(TimedStage):
             "first_frame_sha256": frame_sha256(frame),
             **{f"visible_{side}": share for side, share in start["tile_visibility"].items()},
         }
-        self._first = shrink(frame) if self._keep_ends else None
+        self._small_frames: list[NDArray[np.uint8]] = []
+        self._keep_small()
 
     def advance(self, actions: Iterable[NDArray[np.float32]]) -> Answer:
         """Carry out actions until they or the episode end."""
@@ -147,8 +148,7 @@ class Stage(TimedStage):
 
     def dismiss(self) -> Answer:
         """End the episode without an action: its model was only captured. There is no outcome."""
-        ends = None if self._first is None else (self._first,)
-        return Ending({"outcome": CAPTURE_ONLY, **self._facts}, self._frames, ends)
+        return Ending({"outcome": CAPTURE_ONLY, **self._facts}, self._frames, tuple(self._small_frames))
 
     def tile_masks(self) -> dict[Side, NDArray[np.bool_]]:
         """(H, W) where in the last picture each tile's own picture is seen."""
@@ -172,14 +172,19 @@ class Stage(TimedStage):
             _, terminated, truncated, _ = self._env.advance(action)
             self._recorder.note(action)
             self._shoot()
+            if terminated or truncated or self._kept == "all":
+                self._keep_small()
             if terminated or truncated:
                 trajectory = self._recorder.trajectory().frames
                 outcome = {**_record(self._env), **self._facts}
-                return Ending(outcome, self._frames, self._ends(), trajectory)
+                return Ending(outcome, self._frames, tuple(self._small_frames), trajectory)
         return None
 
-    def _ends(self) -> Ends | None:
-        return None if self._first is None else (self._first, shrink(self._env.render()))
+    def _keep_small(self) -> None:
+        if self._kept != "none":
+            every = self._kept == "all"
+            frame = self._env.render_small(FILM_HEIGHT) if every else shrink(self._env.render())
+            self._small_frames.append(frame)
 
     def _see(self) -> Observation:
         return self._observed(self._env.observe())
@@ -242,9 +247,11 @@ class AskableStage(Protocol):
 class LocalStage:
     """A stage in this process: the work is done when the answer is wanted."""
 
-    def __init__(self, source: Any, script: str | None, keep_ends: bool = False, kind: StageKind = Stage) -> None:
+    def __init__(
+        self, source: Any, script: str | None, frames: FrameChoice = "none", kind: StageKind = Stage
+    ) -> None:
         """source: where observations come from, for `kind`: a SceneSpec for `Stage`."""
-        self._stage = kind(source, script, keep_ends)
+        self._stage = kind(source, script, frames)
 
     def ask(self, method: str, *arguments: Any, then: StageRequest | None = None) -> None:
         """Remember the question."""

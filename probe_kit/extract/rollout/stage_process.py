@@ -7,14 +7,17 @@ from probe_kit._execution.child_process import Child
 from probe_kit.errors import ProbeKitError, StageDiedError
 from probe_kit.extract.rollout.events import add_traceback
 from probe_kit.extract.rollout.stage import Answer, Ending, Stage, StageKind, StageRequest, TimedStage
+from probe_kit.extract.run_layout import FrameChoice
 
 
 class ProcessStage:
     """A stage in a child process; a child that dies costs its episode and is replaced."""
 
-    def __init__(self, source: Any, script: str | None, keep_ends: bool = False, kind: StageKind = Stage) -> None:
+    def __init__(
+        self, source: Any, script: str | None, frames: FrameChoice = "none", kind: StageKind = Stage
+    ) -> None:
         """source: where observations come from, for `kind`; see `LocalStage`."""
-        self._settings = kind, (source, script, keep_ends)
+        self._settings = kind, (source, script, frames)
         self._start()
 
     def _start(self) -> None:

@@ -71,7 +71,7 @@ class Worker:
         if wanted is None:
             wanted = 2 * self._settings.batch if self._episodes >= WORTH_PROCESSES else 0
         kind = ProcessStage if position < wanted else LocalStage
-        stage: AskableStage = kind(self._settings.scene, self._controller.script, self._settings.frames == "ends")
+        stage: AskableStage = kind(self._settings.scene, self._controller.script, self._settings.frames)
         stack.callback(stage.close)
         return stage
 
@@ -111,10 +111,21 @@ class Worker:
             rollout.buffers.wait()
             with self._writer.location.in_words():
                 self._writer.write_certificate(self._controller.certificate())
-                self._writer.write(replace(rollout.record, pictures=dict(_pictures(rollout))))
+                self._writer.write(
+                    replace(rollout.record, pictures=self._pictures(rollout), frames=self._frame_count(rollout))
+                )
         finally:
             self._ring.give_back(rollout.buffers)
         return Done(rollout.planned.index, rollout.outcome)
+
+    def _pictures(self, rollout: Rollout) -> dict[str, bytes]:
+        """Content by key of what is kept for people."""
+        small = rollout.small_frames
+        kept = {thumbnail_key(rollout.planned.index): as_thumbnail(small, self._settings.frames)} if small else {}
+        return kept | (dict([_film(rollout)]) if rollout.frames else {})
+
+    def _frame_count(self, rollout: Rollout) -> int | None:
+        return len(rollout.small_frames) or None if self._settings.frames == "all" else None
 
     def _is_filmed(self, planned: PlannedRow) -> bool:
         return self._settings.films(planned.index)
@@ -134,14 +145,6 @@ def torch_threads(count: int | None) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _pictures(rollout: Rollout) -> Iterator[tuple[str, bytes]]:
-    """Key and content of what is kept for people."""
-    if rollout.ends:
-        yield thumbnail_key(rollout.planned.index), as_thumbnail(rollout.ends)
-    if rollout.frames:
-        yield _film(rollout)
 
 
 def _film(rollout: Rollout) -> tuple[str, bytes]:

@@ -22,6 +22,7 @@ from probe_kit.extract.settings import check_other_settings
 from probe_kit.extract.store.certificates import write_certificate
 from probe_kit.extract.store.format.arrays import at_extent, create_arrays
 from probe_kit.extract.store.format.commits import (
+    FRAME_COUNT,
     Commit,
     commit_key,
     read_commit,
@@ -59,7 +60,8 @@ class EpisodeRecord:
 
     arrays: by kind (`pooled`, `tokens`) and stream, each shaped like its row in the store.
     roles: per captured inference and stream, the spans of roles. trajectory: (T + 1, C) float32 frames.
-    instruction_ids: the instruction as the policy was delivered it. pictures: encoded, by key in the run.
+    instruction_ids: the instruction as the policy was delivered it. pictures: encoded, by key in the run. frames:
+    how many one of them holds, if it holds all of the episode.
     control_steps: of every inference, how many actions of the episode came before it; rising. seconds: what the
     episode took, which no hash of the run covers.
     """
@@ -73,6 +75,7 @@ class EpisodeRecord:
     pictures: Mapping[str, bytes] = field(default_factory=dict)
     control_steps: Sequence[int] = ()
     seconds: Seconds = field(default_factory=Seconds)
+    frames: int | None = None
 
 
 class RunWriter:
@@ -282,6 +285,7 @@ class RunWriter:
             "control_steps": [int(step) for step in episode.control_steps],
             "objects": {key: one.to_json() for key, one in store.sums.items()},
             "pictures": {key: one.to_json() for key, one in pictures.items()},
+            **({} if episode.frames is None else {FRAME_COUNT: episode.frames}),
         }
 
     def write_certificate(self, certificate: dict[str, Any]) -> None:

@@ -109,7 +109,7 @@ function frameAt(frames, now, steps) {
   return frames.count > 1 && now >= steps && steps > 0 ? 1 : 0;
 }
 function Film({ run, one, frames, now, steps, bare }) {
-  if (!frames) return html`<div class="film none">No picture of this episode is stored.${!bare && html` <code>--frames ends</code> stores two.`}</div>`;
+  if (!frames) return html`<div class="film none">No picture of this episode is stored.${!bare && html` <code>extract --frames all</code> stores every frame.`}</div>`;
   const i = frameAt(frames, now, steps), rows = Math.ceil(frames.count / frames.columns), at = (k, of) => (of > 1 ? `${(100 * k) / (of - 1)}%` : "0%");
   return html`<div class="film" role="img" data-frame=${i} aria-label=${`Camera picture at step ${now}`} style=${{ aspectRatio: `${frames.width} / ${frames.height}`, backgroundImage: `url("data/${run}/f/${numbered(one.number)}.webp")`, backgroundSize: `${100 * frames.columns}% ${100 * rows}%`, backgroundPosition: `${at(i % frames.columns, frames.columns)} ${at(Math.floor(i / frames.columns), rows)}` }}>
     ${!frames.all && !bare && html`<span class="stamp">${i ? "last" : "first"} frame${frames.count > 1 ? " of two stored" : ""}</span>`}</div>`;

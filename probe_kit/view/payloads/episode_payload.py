@@ -10,8 +10,8 @@ from PIL import Image
 from probe_kit.env.scoring.events import EVENTS, Events
 from probe_kit.env.scoring.rules import RULES, judge, rule_of
 from probe_kit.env.scoring.trajectory import Trajectory
-from probe_kit.extract.run_layout import CAPTURE_ONLY
-from probe_kit.extract.store.thumbnails import read_thumbnail
+from probe_kit.extract.run_layout import CAPTURE_ONLY, FRAME_COLUMNS
+from probe_kit.extract.store.thumbnails import read_sheet
 from probe_kit.view.frozen_probes import toward
 from probe_kit.view.payloads.coding import pack_floats, pack_log_odds
 from probe_kit.view.viewed_run import ViewedRun
@@ -75,12 +75,14 @@ def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
 
 def _frames(viewed: ViewedRun, number: int, row: dict[str, Any]) -> dict[str, Any] | None:
     """How the episode's picture is divided: `count` frames of one size in `columns`; None without a picture."""
-    picture = read_thumbnail(viewed.run.location, number)
-    if picture is None:
+    sheet = read_sheet(viewed.run.location, number)
+    if sheet is None:
         return None
-    width, height = Image.open(BytesIO(picture)).size
-    count = 1 if viewed.answers or row["outcome"] == CAPTURE_ONLY else 2
-    return {"count": count, "columns": count, "width": width // count, "height": height, "all": False}
+    count = sheet.count or (1 if viewed.answers or row["outcome"] == CAPTURE_ONLY else 2)
+    columns = min(count, FRAME_COLUMNS)
+    width, height = Image.open(BytesIO(sheet.content)).size
+    size = {"width": width // columns, "height": height // -(-count // columns)}
+    return {"count": count, "columns": columns, **size, "all": sheet.count is not None}
 
 
 def _trajectory(trajectory: Trajectory) -> dict[str, Any]:

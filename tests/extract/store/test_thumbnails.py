@@ -1,5 +1,6 @@
 """Thumbnails illustrate: they are there by default, whole, and change no number of a run."""
 
+import json
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -8,11 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from probe_kit.env import SceneSpec
-from probe_kit.extract import ExtractSettings, Run, extract_run
-from probe_kit.extract.store.frame_ends import HEIGHT
-from probe_kit.extract.store.thumbnails import read_thumbnail
-from probe_kit.suite import build_suite
+from probe_kit.env import Act2AnswerEnv, SceneSpec, ScriptedExpert
+from probe_kit.errors import RunDamagedError, UsageError
+from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, verify_run
+from probe_kit.extract.store.format.hashes import HASH, as_record
+from probe_kit.extract.store.small_frames import FILM_HEIGHT, HEIGHT
+from probe_kit.extract.store.thumbnails import as_thumbnail, decode_frames, read_sheet, read_thumbnail
+from probe_kit.suite import build_suite, load_suite
 from tests.support.episode_tables import without_seconds
 
 
@@ -51,6 +54,9 @@ def test_every_episode_keeps_its_first_and_last_frame(run: Run) -> None:
 def test_thumbnails_change_neither_numbers_nor_settings_and_can_be_left_out(
     settings: ExtractSettings, run: Run, tmp_path: Path
 ) -> None:
+    film = extract_run(replace(settings, frames="all"), tmp_path / "film")
+    assert film.settings_sha256 == run.settings_sha256
+    assert without_seconds(film.episodes).equals(without_seconds(run.episodes))
     bare = extract_run(replace(settings, frames="none"), tmp_path / "bare")
     assert bare.settings_sha256 == run.settings_sha256
     assert without_seconds(bare.episodes).equals(without_seconds(run.episodes))
@@ -75,3 +81,77 @@ def test_a_torn_thumbnail_of_a_killed_process_is_cleared(settings: ExtractSettin
     torn.write_bytes(b"RIFF")
     extract_run(settings, tmp_path / "run")
     assert not torn.exists()
+
+
+def different_frames(count: int) -> tuple[np.ndarray, ...]:
+    """Flat pictures of different shades; WebP keeps a flat shade to a few units."""
+    return tuple(np.full((240, 320, 3), 10 * number, np.uint8) for number in range(count))
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 16, 21])
+def test_a_sheet_gives_back_every_frame_in_order(count: int) -> None:
+    frames = different_frames(count)
+    decoded = decode_frames(as_thumbnail(frames, "all"), count)
+    assert [frame.shape for frame in decoded] == [(240, 320, 3)] * count
+    for before, behind in zip(frames, decoded, strict=True):
+        np.testing.assert_allclose(behind.astype(int), before, atol=5)
+
+
+@pytest.fixture(scope="module")
+def film_settings(settings: ExtractSettings) -> ExtractSettings:
+    return replace(settings, scene=SceneSpec(max_steps=8), frames="all", env_workers=0)
+
+
+@pytest.fixture(scope="module")
+def filmed(film_settings: ExtractSettings, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return extract_run(film_settings, tmp_path_factory.mktemp("filmed") / "run")
+
+
+def test_all_frames_are_those_that_the_environment_draws_in_the_same_episode(
+    filmed: Run, film_settings: ExtractSettings
+) -> None:
+    row = filmed.episodes.iloc[1]
+    sheet = read_sheet(filmed.location, int(row["episode"]))
+    assert sheet is not None
+    assert sheet.count == row["steps"] + 1 == 9
+    frames = decode_frames(sheet.content, sheet.count)
+    assert film_settings.suite is not None
+    item = next(one for one in load_suite(film_settings.suite).items if one.item_id == row["item_id"])
+    env = Act2AnswerEnv(film_settings.scene)
+    env.reset(seed=int(row["scene_seed"]), options={"item": item, "layout": row["layout"]})
+    expert = ScriptedExpert(env)
+    expert.reset()
+    for number in range(len(frames)):
+        if number:
+            env.advance(expert.act())
+        assert np.abs(env.render_small(FILM_HEIGHT).astype(int) - frames[number]).mean() < 2
+        shrunk = np.asarray(Image.fromarray(env.render()).reduce(2), int)
+        errors = [np.abs(shrunk - other).mean() for other in frames]
+        assert errors[number] < min(errors) + 0.1 < 4, "the picture that a policy gets, half as high"
+    env.close()
+
+
+def test_reports_take_first_and_last_frame_out_of_a_sheet(filmed: Run) -> None:
+    sheet = read_sheet(filmed.location, 0)
+    assert sheet is not None
+    assert sheet.count is not None
+    frames = decode_frames(sheet.content, sheet.count)
+    for half, frame in zip(halves(filmed, 0), (frames[0], frames[-1]), strict=True):
+        assert np.abs(half - np.asarray(Image.fromarray(frame).reduce(2), int)).mean() < 4
+
+
+def test_a_commit_with_another_number_of_frames_is_damage(filmed: Run) -> None:
+    path = filmed.path / "commits" / "00000001.json"
+    stored = path.read_bytes()
+    commit = json.loads(stored)
+    del commit[HASH]
+    path.write_bytes(as_record({**commit, "frames": 0}))
+    with pytest.raises(RunDamagedError, match="0 as the number of its frames"):
+        open_run(filmed.path)
+    path.write_bytes(stored)
+    assert verify_run(filmed.path, deep=True).ok
+
+
+def test_a_film_that_no_webp_can_hold_is_refused() -> None:
+    with pytest.raises(UsageError, match="at most 544 frames"):
+        ExtractSettings("idle", scene=SceneSpec(max_steps=544), frames="all")

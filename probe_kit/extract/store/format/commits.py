@@ -36,6 +36,8 @@ WITH_CONTROL_STEPS = 4
 """The first schema whose commits hold the control step of every inference."""
 _WITH_PLANS = 5
 """The first schema whose commits name the plan record that added their episode."""
+FRAME_COUNT = "frames"
+"""In a commit: how many frames its picture holds, where it holds all of the episode."""
 _NUMBERED = re.compile(r"([0-9]{8})\.json")
 _PROVENANCE = re.compile(r"[0-9a-f]{16}")
 
@@ -139,6 +141,9 @@ def _problems(root: Root, number: int, commit: Commit) -> Iterator[str]:
         yield "has other instruction ids than numbers"
     if problem := _control_step_problem(commit):
         yield problem
+    count = commit.get(FRAME_COUNT, 1)
+    if type(count) is not int or count < 1:
+        yield f"says {count!r} as the number of its frames"
     needed = {object_key(array, number, axes) for array, axes in root.arrays.items()}
     trajectory = object_key(TRAJECTORY, number, TRAJECTORY_AXES)
     if lost := sorted(needed - {*commit["objects"]}):
@@ -207,8 +212,8 @@ def pictures_of(commit: Commit) -> dict[str, Sum] | None:
     return read_sums(commit["pictures"]) if "pictures" in commit else None
 
 
-def read_pictures(location: Location, number: int) -> dict[str, Sum] | None:
-    """The same from the commit as it is stored; None also where there is no commit. Raises RunDamagedError."""
+def read_own_commit(location: Location, number: int) -> Commit | None:
+    """The commit of one episode as it is stored, pictures checked; None without any. Raises RunDamagedError."""
     key = commit_key(number)
     name = f"{location}/{key}"
     try:
@@ -216,7 +221,7 @@ def read_pictures(location: Location, number: int) -> dict[str, Sum] | None:
     except FileNotFoundError:
         return None
     _check_pictures(commit, name, redo(number))
-    return pictures_of(commit)
+    return commit
 
 
 def _check_pictures(commit: Commit, name: str, advice: str) -> None:

@@ -1,0 +1,20 @@
+"""Small copies of an episode's frames, kept for people. Simulating processes import this, no array store."""
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+HEIGHT = 120
+"""Pixels, where first and last frame are kept; a pair of 4:3 frames is 320 wide and takes about 2 kB."""
+FILM_HEIGHT = 240
+"""Pixels, where every frame is kept; one takes about 6 kB."""
+
+SmallFrames = tuple[NDArray[np.uint8], ...]
+"""(h, w, 3) uint8 each: the first and last frame, the first alone where nothing moved, or every one."""
+
+
+def shrink(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A frame (H, W, 3) uint8 at `HEIGHT`."""
+    height, width, _ = frame.shape
+    size = (round(width * HEIGHT / height), HEIGHT)
+    return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS))
