@@ -20,7 +20,15 @@ from probe_kit.env.scoring.rules import RULES
 from probe_kit.env.spec import PRESETS
 from probe_kit.extract.command_options import Size, Sizes
 from probe_kit.extract.protocols import SCENES
-from probe_kit.extract.run_layout import AskTokens, Codec, ExportFormat, FrameChoice, Tokens, VideoChoice
+from probe_kit.extract.run_layout import (
+    AskTokens,
+    Codec,
+    ExportFormat,
+    FrameChoice,
+    LaterViews,
+    Tokens,
+    VideoChoice,
+)
 from probe_kit.extract.settings import SCENE_OPTIONS, AskSettings, ExtractSettings
 from probe_kit.extract.store.export import WRITERS
 from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
@@ -59,6 +67,7 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("extract", "--dtype"): get_args(Dtype),
     ("extract", "--tokens"): get_args(Tokens),
     ("extract", "--frames"): get_args(FrameChoice),
+    ("extract", "--later-views"): get_args(LaterViews),
     ("extract", "--video"): get_args(VideoChoice),
     ("extract", "--codec"): get_args(Codec),
     ("extract", "--rendering"): get_args(Rendering),

@@ -10,7 +10,7 @@ import typer
 from probe_kit._terminal.console import whole_number
 from probe_kit._terminal.options import Names, choices, further_option, read_size, some_of, speed_option
 from probe_kit.errors import UsageError
-from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, Tokens, VideoChoice
+from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, LaterViews, Tokens, VideoChoice
 from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.hooks import family as hook_family
 from probe_kit.hooks.contract.protocol import ProtocolName, Rotation
@@ -74,6 +74,14 @@ def _batch(text: str | int) -> int | str:
     if number is None and text != "auto":
         raise UsageError(f"--batch {text!r} is neither a whole number nor auto")
     return "auto" if number is None else number
+
+
+def _captured_calls(text: str | int) -> int | str:
+    """A number of inferences, or `all`. Raises UsageError for anything else."""
+    number = whole_number(str(text))
+    if number is None and text != "all":
+        raise UsageError(f"--captured-calls {text!r} is neither a whole number nor all")
+    return "all" if number is None else number
 
 
 # -- most used ----------------------------------------------------------------------------------------------
@@ -220,7 +228,20 @@ AskStoredTokens = Annotated[
     ),
 ]
 CapturedCalls = Annotated[
-    int, _storage_option("--captured-calls", help="Number of inferences captured per episode.")
+    object,
+    _storage_option(
+        "--captured-calls",
+        parser=_captured_calls,
+        metavar="N|all",
+        help="Number of inferences captured per episode. all: as many as an episode can have.",
+    ),
+]
+LaterViewsKept = Annotated[
+    LaterViews,
+    _storage_option(
+        "--later-views",
+        help="mean: of the inferences after the first, store the view mean alone, in bfloat16 (small).",
+    ),
 ]
 Frames = Annotated[
     FrameChoice,

@@ -35,6 +35,7 @@ def extract(
     label: own.Label = None,
     tokens: own.StoredTokens = "pooled",
     captured_calls: own.CapturedCalls = 1,
+    later_views: own.LaterViewsKept = "all",
     frames: own.Frames = "ends",
     video: own.Video = "none",
     codec: own.StorageCodec = "zstd",

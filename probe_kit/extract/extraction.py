@@ -166,7 +166,8 @@ def prepare(
         # This process only plans; the GPUs belong to the workers.
         here = replace(settings, device="cpu", calibrate=False)  # each worker calibrates on its own device
         planned = load(here, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
-        return Extraction(settings, planned.plan, planned.card, None, declared=planned.declared)
+        chosen = replace(planned.settings, device=settings.device, calibrate=settings.calibrate)
+        return Extraction(chosen, planned.plan, planned.card, None, declared=planned.declared)
     prepared = load(settings, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
     return Extraction(**{field.name: getattr(prepared, field.name) for field in fields(prepared)})
 

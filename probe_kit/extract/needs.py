@@ -28,13 +28,13 @@ def space_needed(plan: RowPlan, settings: RunSettings) -> dict[str, int]:
 
 def space_of(streams: Sequence[StoredStream], episodes: int, settings: RunSettings) -> dict[str, int]:
     """The same for a number of episodes that store these streams."""
-    calls, with_tokens = int(getattr(settings, "captured_calls", 1)), settings.tokens == "all"
+    calls, later, with_tokens = settings.stored_calls, settings.stored_later, settings.tokens == "all"
     films = {"all": episodes, "first": 1}.get(str(getattr(settings, "video", "none")), 0)
     pictures = {"none": 0, "ends": THUMBNAILS, "all": FRAME * (settings.scene.max_steps + 1)}[settings.frames]
     sites = sum(len(stream.stream.sites()) for stream in streams)
     return {
-        "activations": sum(stream.raw_bytes(with_tokens) for stream in streams) * calls * episodes,
-        "columns": sum(stream.raw_bytes(False) for stream in streams) * calls * episodes,
+        "activations": sum(stream.raw_bytes(with_tokens, calls, later) for stream in streams) * episodes,
+        "columns": sum(stream.raw_bytes(False, calls, later) for stream in streams) * episodes,
         "episodes": episodes * (EPISODE + pictures) + films * FILM,
         "probes": sites * episodes * DECISION,
         "report": REPORT if streams else 0,

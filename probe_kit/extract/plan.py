@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Any, Protocol, Self
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.run_layout import LaterViews, StoredStream
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.suite import Episode, Suite
 from probe_kit.suite.ladder import Wording, in_words
@@ -256,12 +256,13 @@ def instructions_of(episodes: Iterable[PlannedEpisode]) -> tuple[str, ...]:
 def make_plan(
     suite: Suite, streams: list[StoredStream], seed: int, calls: int, with_tokens: bool,
     wordings: Sequence[Wording] | None = None, asked_objects: Mapping[str, str] = {},
+    later_views: LaterViews = "all",
 ) -> Plan:  # fmt: skip
     """Plan every episode of `suite`. Raises UsageError for a wording that no item has."""
     episodes = tuple(plan_episodes(suite, seed, wordings, asked_objects))
-    per_call = sum(stream.raw_bytes(with_tokens) for stream in streams)
+    size = sum(stream.raw_bytes(with_tokens, calls, later_views) for stream in streams)
     skipped = None if wordings is None else skipped_items(suite, episodes, wordings)
-    return Plan(episodes, tuple(streams), per_call * calls * len(episodes), suite, skipped)
+    return Plan(episodes, tuple(streams), size * len(episodes), suite, skipped)
 
 
 def skipped_items(

@@ -1,6 +1,6 @@
 """Preparation of an extraction: finds the suite, loads the model, plans the episodes. Writes nothing."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, Po
 from probe_kit.extract.rollout.examples import check_unfit, example_observations
 from probe_kit.extract.rollout.preflight import run_preflight
 from probe_kit.extract.rollout.settings_checks import check_embodiment, check_meaningless, check_unreachable
+from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import provenance_here
@@ -109,21 +110,29 @@ def load(
         skipped_items(suite, asked, wordings)
     if policy is None:
         _check_instructions(settings, instructions_of(asked), fetch)
-    with_tokens = settings.tokens == "all"
     if not fetch and (streams := declared_streams(settings)) is not None:
-        plan = make_plan(suite, streams, settings.seed, settings.stored_calls, with_tokens, wordings, objects)
+        if isinstance(settings, ExtractSettings):
+            settings = settings.with_every_call(settings.execute or 1)  # a model may execute more
+        plan = _plan(suite, streams, settings, objects)
         return Prepared(settings, plan, _declared_card(settings), None, declared=True)
     if isinstance(settings, AskSettings):
         controller: ActingController | AnswerController = _asking(settings, suite, answer_model)
     else:
         controller = _acting(settings, instructions_of(asked), policy)
-    plan = make_plan(
-        suite, controller.streams, settings.seed, settings.stored_calls, with_tokens, wordings, objects
-    )
+    if isinstance(settings, ExtractSettings) and isinstance(controller, PolicyController):
+        settings = settings.with_every_call(controller.execute)
+    plan = _plan(suite, controller.streams, settings, objects)
     if settings.calibrate and isinstance(controller, PolicyController):
         settings, calibration = calibrated(settings, controller, plan)
         return Prepared(settings, plan, controller.identity, controller, calibration)
     return Prepared(settings, plan, controller.identity, controller)
+
+
+def _plan(suite: Suite, streams: list[StoredStream], settings: RunSettings, objects: Mapping[str, str]) -> Plan:
+    return make_plan(
+        suite, streams, settings.seed, settings.stored_calls, settings.tokens == "all", settings.asked_wordings,
+        objects, settings.stored_later,
+    )  # fmt: skip
 
 
 def as_protocol(settings: RunSettings) -> RunSettings:
@@ -221,7 +230,7 @@ def _acting(settings: RunSettings, instructions: Sequence[str], loaded: "Policy 
         settings.model,
         examples,
         settings.execute,
-        settings.captured_calls,
+        settings.with_every_call(settings.execute or policy.card.execute).stored_calls,
         settings.tokens == "all",
         settings.edits,
         settings.vectors,

@@ -9,7 +9,7 @@ RUN/
   times/<n>.json     seconds that an episode took, which no other hash covers, see `seconds`
   failed/<n>.json    why an episode was given up; removed when it is tried again
   certificate.json   what was really loaded, and what was checked
-  data.zarr/         <stream>/pooled and, with --tokens all, <stream>/tokens
+  data.zarr/         <stream>/pooled; with --tokens all <stream>/tokens; with --later-views mean <stream>/later
   columns.zarr/      the pooled rows again, by site and view; derived, see `columns`
   sealed/<stamp>.json  hashes of the columns, and of which commits they were made
   probes/            results of `probe-kit train`
@@ -51,6 +51,13 @@ CODECS: tuple[Codec, ...] = get_args(Codec)
 Tokens = Literal["pooled", "all"]
 AskTokens = Literal["none", "pooled", "all"]
 """What is stored of the streams: nothing, the pooled views, or these and every token."""
+LaterViews = Literal["all", "mean"]
+"""Pooled views that are stored of the inferences after the first."""
+MEAN_VIEW, LATER = "mean", "later"
+"""The view that later inferences keep with `mean`, and the array that holds it."""
+VectorKind = Literal["pooled", "later"]
+ArrayKind = Literal["pooled", "later", "tokens"]
+"""Arrays of a stream: those with a vector per view, and all."""
 VideoChoice = Literal["none", "first", "all"]
 """Episodes of which a GIF is stored."""
 FrameChoice = Literal["ends", "all", "none"]
@@ -175,14 +182,15 @@ class StoredStream:
         """Index of `site` in the lead axes."""
         return (site.layer,) if site.iteration is None else (site.iteration, site.layer)
 
-    def arrays(self, with_tokens: bool) -> dict[str, int]:
+    def arrays(self, with_tokens: bool, later_views: str = "all") -> dict[str, int]:
         """Number of axes of every array in `data.zarr` that holds this stream."""
         axes = 2 + len(self.lead) + 2  # episode and call before, token or view and feature behind
-        kinds = ("pooled", "tokens") if with_tokens else ("pooled",)
-        return {f"{self.name}/{kind}": axes for kind in kinds}
+        kinds = {"pooled": axes, **({"tokens": axes} if with_tokens else {})}
+        later = {LATER: axes - 1} if later_views == MEAN_VIEW else {}
+        return {f"{self.name}/{kind}": count for kind, count in (kinds | later).items()}
 
-    def raw_bytes(self, with_tokens: bool) -> int:
-        """Uncompressed bytes of one captured inference."""
+    def raw_bytes(self, with_tokens: bool, calls: int = 1, later_views: LaterViews = "all") -> int:
+        """Uncompressed bytes of the captured inferences of an episode."""
         cells = int(np.prod(self.lead)) * self.width
-        pooled = cells * len(self.views) * 4
-        return pooled + (cells * self.tokens * 2 if with_tokens else 0)
+        one = cells * len(self.views) * 4 + (cells * self.tokens * 2 if with_tokens else 0)
+        return one * calls if later_views == "all" else one + cells * 2 * (calls - 1)

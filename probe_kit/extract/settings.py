@@ -8,7 +8,15 @@ from typing import Any, ClassVar, Literal, Self, get_args
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.extract.protocols import has_network, protocol_identity, protocol_row, scene_of
-from probe_kit.extract.run_layout import MOST_FRAMES, AskTokens, Codec, FrameChoice, Tokens, VideoChoice
+from probe_kit.extract.run_layout import (
+    MOST_FRAMES,
+    AskTokens,
+    Codec,
+    FrameChoice,
+    LaterViews,
+    Tokens,
+    VideoChoice,
+)
 from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.extract.vqa.templates import P1, Template, find_template
 from probe_kit.hashing import sha256_json
@@ -34,6 +42,7 @@ _ELSEWHERE = {
     "capture_only",
     "protocol",
     "rotation",
+    "later_views",
 }
 _MOST = {
     "captured_calls": 10_000,
@@ -211,6 +220,11 @@ class RunSettings:
         return 1
 
     @property
+    def stored_later(self) -> LaterViews:
+        """Pooled views that are stored of the inferences after the first."""
+        return "all"
+
+    @property
     def asked_wordings(self) -> tuple[Wording, ...] | None:
         """The wordings that every item is asked in, None for its own words alone."""
         return None
@@ -231,7 +245,9 @@ class ExtractSettings(RunSettings):
     `idle`.
 
     wordings: names of `suite.ladder`, each a condition of the run; None for the items' own words alone.
-    captured_calls: policy inferences captured per episode, from the first on.
+    captured_calls: policy inferences captured per episode, from the first on; `all` is as many as an episode can
+    have, once the model is known.
+    later_views: `mean` stores of the inferences after the first the view `mean` alone, in bfloat16.
     execute: actions executed per inference; None for the policy's own.
     rotation: what reaches the controller as the rotation of an action, see `ProtocolRow`; None for the protocol's,
     or its angles as they are.
@@ -243,7 +259,8 @@ class ExtractSettings(RunSettings):
     """
 
     wordings: tuple[Wording, ...] | None = None
-    captured_calls: int = 1
+    captured_calls: int | Literal["all"] = 1
+    later_views: LaterViews = "all"
     execute: int | None = None
     rotation: Rotation | None = None
     capture_only: bool = False
@@ -255,12 +272,26 @@ class ExtractSettings(RunSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_one_of("video", get_args(VideoChoice))
-        self._check_at_least("captured_calls", 1)
+        if self.captured_calls != "all":
+            self._check_at_least("captured_calls", 1)
+        self._check_later_views()
         self._check_at_least("execute", 1)
         if self.rotation is not None:
             self._check_one_of("rotation", ROTATIONS)
         if self.wordings is not None:
             check_wordings(self.wordings)
+
+    def _check_later_views(self) -> None:
+        self._check_one_of("later_views", get_args(LaterViews))
+        if self.later_views == "all":
+            return
+        if self.captured_calls == 1:
+            raise UsageError(
+                "--later-views mean is about inferences after the first, and the first alone is captured; add "
+                "--captured-calls all, or a number"
+            )
+        if self.tokens == "all":
+            raise UsageError("--later-views mean and --tokens all contradict each other; leave one out")
 
     @classmethod
     def _calibrates_by_default(cls, model: str, given: Mapping[str, Any]) -> bool:
@@ -273,7 +304,18 @@ class ExtractSettings(RunSettings):
         capture_only_part = {"capture_only": True} if self.capture_only else {}
         edits = {"edits": [edit.to_json() for edit in self.edits]} if self.edits else {}
         rotation = {} if self.rotation in (None, PLAIN) else {"rotation": self.rotation}
-        return super().choices() | capture_only_part | rotation | edits
+        later = {} if self.later_views == "all" else {"later_views": self.later_views}
+        return super().choices() | capture_only_part | rotation | edits | later
+
+    def most_inferences(self, execute: int) -> int:
+        """Inferences that an episode can have with `execute` actions per inference."""
+        return -(-self.scene.max_steps // max(1, execute))
+
+    def with_every_call(self, execute: int) -> Self:
+        """The settings with a number in place of `captured_calls` `all`."""
+        return (
+            self if self.captured_calls != "all" else replace(self, captured_calls=self.most_inferences(execute))
+        )
 
     def followed(self) -> Self:
         """The settings with all that was not given as their protocol has it for the model; scripts get its scene.
@@ -298,8 +340,15 @@ class ExtractSettings(RunSettings):
 
     @property
     def stored_calls(self) -> int:
-        """As many as were asked for."""
+        """As many as were asked for. Raises UsageError for `all`, of which the number is not known yet."""
+        if self.captured_calls == "all":
+            raise UsageError("captured_calls is 'all', which has no number before the model is loaded")
         return self.captured_calls
+
+    @property
+    def stored_later(self) -> LaterViews:
+        """Those that were asked for."""
+        return self.later_views
 
     @property
     def asked_wordings(self) -> tuple[Wording, ...] | None:

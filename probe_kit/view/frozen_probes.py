@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.extract import Run
+from probe_kit.extract.run_layout import MEAN_VIEW
+from probe_kit.extract.store.format.arrays import decode_bfloat16
 from probe_kit.extract.store.format.rows import Rows
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import resolve_view
@@ -24,8 +26,8 @@ Values = NDArray[np.float64]
 class EpisodeLogOdds:
     """values: (K, S) log-odds that the correct side is the answer, by captured inference and site.
 
-    held_out: whether no probe that gave them was trained on the episode's item. NaN where the probe's view is one
-    of tokens, or the activations are left out, and the inference is a later one.
+    held_out: whether no probe that gave them was trained on the episode's item. NaN where the inference is a later
+    one, and its activations are left out, or lack the view of the probe.
     """
 
     values: Values
@@ -79,15 +81,25 @@ class FrozenProbes:
             found[:1] = self.decisions(str(row["episode_id"]), side)
             return EpisodeLogOdds(found, fold is not None)
         for stream, probes in self._streams.items():
-            features = self._rows[stream][position][:calls]
-            index: tuple[Any, ...] = (slice(None), *probes.at, probes.view)
-            own = features[index].astype(np.float64)
+            own = self._features(stream, probes, position, calls)
             if fold is None:
                 values = (np.einsum("ksd,sfd->ksf", own, probes.weights) + probes.intercepts).mean(axis=-1)
             else:
                 values = np.einsum("ksd,sd->ks", own, probes.weights[:, fold]) + probes.intercepts[:, fold]
             found[:, probes.places] = values * toward(side)
         return EpisodeLogOdds(found, fold is not None)
+
+    def _features(self, stream: str, probes: _StreamProbes, position: int, calls: int) -> Values:
+        """(K, S, D) of the view at every captured inference; NaN where the view is not stored of it."""
+        sites: tuple[Any, ...] = (slice(None), *probes.at)
+        first: Values = self._rows[stream][position][:calls][(*sites, probes.view)].astype(np.float64)
+        if len(first) == calls:
+            return first
+        further = np.full((calls - 1, *first.shape[1:]), np.nan)
+        if self._view == MEAN_VIEW:
+            kept = decode_bfloat16(self.run.rows(stream, "later")[position][: calls - 1])
+            further = kept[sites].astype(np.float64)
+        return np.concatenate([first, further])
 
     @property
     def _reads_activations(self) -> bool:

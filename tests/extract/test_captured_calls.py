@@ -1,19 +1,40 @@
 """Several captured inferences per episode: an axis of its own, also where episodes end early."""
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+import torch
+from safetensors import safe_open
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
-from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UnknownSiteError, UsageError
-from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepare, seal, verify_run
+from probe_kit.errors import (
+    ActivationsLeftOutError,
+    TooFewGroupsError,
+    UnbalancedEpisodesError,
+    UnknownSiteError,
+    UsageError,
+)
+from probe_kit.extract import (
+    ExtractSettings,
+    Run,
+    copy_run,
+    export_run,
+    extract_run,
+    open_run,
+    prepare,
+    seal,
+    verify_run,
+)
 from probe_kit.extract.plan import make_plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
-from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.run_layout import LaterViews, StoredStream
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Site
@@ -37,28 +58,111 @@ def inferences_of(number: int) -> int:
 pytestmark = pytest.mark.filterwarnings("ignore:.*is not sealed")
 
 
-@pytest.fixture(scope="module")
-def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
+def write_run(where: Path, suite: Suite, later_views: LaterViews = "all") -> Run:
     """48 episodes; features of inference c are noise around 10 c, and name the answer from the second on."""
+    with_tokens = later_views == "all"
     settings = {
-        "captured_calls": CALLS, "tokens": "all", "codec": "zstd", "model": "synthetic", "random_weights": False,
-        "weights_sha256": None, "suite": {"identity": small_suite.identity},
+        "captured_calls": CALLS, "tokens": "all" if with_tokens else "pooled", "codec": "zstd",
+        "model": "synthetic", "random_weights": False, "weights_sha256": None,
+        "suite": {"identity": suite.identity}, **({} if with_tokens else {"later_views": later_views}),
     }  # fmt: skip
-    plan = make_plan(small_suite, [STREAM], 0, CALLS, True)
-    writer = RunWriter(locate(tmp_path_factory.mktemp("calls") / "run"), plan, settings)
+    plan = make_plan(suite, [STREAM], 0, CALLS, with_tokens, later_views=later_views)
+    writer = RunWriter(locate(where), plan, settings)
     for planned in plan.episodes:
         draw = np.random.default_rng(planned.index)
-        buffers = EpisodeBuffers([STREAM], CALLS, True, pinned=False)
+        buffers = EpisodeBuffers([STREAM], CALLS, with_tokens, False, later_views)
         for call in range(inferences_of(planned.index)):
             values = draw.normal(size=(2, 3, 8)) + 10 * call
             values[..., 0] += 3 * (call > 0) * (planned.episode.side_correct == "left")
-            buffers.pooled["backbone"][call] = values
-            buffers.tokens["backbone"][call] = 0x3F80 + call
             buffers.roles.append({"backbone": [("language", 0, 4), ("padding", 4, 6)]})
+            buffers.keep_pooled("backbone", torch.from_numpy(values.astype(np.float32)))
+            if with_tokens:
+                buffers.tokens["backbone"][call] = 0x3F80 + call
         outcome = {"outcome": "oob", "side_placed": "none", "cube_x": 0.0, "cube_y": 0.0}
         steps = range(len(buffers.roles))
         writer.write(Rollout(planned, outcome, buffers, [], control_steps=steps).record)
     return open_run(writer.location)
+
+
+@pytest.fixture(scope="module")
+def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return write_run(tmp_path_factory.mktemp("calls") / "run", small_suite)
+
+
+@pytest.fixture(scope="module")
+def mean_run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """The same numbers, of which later inferences keep the mean alone."""
+    return write_run(tmp_path_factory.mktemp("mean") / "run", small_suite, "mean")
+
+
+def in_bfloat16(values: np.ndarray) -> np.ndarray:
+    return torch.from_numpy(values).to(torch.bfloat16).to(torch.float32).numpy()
+
+
+@pytest.mark.parametrize("sealed", [False, True])
+def test_later_inferences_that_keep_the_mean_have_it_in_bfloat16(run: Run, mean_run: Run, sealed: bool) -> None:
+    if sealed:
+        seal(mean_run.location)
+    mean_run = open_run(mean_run.location)
+    assert mean_run.sealed == sealed
+    for view in STREAM.views:
+        np.testing.assert_array_equal(mean_run.column(SITE, view), run.column(SITE, view))
+    for call in range(1, CALLS):
+        np.testing.assert_array_equal(
+            mean_run.column(SITE, "mean", call), in_bfloat16(run.column(SITE, "mean", call))
+        )
+        assert mean_run.views("backbone", call) == ("mean",)
+        with pytest.raises(UnknownSiteError, match=f"'last' of backbone at inference {call}.*stored: mean"):
+            mean_run.column(SITE, "last", call)
+    assert verify_run(mean_run.location, deep=True).ok
+    assert mean_run.xarray()["backbone_pooled"].sizes["call"] == 1
+
+
+@pytest.mark.filterwarnings("ignore:.*classes are not balanced")
+def test_probes_of_later_inferences_read_the_mean_and_no_other_view(mean_run: Run) -> None:
+    assert train_probes(mean_run, ("color",), permutations=0, call=1, controls=()).scores["accuracy"].max() > 0.85
+    with pytest.raises((UsageError, UnknownSiteError), match="last"):
+        train_probes(mean_run, ("color",), ("last",), permutations=0, call=1, controls=())
+
+
+def test_an_export_and_a_copy_know_of_later_inferences_that_keep_the_mean(mean_run: Run, tmp_path: Path) -> None:
+    with safe_open(export_run(mean_run.location, "safetensors", tmp_path / "one"), framework="numpy") as file:
+        assert file.get_slice("backbone.pooled").get_shape() == [48, 1, 2, 3, 8]
+        assert file.get_slice("backbone.later").get_shape() == [48, 2, 2, 8]
+    table = pd.read_parquet(export_run(mean_run.location, "parquet", tmp_path / "two"))
+    rows = table[(table["call"] == 2) & (table["site"] == str(SITE))]
+    assert set(rows["view"]) == {"mean"}
+    np.testing.assert_array_equal(np.stack(rows["vector"]), mean_run.column(SITE, "mean", 2))
+    copy = copy_run(mean_run.location, tmp_path / "copy")
+    with pytest.raises(ActivationsLeftOutError):
+        copy.column(SITE, "mean", 2)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"later_views": "mean"}, "the first alone is captured"),
+        ({"later_views": "mean", "captured_calls": 3, "tokens": "all"}, "contradict"),
+        ({"later_views": "last", "captured_calls": 3}, "all, mean"),
+    ],
+)
+def test_a_view_of_later_inferences_that_cannot_be_kept_is_refused(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        ExtractSettings("pi0-tiny", **options)
+
+
+def test_all_inferences_are_as_many_as_an_episode_can_have() -> None:
+    settings = ExtractSettings("pi0-tiny", scene=SceneSpec(max_steps=5), captured_calls="all")
+    assert [settings.with_every_call(execute).stored_calls for execute in (1, 2, 5, 8)] == [5, 3, 1, 1]
+    assert replace(settings, captured_calls=4).with_every_call(2).stored_calls == 4
+    with pytest.raises(UsageError, match="before the model is loaded"):
+        _ = settings.stored_calls
+
+
+def test_bytes_of_a_run_count_what_later_inferences_keep() -> None:
+    cells = STREAM.layers * STREAM.width
+    assert STREAM.raw_bytes(False, CALLS) == CALLS * cells * 3 * 4
+    assert STREAM.raw_bytes(False, CALLS, "mean") == cells * 3 * 4 + (CALLS - 1) * cells * 2
 
 
 @pytest.mark.parametrize("sealed", [False, True])
@@ -152,6 +256,11 @@ def test_a_real_policy_is_captured_at_every_inference(small_suite: Suite, tmp_pa
     assert run.reached(1).all()
     assert np.isfinite(run.column(site, "mean", 1)).all()
     assert (run.column(site, "mean", 0) != run.column(site, "mean", 1)).any()
+    every = extract_run(replace(settings, captured_calls="all"), tmp_path / "every")
+    assert every.settings_sha256 == run.settings_sha256
+    np.testing.assert_array_equal(every.column(site, "mean", 1), run.column(site, "mean", 1))
+    fewer = extract_run(replace(settings, captured_calls="all", later_views="mean"), tmp_path / "fewer")
+    np.testing.assert_array_equal(fewer.column(site, "mean", 1), in_bfloat16(run.column(site, "mean", 1)))
 
 
 def test_more_inferences_than_an_episode_can_have_are_refused(small_suite: Suite) -> None:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.run_layout import MEAN_VIEW, LaterViews, StoredStream
+from probe_kit.extract.store.format.arrays import NOT_A_NUMBER
 
 if TYPE_CHECKING:
     import torch
@@ -23,13 +24,25 @@ class EpisodeBuffers:
     pooled: (S, *lead, V, D) float32 per stream, NaN where nothing was captured.
     tokens: (S, *lead, T, D) uint16 bits of bfloat16 per stream, zero where there is no token; empty if only
     views are stored.
+    later: (S - 1, *lead, D) uint16 bits of bfloat16 per stream, the view `mean` of the inferences after the first;
+    empty unless they keep that view alone, and pooled then holds the first one.
     roles: per captured inference and stream, the spans of roles.
     pinned: page-locked memory, into which a GPU copies while it computes on.
     """
 
-    def __init__(self, streams: Sequence[StoredStream], calls: int, with_tokens: bool, pinned: bool) -> None:
+    def __init__(
+        self, streams: Sequence[StoredStream], calls: int, with_tokens: bool, pinned: bool,
+        later_views: LaterViews = "all",
+    ) -> None:  # fmt: skip
+        full = calls if later_views == "all" else 1
+        self.later: dict[str, NDArray[np.uint16]] = {
+            s.name: _memory((calls - 1, *s.lead, s.width), np.uint16, pinned)
+            for s in streams
+            if later_views == MEAN_VIEW
+        }
+        self._mean_of = {s.name: s.views.index(MEAN_VIEW) for s in streams if s.name in self.later}
         self.pooled: dict[str, NDArray[np.float32]] = {
-            s.name: _memory((calls, *s.lead, len(s.views), s.width), np.float32, pinned) for s in streams
+            s.name: _memory((full, *s.lead, len(s.views), s.width), np.float32, pinned) for s in streams
         }
         self.tokens: dict[str, NDArray[np.uint16]] = {
             s.name: _memory((calls, *s.lead, s.stored_tokens, s.width), np.uint16, pinned)
@@ -46,14 +59,23 @@ class EpisodeBuffers:
             pooled.fill(np.nan)
         for tokens in self.tokens.values():
             tokens.fill(0)
+        for later in self.later.values():
+            later.fill(NOT_A_NUMBER)
 
     def keep_roles(self, roles: "dict[str, Roles]") -> None:
         """Begin the next captured inference."""
         self.roles.append({name: [(s.role, s.start, s.stop) for s in own.spans] for name, own in roles.items()})
 
     def keep_pooled(self, stream: str, values: "Tensor") -> None:
-        """Copy (*lead, V, D) of the last inference begun."""
-        self._copy(values, self.pooled[stream][len(self.roles) - 1])
+        """Copy (sites, V, D) of the last inference begun, or what is stored of it."""
+        import torch
+
+        call = len(self.roles) - 1
+        if call and stream in self.later:
+            bits = values[..., self._mean_of[stream], :].to(torch.bfloat16).view(torch.int16)
+            self._copy(bits, self.later[stream][call - 1].view(np.int16))
+        else:
+            self._copy(values, self.pooled[stream][call])
 
     def keep_tokens(self, stream: str, bits: "Tensor") -> None:
         """Copy (*lead, T, D) int16 bit patterns of the last inference begun; behind them come zeros.

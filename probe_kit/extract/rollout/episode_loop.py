@@ -14,6 +14,7 @@ from probe_kit.extract.rollout.controllers import ActingController, Turn
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.events import traceback_of
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, StageRequest
+from probe_kit.extract.run_layout import LATER
 from probe_kit.extract.store.seconds import Seconds
 from probe_kit.extract.store.small_frames import SmallFrames
 from probe_kit.extract.store.writer import EpisodeRecord
@@ -43,7 +44,9 @@ class Rollout:
     def record(self) -> EpisodeRecord:
         """What of it the run stores."""
         buffers = self.buffers
-        arrays: dict[str, dict[str, NDArray[Any]]] = {"pooled": {**buffers.pooled}, "tokens": {**buffers.tokens}}
+        arrays: dict[str, dict[str, NDArray[Any]]] = {
+            "pooled": {**buffers.pooled}, "tokens": {**buffers.tokens}, LATER: {**buffers.later},
+        }  # fmt: skip
         return EpisodeRecord(
             self.planned, self.outcome, arrays, buffers.roles, self.trajectory, self.instruction_ids,
             control_steps=self.control_steps, seconds=self.seconds,

@@ -83,8 +83,8 @@ def check_unreachable(settings: ExtractSettings, card: ModelCard) -> None:
             f"--execute {execute}: {settings.model} averages the plans of overlapping chunks, which needs an "
             "inference per action; leave --execute out, or the model's option that asks for averaging"
         )
-    inferences = -(-steps // max(1, execute))
-    if settings.captured_calls > inferences:
+    inferences = settings.most_inferences(execute)
+    if settings.captured_calls != "all" and settings.captured_calls > inferences:
         raise UsageError(
             f"--captured-calls {settings.captured_calls}: episodes of {steps} actions, {execute} per inference, "
             f"have at most {inferences}; capture 1 to {inferences} of them, or raise --max-steps"

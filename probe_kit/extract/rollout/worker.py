@@ -78,7 +78,9 @@ class Worker:
     def _make_buffers(self) -> EpisodeBuffers:
         settings, controller = self._settings, self._controller
         with_tokens = settings.tokens == "all"
-        return EpisodeBuffers(self._writer.streams, settings.stored_calls, with_tokens, controller.on_gpu)
+        return EpisodeBuffers(
+            self._writer.streams, settings.stored_calls, with_tokens, controller.on_gpu, settings.stored_later
+        )
 
     def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
         """EpisodeLoop what `next_number` gives until it gives None; an event per episode, when it is committed."""

@@ -8,14 +8,15 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from probe_kit._system.drafts import draft_of, write_whole
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import UsageError
-from probe_kit.extract.run_layout import ExportFormat, StoredStream
+from probe_kit.extract.run_layout import LATER, MEAN_VIEW, ArrayKind, ExportFormat, StoredStream
+from probe_kit.extract.store.format.arrays import decode_bfloat16
 from probe_kit.extract.store.format.rows import Rows
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run, open_run
@@ -24,8 +25,8 @@ from probe_kit.extract.store.run import Run, open_run
 def export_run(path: Path | str | Location, style: ExportFormat, out: Path, allow_partial: bool = False) -> Path:
     """Write the run at `path` to the file `out` and its sha256 to `out`.sha256; returns `out`.
 
-    h5: `<stream>/pooled`, `<stream>/tokens`, and a dataset per column under `episodes`.
-    safetensors: `<stream>.pooled` and `<stream>.tokens`, the latter true bfloat16; episodes in the metadata.
+    h5: `<stream>/pooled`, `<stream>/later`, `<stream>/tokens`, and a dataset per column under `episodes`.
+    safetensors: the same with a dot, the last two true bfloat16; episodes in the metadata.
     parquet: a row per episode, inference, site and view with its vector; no tokens.
     Array axes are (episode, call, [iteration,] layer, view or token, feature).
     Raises UsageError for another format or a file that exists, MissingExtraError, RunDamagedError.
@@ -52,9 +53,9 @@ def check_format(style: str) -> None:
 
 def _arrays(run: Run) -> Iterator[tuple[str, str, Rows]]:
     """Stream, kind and rows of every array of the run."""
-    kinds: tuple[Literal["pooled", "tokens"], ...] = ("pooled", "tokens")
+    tokens: tuple[ArrayKind, ...] = ("tokens",) if run.settings["tokens"] == "all" else ()
     for stream in run.streams:
-        for kind in kinds[: 1 + (run.settings["tokens"] == "all")]:
+        for kind in (*run.root.vector_kinds, *tokens):
             yield stream, kind, run.rows(stream, kind)
 
 
@@ -116,17 +117,19 @@ def _write_parquet(run: Run, out: Path) -> None:
     keys = ["episode_id", "item_id", "category", "layout", "side_correct", "outcome"]
     fields = [*((key, pa.string()) for key in keys), ("call", pa.int32()), ("site", pa.string())]
     schema = pa.schema([*fields, ("view", pa.string()), ("vector", pa.list_(pa.float32()))])
-    pooled = [(run.stored(stream), rows) for stream, kind, rows in _arrays(run) if kind == "pooled"]
+    arrays = [(run.stored(stream), kind, rows) for stream, kind, rows in _arrays(run) if kind != "tokens"]
     with pq.ParquetWriter(out, schema) as writer:
         for position, episode in enumerate(run.episodes[keys].to_dict("records")):
-            vectors = [vector for stored, rows in pooled for vector in _vectors(stored, rows[position])]
+            vectors = [one for stored, kind, rows in arrays for one in _vectors(stored, kind, rows[position])]
             writer.write_table(pa.Table.from_pylist([{**episode, **vector} for vector in vectors], schema))
 
 
-def _vectors(stored: StoredStream, row: Any) -> Iterator[dict[str, Any]]:
-    for call, captured in enumerate(row):
+def _vectors(stored: StoredStream, kind: str, row: Any) -> Iterator[dict[str, Any]]:
+    later = kind == LATER
+    views = (MEAN_VIEW,) if later else stored.views
+    for call, captured in enumerate(decode_bfloat16(row)[..., None, :] if later else row, start=int(later)):
         for site in stored.stream.sites():
-            for view, vector in zip(stored.views, captured[stored.at(site)], strict=True):
+            for view, vector in zip(views, captured[stored.at(site)], strict=True):
                 yield {"call": call, "site": str(site), "view": view, "vector": vector}
 
 

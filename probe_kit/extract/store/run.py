@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -20,9 +20,17 @@ from probe_kit.errors import (
     UnknownSiteError,
     UsageError,
 )
-from probe_kit.extract.run_layout import DATA, PROVENANCE, TRAJECTORY, StoredStream
+from probe_kit.extract.run_layout import (
+    DATA,
+    MEAN_VIEW,
+    PROVENANCE,
+    TRAJECTORY,
+    ArrayKind,
+    StoredStream,
+    VectorKind,
+)
 from probe_kit.extract.store.certificates import read_certificate
-from probe_kit.extract.store.format.arrays import open_array
+from probe_kit.extract.store.format.arrays import decode_bfloat16, open_array
 from probe_kit.extract.store.format.checking import CheckedStore
 from probe_kit.extract.store.format.columns import Columns, find_columns
 from probe_kit.extract.store.format.commits import (
@@ -474,9 +482,13 @@ class Run:
             raise UnknownSiteError(f"{self.location} has no stream {stream!r}; stored: {known}")
         return self._streams[stream]
 
-    def views(self, stream: str) -> tuple[str, ...]:
-        """Pooled views of one stream."""
-        return self.stored(stream).views
+    def views(self, stream: str, call: int = 0) -> tuple[str, ...]:
+        """Pooled views of one stream that are stored of captured inference `call`."""
+        return (MEAN_VIEW,) if self._keeps_mean_of(call) else self.stored(stream).views
+
+    def _keeps_mean_of(self, call: int) -> bool:
+        """Whether captured inference `call` is one of which the mean alone is stored, in bfloat16."""
+        return call > 0 and self.root.later_views == MEAN_VIEW
 
     def sites(self, stream: str) -> list[Site]:
         """All sites of one stream."""
@@ -510,7 +522,8 @@ class Run:
     def column(self, site: Site, view: str = "mean", call: int = 0) -> NDArray[np.float32]:
         """(E, D) float32: one pooled view of one site at one captured inference, a row per episode.
 
-        NaN in the rows of episodes that ended before inference `call`; see `reached`.
+        NaN in the rows of episodes that ended before inference `call`; see `reached`. With `--later-views mean`,
+        inferences after the first have the view `mean` alone, rounded to bfloat16.
 
         Raises UnknownSiteError, RunDamagedError if stored bytes are missing or fail their checksum, or
         ActivationsLeftOutError in a copy without activations.
@@ -519,13 +532,23 @@ class Run:
         if self.columns is None and f"{site.stream}/pooled" in self.root.left_out:
             self.root.refuse_left_out(f"there is no column of {site}")
         view = resolve_view(view, stored.views)
-        if view not in stored.views:
-            raise UnknownSiteError(f"no view {view!r} of {site.stream}; stored: {', '.join(stored.views)}")
+        if view not in (known := self.views(site.stream, call)):
+            at = f" at inference {call}, with --later-views mean" if self._keeps_mean_of(call) else ""
+            raise UnknownSiteError(f"no view {view!r} of {site.stream}{at}; stored: {', '.join(known)}")
         if self.columns is None:
             self._note_slow_reading()
-            index: tuple[Any, ...] = (slice(None), call, *stored.at(site), stored.views.index(view))
-            return np.asarray(self._pooled(site.stream)[index])
+            return self._column_of_rows(stored, site, view, call)
+        if self._keeps_mean_of(call):
+            return self.columns.later_column(stored, site, call)[self._columns_rows]
         return self.columns.column(stored, site, view, call)[self._columns_rows]
+
+    def _column_of_rows(self, stored: StoredStream, site: Site, view: str, call: int) -> NDArray[np.float32]:
+        at = stored.at(site)
+        index: tuple[Any, ...] = (slice(None), call - 1, *at)
+        if self._keeps_mean_of(call):
+            return decode_bfloat16(self._kept(site.stream, "later")[index])
+        index = (slice(None), call, *at, stored.views.index(view))
+        return np.asarray(self._kept(site.stream, "pooled")[index])
 
     @property
     def sealed(self) -> bool:
@@ -545,7 +568,7 @@ class Run:
             stacklevel=3,
         )
 
-    def rows(self, stream: str, kind: Literal["pooled", "tokens"] = "pooled") -> Rows:
+    def rows(self, stream: str, kind: ArrayKind = "pooled") -> Rows:
         """The stored rows of the committed episodes: all that was captured in one episode at a time.
 
         Raises ActivationsLeftOutError in a copy without activations.
@@ -571,19 +594,21 @@ class Run:
         of = next((number for number, commit in self._commits.items() if key in commit["objects"]), None)
         return RESTORE if of is None else redo(of)
 
-    def _pooled(self, stream: str) -> NDArray[np.float32]:
-        """(E, S, [I,] L, V, D) rows of the committed episodes, read once per stream."""
-        if stream not in self._kept_rows:
-            rows = self.rows(stream)
-            self._kept_rows[stream] = np.stack([rows[position] for position in range(len(rows))])
-        return self._kept_rows[stream]
+    def _kept(self, stream: str, kind: VectorKind) -> NDArray[Any]:
+        """(E, S, [I,] L, [V,] D) rows of the committed episodes, read once per array."""
+        if (stream, kind) not in self._kept_rows:
+            rows = self.rows(stream, kind)
+            self._kept_rows[stream, kind] = np.stack([rows[position] for position in range(len(rows))])
+        return self._kept_rows[stream, kind]
 
     @cached_property
-    def _kept_rows(self) -> dict[str, NDArray[np.float32]]:
+    def _kept_rows(self) -> dict[tuple[str, VectorKind], NDArray[Any]]:
         return {}
 
     def xarray(self) -> "xr.Dataset":
         """The pooled arrays with labelled views and episodes; dimensions of a stream carry its name.
+
+        With `--later-views mean` they hold the first inference alone; `column` reads the others.
 
         Values of a sealed run are read when they are used, not before.
         """
@@ -593,7 +618,7 @@ class Run:
         for name, stored in self._streams.items():
             if self.columns is None:
                 dimensions = ["episode", "call", *stored.dimensions, "view", "feature"]
-                array = xr.DataArray(self._pooled(name), dims=dimensions)
+                array = xr.DataArray(self._kept(name, "pooled"), dims=dimensions)
             else:
                 array = self.columns.xarray(name).isel(episode=self._columns_rows)
             own = {dimension: f"{name}_{dimension}" for dimension in (*stored.dimensions, "view", "feature")}

@@ -9,10 +9,11 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from probe_kit.extract.run_layout import COLUMNS, SEALED
+from probe_kit.extract.run_layout import COLUMNS, SEALED, StoredStream, VectorKind
 from probe_kit.extract.store.format.arrays import codecs
 from probe_kit.extract.store.format.columns import STAMP_DIGITS, seal_key, write_seal
 from probe_kit.extract.store.format.recording import RecordingStore
+from probe_kit.extract.store.format.rows import Rows
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run, read_run
@@ -48,7 +49,8 @@ def _seal(run: Run) -> bool:
         store = RecordingStore(place)
         group = zarr.open_group(store, mode="w", zarr_format=3)
         for name in run.streams:
-            _write_pooled(run, name, group)
+            for kind in run.root.vector_kinds:
+                _write_vectors(run, name, kind, group)
             _write_roles(run, name, group)
         group.attrs["stamp"] = run.stamp
         folder = run.location.derived(COLUMNS, run.stamp)
@@ -65,38 +67,44 @@ def _remove_former_seals(run: Run) -> None:
             run.location.delete(key)
 
 
-def _write_pooled(run: "Run", name: str, group: zarr.Group) -> None:
-    stored = run.stored(name)
-    rows = run.rows(name)
-    calls, episodes = rows.array.shape[1], len(rows)
-    block = _block(episodes)
-    lead = (calls, len(stored.views), *stored.lead)
+def _write_vectors(run: "Run", name: str, kind: VectorKind, group: zarr.Group) -> None:
+    stored, rows = run.stored(name), run.rows(name, kind)
+    episodes = len(rows)
+    block, lead = _block(episodes), _lead(stored, rows, kind)
     array = group.create_array(
-        f"{name}/pooled",
+        f"{name}/{kind}",
         shape=(*lead, episodes, stored.width),
         chunks=(*(1 for _ in lead), block, stored.width),
-        dtype="float32",
-        fill_value=np.nan,
-        compressors=codecs(run.settings["codec"], typesize=4),
-        dimension_names=("call", "view", *stored.dimensions, "episode", "feature"),
-        attributes={"views": list(stored.views)},
+        dtype=rows.array.dtype,
+        fill_value=rows.array.fill_value,
+        compressors=codecs(run.settings["codec"], typesize=rows.array.dtype.itemsize),
+        dimension_names=("call", *(["view"] * (kind == "pooled")), *stored.dimensions, "episode", "feature"),
+        attributes=dict(rows.array.attrs),
         config={"write_empty_chunks": True},
     )
-    for index, column in columns_of_rows(run, name):
+    for index, column in columns_of_rows(run, name, kind):
         array[index] = column
 
 
-def columns_of_rows(run: "Run", name: str) -> Iterator[tuple[tuple[Any, ...], NDArray[np.float32]]]:
-    """Every chunk of the pooled columns of a stream as its rows have it: where it belongs, and (E, D) values."""
-    stored, rows = run.stored(name), run.rows(name)
-    episodes = len(rows)
-    cells = list(np.ndindex(rows.array.shape[1], len(stored.views), *stored.lead))
+def _lead(stored: StoredStream, rows: Rows, kind: VectorKind) -> tuple[int, ...]:
+    """Axes of the columns before episode and feature."""
+    views = (len(stored.views),) if kind == "pooled" else ()
+    return (rows.array.shape[1], *views, *stored.lead)
+
+
+def columns_of_rows(
+    run: "Run", name: str, kind: VectorKind
+) -> Iterator[tuple[tuple[Any, ...], NDArray[np.float32 | np.uint16]]]:
+    """Every chunk of the columns of a stream as its rows have it: where it belongs, and (E, D) values."""
+    stored, rows = run.stored(name), run.rows(name, kind)
+    episodes, size = len(rows), rows.array.dtype.itemsize
+    cells = list(np.ndindex(_lead(stored, rows, kind)))
     for start in range(0, episodes, _block(episodes)):
         stop = min(start + _block(episodes), episodes)
-        for slab in _slabs(cells, (stop - start) * stored.width * 4):
-            values = np.empty((len(slab), stop - start, stored.width), np.float32)
+        for slab in _slabs(cells, (stop - start) * stored.width * size):
+            values = np.empty((len(slab), stop - start, stored.width), rows.array.dtype)
             for position in range(start, stop):
-                row = np.moveaxis(rows[position], -2, 1)
+                row = np.moveaxis(rows[position], -2, 1) if kind == "pooled" else rows[position]
                 values[:, position - start] = row[tuple(np.transpose(slab))]
             for cell, column in zip(slab, values, strict=True):
                 yield (*cell, slice(start, stop)), column

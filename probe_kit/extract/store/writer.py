@@ -118,7 +118,7 @@ class RunWriter:
         store = MemoryStore(arrays)
         create_arrays(
             store, list(self.plan.streams), 0, self.settings["captured_calls"], self._with_tokens,
-            self.settings["codec"],
+            self.settings["codec"], self.settings.get("later_views", "all"),
         )  # fmt: skip
         still = "ask" in self.settings or bool(self.settings.get("capture_only"))
         if "scene" in self.settings and not still:  # who is asked or captured does not move

@@ -75,5 +75,5 @@ class _AtCall:
 
     def views(self, stream: str) -> Sequence[str]:
         """Pooled views stored for `stream`."""
-        views: Sequence[str] = self.run.views(stream)
+        views: Sequence[str] = self.run.views(stream, self.call)
         return views

@@ -190,7 +190,7 @@ function NetworkNow({ run, one, episode, map, now, place }) {
       legend=${html`<div class="ramp two" aria-hidden="true"><span>wrong</span><i></i><span>correct</span><span class="swatch weak"></span><span>no signal shown</span></div>`} />
     ${episode.refitted && html`<label class="choice inline"><span>probes</span><select name="probe" value=${place.probe === "refitted" ? "refitted" : ""} onChange=${(e) => go({ probe: e.target.value }, true)}><option value="">of inference 0</option><option value="refitted">refitted at each inference</option></select></label>`}
     ${!episode.held_out && html`<p class="note">No fold tests this item: the mean of the folds' log-odds is shown.</p>`}
-    ${calls === 1 && episode.inferences.length > 1 && html`<p class="note">One of ${episode.inferences.length} inferences was captured. <code>--captured-calls ${episode.inferences.length}</code> captures all.</p>`}</div>`;
+    ${calls === 1 && episode.inferences.length > 1 && html`<p class="note">One of ${episode.inferences.length} inferences was captured. <code>extract --captured-calls all</code> captures all.</p>`}</div>`;
 }
 function Charts({ run, one, episode, map, now, last, step, place }) {
   const { trajectory } = episode, n = run.sites.length, { along, tool } = sideways(trajectory, one);

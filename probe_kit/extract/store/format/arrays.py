@@ -1,6 +1,6 @@
 """The arrays of a run: shapes, chunks, codec, and where the inner chunks of a shard lie.
 
-Token arrays hold the bits of bfloat16 as uint16, because Zarr v3 has no bfloat16.
+Arrays of tokens and of later inferences hold the bits of bfloat16 as uint16, because Zarr v3 has no bfloat16.
 """
 
 import json
@@ -13,30 +13,36 @@ from zarr.abc.codec import BytesBytesCodec
 from zarr.abc.store import Store
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.run_layout import LATER, MEAN_VIEW, LaterViews, StoredStream
 
 ENTRY, CHECKSUM = 16, 4
 """Bytes: offset and length of a chunk as two uint64, and the crc32c after all entries, in the
 index that Zarr writes at the end of every shard."""
 _ABSENT = (1 << 64) - 1
+NOT_A_NUMBER = 0x7FC0
+"""Bits of bfloat16 where nothing was captured."""
 
 
 def create_arrays(
-    store: Store, streams: list[StoredStream], episodes: int, calls: int, with_tokens: bool, codec: str
-) -> None:
+    store: Store, streams: list[StoredStream], episodes: int, calls: int, with_tokens: bool, codec: str,
+    later_views: LaterViews = "all",
+) -> None:  # fmt: skip
     """Create every array; afterwards chunks are written, and `at_extent` gives them room for more episodes.
 
     Pooled rows: float32 (episode, call, [iteration,] layer, view, feature), one chunk per episode, NaN where
-    nothing was captured. Tokens: uint16, one shard per episode, inner chunks of one layer x 128 tokens.
+    nothing was captured. Tokens: uint16, one shard per episode, inner chunks of one layer x 128 tokens. With
+    later_views `mean`, pooled rows hold the first inference alone, and `later` that view of the others: uint16
+    (episode, call, [iteration,] layer, feature), one chunk per episode, `NOT_A_NUMBER` where nothing was captured.
     """
     root = zarr.open_group(store, mode="w-", zarr_format=3)
+    full = calls if later_views == "all" else 1
     for stream in streams:
         group = root.create_group(stream.name)
         pooled = (*stream.lead, len(stream.views), stream.width)
         group.create_array(
             "pooled",
-            shape=(episodes, calls, *pooled),
-            chunks=(1, calls, *pooled),
+            shape=(episodes, full, *pooled),
+            chunks=(1, full, *pooled),
             dtype="float32",
             fill_value=np.nan,
             compressors=codecs(codec, typesize=4),
@@ -44,6 +50,19 @@ def create_arrays(
             attributes={"views": list(stream.views)},
             config={"write_empty_chunks": True},
         )
+        if later_views == MEAN_VIEW:
+            later = (*stream.lead, stream.width)
+            group.create_array(
+                LATER,
+                shape=(episodes, calls - 1, *later),
+                chunks=(1, calls - 1, *later),
+                dtype="uint16",
+                fill_value=NOT_A_NUMBER,
+                compressors=codecs(codec, typesize=2),
+                dimension_names=("episode", "call", *stream.dimensions, "feature"),
+                attributes={"probe_kit:dtype": "bfloat16", "view": MEAN_VIEW},
+                config={"write_empty_chunks": True},
+            )
         if with_tokens:
             tokens = (*stream.lead, stream.stored_tokens, stream.width)
             group.create_array(

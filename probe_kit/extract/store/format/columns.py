@@ -4,6 +4,7 @@ A row store answers "everything of one episode". Columns hold the same numbers t
 writes them. They are derived: safe to delete, and used only while their stamp matches the commits.
 
     columns.zarr/<stream>/pooled   float32 (call, view, [iteration,] layer, episode, feature)
+    columns.zarr/<stream>/later    uint16 (call - 1, [iteration,] layer, episode, feature), with --later-views mean
     columns.zarr/<stream>/role     uint8   (call, episode, token), codes named by the attribute `roles`
     sealed/<stamp>.json            the hash of every object in columns.zarr, and of which run and commits they are
 
@@ -21,8 +22,8 @@ from zarr.abc.store import Store
 from zarr.errors import ChunkNotFoundError
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.run_layout import COLUMNS, SEALED, StoredStream
-from probe_kit.extract.store.format.arrays import open_array
+from probe_kit.extract.run_layout import COLUMNS, LATER, SEALED, StoredStream
+from probe_kit.extract.store.format.arrays import decode_bfloat16, open_array
 from probe_kit.extract.store.format.checking import CheckedStore
 from probe_kit.extract.store.format.commits import Commit, commit_key, stamp_of
 from probe_kit.extract.store.format.hashes import Sum, as_record, check_sums, expect, read_record, read_sums
@@ -68,9 +69,16 @@ class Columns:
 
     def column(self, stored: StoredStream, site: Site, view: str, call: int) -> NDArray[np.float32]:
         """(E, D) float32: one view of one site at one captured inference. Raises RunDamagedError."""
-        array = self.array(f"{stored.name}/pooled")
+        return self._read(f"{stored.name}/pooled", (call, stored.views.index(view), *stored.at(site)), site)
+
+    def later_column(self, stored: StoredStream, site: Site, call: int) -> NDArray[np.float32]:
+        """(E, D) float32: the mean of one site at a later inference that keeps no other view."""
+        return decode_bfloat16(self._read(f"{stored.name}/{LATER}", (call - 1, *stored.at(site)), site))
+
+    def _read(self, name: str, index: tuple[int, ...], site: Site) -> NDArray[Any]:
+        array = self.array(name)
         try:
-            return np.asarray(array[(call, stored.views.index(view), *stored.at(site))])
+            return np.asarray(array[index])
         except (ChunkNotFoundError, ValueError, RuntimeError) as error:
             raise RunDamagedError(
                 f"the column of {site} in {self._location}/{self.folder} cannot be read: {error}. {self.advice}"
@@ -80,7 +88,10 @@ class Columns:
         """The pooled columns of one stream, read when they are used."""
         import xarray as xr
 
-        dataset: xr.Dataset = xr.open_zarr(self.store, group=stream, consolidated=False, chunks=None)
+        others = ("role", LATER)  # which may have other numbers of calls
+        dataset: xr.Dataset = xr.open_zarr(
+            self.store, group=stream, consolidated=False, chunks=None, drop_variables=others
+        )
         return dataset["pooled"].drop_attrs()
 
     def problems(self) -> Iterator[str]:
@@ -134,11 +145,17 @@ def _read_seals(root: Root, commits: Mapping[int, Commit]) -> Iterator[dict[str,
         check_sums(seal["objects"], name, advice)
         if seal["run"] != root.identity or seal_key(seal["stamp"]) != f"{SEALED}/{file}":
             raise RunDamagedError(f"{name} belongs to another run or to other episodes. {advice}")
-        if lost := {METADATA, *(f"{stream}/pooled/{METADATA}" for stream in root.streams)} - {*seal["objects"]}:
+        if lost := _metadata(root) - {*seal["objects"]}:
             raise RunDamagedError(f"{name} names no hash of {min(lost)}. {advice}")
         if "episodes" in seal:  # seals of before this was noted say less
             _check_lost(root, commits, seal, name, advice)
         yield seal
+
+
+def _metadata(root: Root) -> set[str]:
+    """What columns have for every episode."""
+    arrays = [f"{stream}/{kind}" for stream in root.streams for kind in root.vector_kinds]
+    return {METADATA, *(f"{array}/{METADATA}" for array in arrays)}
 
 
 def _check_lost(

@@ -19,11 +19,14 @@ from probe_kit.errors import (
 from probe_kit.extract.run_layout import (
     DATA,
     FORMER_PLAN_FILE,
+    MEAN_VIEW,
     PLANS,
     READABLE_SCHEMAS,
     RUN_FILE,
     SCHEMA_VERSION,
+    LaterViews,
     StoredStream,
+    VectorKind,
 )
 from probe_kit.extract.store.format.arrays import at_extent, extent_of
 from probe_kit.extract.store.format.hashes import (
@@ -46,7 +49,7 @@ from probe_kit.hashing import sha256_json
 
 _PARTS = {"settings": dict, "settings_sha256": str, "streams": list, "objects": dict}
 _SETTINGS = {"model": str, "captured_calls": int, "tokens": str, "codec": str}
-_FURTHER = {"random_weights": bool, "suite": dict}
+_FURTHER = {"random_weights": bool, "suite": dict, "later_views": str}
 """What the settings of every extracted run say besides, and those of a run that other code wrote may not."""
 _EPISODE = {
     **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "layout", "side_correct"), str),
@@ -268,7 +271,18 @@ class Root:
     def arrays(self) -> dict[str, int]:
         """Arrays of `data.zarr` in which every episode has one object, and how many axes each has."""
         with_tokens = self.own_settings["tokens"] == "all"
-        return {name: axes for one in self.own_streams.values() for name, axes in one.arrays(with_tokens).items()}
+        streams = self.own_streams.values()
+        return {name: axes for one in streams for name, axes in one.arrays(with_tokens, self.later_views).items()}
+
+    @property
+    def later_views(self) -> LaterViews:
+        """Pooled views that are stored of the inferences after the first."""
+        return "mean" if self.own_settings.get("later_views") == MEAN_VIEW else "all"
+
+    @property
+    def vector_kinds(self) -> tuple[VectorKind, ...]:
+        """Arrays of every stream that hold vectors of views."""
+        return ("pooled",) if self.later_views == "all" else ("pooled", "later")
 
 
 def new_root(settings: Mapping[str, Any], streams: list[dict[str, Any]], objects: Mapping[str, bytes]) -> bytes:

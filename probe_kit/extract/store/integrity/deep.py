@@ -82,10 +82,11 @@ def _differences(run: Run) -> Iterator[str]:
     assert columns is not None
     for stream in run.streams:
         try:
-            array = columns.array(f"{stream}/pooled")
-            for index, expected in columns_of_rows(run, stream):
-                if not np.array_equal(np.asarray(array[index]), expected, equal_nan=True):
-                    place = f"{columns.folder}/{stream}/pooled at {index}"
-                    yield f"{place} is not what the rows give. {columns.advice}"
+            for kind in run.root.vector_kinds:
+                array = columns.array(f"{stream}/{kind}")
+                for index, expected in columns_of_rows(run, stream, kind):
+                    if not np.array_equal(np.asarray(array[index]), expected, equal_nan=True):
+                        place = f"{columns.folder}/{stream}/{kind} at {index}"
+                        yield f"{place} is not what the rows give. {columns.advice}"
         except RunDamagedError as error:
             yield str(error)
