@@ -8,7 +8,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.calibration import Calibration, calibrated
 from probe_kit.extract.early import asked_objects, check_model, check_place, check_words
 from probe_kit.extract.needs import declared_streams
-from probe_kit.extract.plan import RowPlan, instructions_of, make_plan, plan_episodes, skipped_items
+from probe_kit.extract.plan import Plan, RowPlan, instructions_of, make_plan, plan_episodes, skipped_items
 from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
