@@ -7,7 +7,8 @@ stderr.
 import sys
 import warnings
 from io import TextIOWrapper
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 import typer.core
@@ -35,7 +36,10 @@ from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import train
 from probe_kit.train.label_commands import labels
 from probe_kit.train.power_commands import power
-from probe_kit.view.commands import view
+from probe_kit.view.commands import RUNS_BY_NAME, view
+
+if TYPE_CHECKING:
+    from probe_kit.extract import Run
 
 ORDER = (
     "demo", "doctor", "models", "suite", "extract", "ask", "run", "labels", "train", "power", "intervene",
@@ -141,6 +145,15 @@ def _before_commands(
     """What stands in front of every command."""
 
 
+def _stored_runs_of_study(name: str) -> "list[Run] | None":
+    """The stored runs of a study file or of a study of the package; None for a run."""
+    if Path(name).is_dir() or "://" in name:
+        return None
+    from probe_kit.study.tables.stored_runs import stored_runs_by_name
+
+    return stored_runs_by_name(name)
+
+
 app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
 app.add_typer(study_app, name="study")
@@ -165,6 +178,7 @@ for command in (
 ):
     app.command()(command)
 app.command(cls=KindHelp)(intervene)
+RUNS_BY_NAME.append(_stored_runs_of_study)
 for group in (app, *(named.typer_instance for named in app.registered_groups)):
     for registered in group.registered_commands if group else ():
         if registered.cls is not KindHelp:

@@ -41,13 +41,18 @@ def find_study(name: str) -> Path:
     """The file of this path, or the study of the package of this name. Raises UsageError if there is neither."""
     if Path(name).is_file():
         return Path(name)
-    shipped = {file.name.removesuffix(".toml"): file for file in _shipped()}
+    shipped = shipped_studies()
     if name in shipped:
         return shipped[name]
     raise UsageError(
         f"there is no study file {name!r}, and no study of the package of that name; the package has "
         f"{', '.join(sorted(shipped))}"
     )
+
+
+def shipped_studies() -> dict[str, Path]:
+    """The study files of the package by name."""
+    return {file.name.removesuffix(".toml"): file for file in _shipped()}
 
 
 def _shipped() -> list[Path]:

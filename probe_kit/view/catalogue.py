@@ -30,8 +30,8 @@ class Catalogue:
     RUN/e/NNNNN             one episode
     """
 
-    def __init__(self, runs: Sequence[Run]) -> None:
-        self.runs = {viewed.key: viewed for viewed in view_runs(runs)}
+    def __init__(self, runs: Sequence[Run], probes_of: Run | None = None) -> None:
+        self.runs = {viewed.key: viewed for viewed in view_runs(runs, probes_of)}
 
     def replace(self, key: str, run: Run) -> None:
         """Show a run as it is now. Raises KeyError."""
@@ -61,7 +61,9 @@ class Catalogue:
         """A hash that changes with the commits and probes that a payload is made of. Raises KeyError."""
         parts = name.split("/")
         shown = [self.runs[parts[0]]] if parts[0] in self.runs else list(self.runs.values())
-        keys = [sorted(other.key for other in viewed.refitted.values()) for viewed in shown]
+        own = [viewed.results for viewed in shown]
+        refitted = [sorted(other.key for other in viewed.refitted.values()) for viewed in shown]
+        keys = [refitted, [None if results is None else results.key for results in own]]
         return sha256_json([SCHEMA, name, [viewed.run.stamp for viewed in shown], keys])
 
     def picture(self, key: str, number: int) -> bytes | None:

@@ -11,11 +11,19 @@ from probe_kit._terminal.options import NAMED, Names, Partial
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from probe_kit.extract import Run
+
+RUNS_BY_NAME: "list[Callable[[str], list[Run] | None]]" = []
+"""What finds several runs by one name, or None for a name that it does not know; the command line adds studies."""
 
 
 def view(
-    runs: Annotated[list[str], typer.Argument(help="Run folders or URLs.", metavar="RUN…")],
+    runs: Annotated[
+        list[str],
+        typer.Argument(help="Run folders or URLs, or study files, whose runs are opened.", metavar="RUN…"),
+    ],
     export: Annotated[
         Path | None,
         typer.Option("--export", metavar="FOLDER", help="Write a folder that opens without a server, and stop."),
@@ -32,6 +40,14 @@ def view(
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Print the address and open no browser.")
     ] = False,
+    probes_of: Annotated[
+        str | None,
+        typer.Option(
+            "--probes-of",
+            metavar="RUN",
+            help="Read runs without probes, such as unfinished ones, by the probes of this run of the same model.",
+        ),
+    ] = None,
     partial: Partial = False,
 ) -> None:
     """Look at runs in a browser: overview, layer × iteration maps, single episodes, two runs compared.
@@ -40,26 +56,38 @@ def view(
     """
     from probe_kit.extract import open_run
 
+    lender = None if probes_of is None else open_run(probes_of, allow_partial=True)
     if export is None:
         if categories or without_frames:
             raise UsageError("--only and --without-frames are of an export; give --export FOLDER too")
-        _serve([open_run(run, allow_partial=True) for run in runs], port, no_browser)
+        _serve(_opened(runs, True), lender, port, no_browser)
         return
     from probe_kit.view import write_viewer
 
-    opened = [open_run(run, allow_partial=partial) for run in runs]
+    opened = _opened(runs, partial)
     with err.status("exporting"):
-        page = write_viewer(opened, export, frames=not without_frames, categories=categories)
+        page = write_viewer(opened, export, frames=not without_frames, categories=categories, probes_of=lender)
     out.print(str(page), soft_wrap=True)
 
 
-def _serve(runs: "list[Run]", port: int, no_browser: bool) -> None:
+def _opened(names: list[str], partial: bool) -> "list[Run]":
+    """The runs of these names, of which each stands for one run, or for several as `RUNS_BY_NAME` knows."""
+    from probe_kit.extract import open_run
+
+    found: list[Run] = []
+    for name in names:
+        several = next((runs for find in RUNS_BY_NAME if (runs := find(name)) is not None), None)
+        found += [open_run(name, allow_partial=partial)] if several is None else several
+    return found
+
+
+def _serve(runs: "list[Run]", lender: "Run | None", port: int, no_browser: bool) -> None:
     import webbrowser
 
     from probe_kit.view.catalogue import Catalogue
     from probe_kit.view.server import ViewerServer
 
-    server = ViewerServer(Catalogue(runs), port)
+    server = ViewerServer(Catalogue(runs, lender), port)
     out.print(server.address, soft_wrap=True)
     say("Ctrl-C ends the viewer.")
     if not no_browser:

@@ -23,16 +23,18 @@ def write_viewer(
     *,
     frames: bool = True,
     categories: Collection[str] | None = None,
+    probes_of: Run | None = None,
 ) -> Path:
     """Write the viewer of `runs` to `folder`, whole or not at all, and return its `index.html`.
 
     The same runs give the same bytes. frames: with the pictures of the episodes. categories: whose episodes and
-    maps are written, all by default. Raises UsageError without runs, or for a folder that holds anything but a
-    former export, and UnknownCategoryError for a category that no run has.
+    maps are written, all by default. probes_of: a run of the same model whose probes are shown where a run has
+    none. Raises UsageError without runs, for a folder that holds anything but a former export, or for probes of
+    another model, and UnknownCategoryError for a category that no run has.
     """
     folder = Path(folder)
     _check_folder(folder)
-    catalogue = Catalogue(runs)
+    catalogue = Catalogue(runs, probes_of)
     known = {name: None for viewed in catalogue.runs.values() for name in viewed.categories}
     if strange := [name for name in categories or () if name not in known]:
         raise UnknownCategoryError(f"no run has the category {strange[0]!r}; they have {', '.join(known)}")

@@ -49,11 +49,16 @@ class FrozenProbes:
     """The probes of one category in one view, and the log-odds that they give to episodes of `run`.
 
     An episode takes the probe of the fold that tests its item. One whose item no fold tests takes the mean of the
-    folds' log-odds, and is then not held out in the sense of the scores.
+    folds' log-odds, and is then not held out in the sense of the scores. results: of `run`, or of another run of
+    the same model. kept: None for probes of `run` itself, whose stored log-odds are taken. Those of another run
+    are of its own activations; then the first log-odds that were computed so far, by number of the episode.
     """
 
-    def __init__(self, run: Run, results: ProbeResults, category: str, view: str) -> None:
+    def __init__(
+        self, run: Run, results: ProbeResults, category: str, view: str, kept: dict[int, Values] | None = None
+    ) -> None:
         self.run, self.curve = run, results.curves[category, view]
+        self._kept = kept
         self._results, self._category, self._view = results, category, view
         self._fold_of = dict(zip(self.curve.items.tolist(), self.curve.fold_of.tolist(), strict=True))
         self._place_of = {name: place for place, name in enumerate(self.curve.episodes.tolist())}
@@ -63,8 +68,21 @@ class FrozenProbes:
         """S of them, as in the curve."""
         return self.curve.sites
 
-    def decisions(self, episode: str, side_correct: str) -> Values:
-        """(S,) stored out-of-fold log-odds toward the correct side; NaN for an episode without any."""
+    def first(self, position: int) -> Values:
+        """(S,) log-odds of the episode in row `position` at the inference of the probes, as `log_odds` has them.
+
+        Those of the run's own probes are the stored out-of-fold ones; NaN for an episode without any.
+        """
+        row = self.run.episodes.iloc[position]
+        if self._kept is None:
+            return self._stored(str(row["episode_id"]), str(row["side_correct"]))
+        number = int(row["episode"])
+        if number not in self._kept:
+            values = self.log_odds(position).values
+            self._kept[number] = values[0] if len(values) else np.full(len(self.sites), np.nan)
+        return self._kept[number]
+
+    def _stored(self, episode: str, side_correct: str) -> Values:
         place = self._place_of.get(episode)
         if place is None:
             return np.full(len(self.sites), np.nan)
@@ -78,7 +96,8 @@ class FrozenProbes:
         found = np.full((calls, len(self.sites)), np.nan)
         fold = self._fold_of.get(item)
         if not self._reads_activations:
-            found[:1] = self.decisions(str(row["episode_id"]), side)
+            if self._kept is None:
+                found[:1] = self._stored(str(row["episode_id"]), side)
             return EpisodeLogOdds(found, fold is not None)
         for stream, probes in self._streams.items():
             own = self._features(stream, probes, position, calls)

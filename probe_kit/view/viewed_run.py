@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,17 +17,23 @@ from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.view.frozen_probes import FrozenProbes, count_inferences
+from probe_kit.view.frozen_probes import FrozenProbes, Values, count_inferences
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
 
 @dataclass(frozen=True)
 class ViewedRun:
-    """A run, opened in one wording. key: its name in addresses and folders, unique among the runs of a page."""
+    """A run, opened in one wording. key: its name in addresses and folders, unique among the runs of a page.
+
+    lender: a run of the same model whose probes are shown where this one has none. readings: first log-odds by
+    category and number of the episode that these probes gave so far.
+    """
 
     key: str
     run: Run
+    lender: "ViewedRun | None" = None
+    readings: dict[str, dict[int, Values]] = field(default_factory=dict)
 
     @cached_property
     def table(self) -> RetentionTable:
@@ -40,9 +46,24 @@ class ViewedRun:
         return self.run.location.address, str(self.run.location)
 
     @property
-    def results(self) -> ProbeResults | None:
+    def own_results(self) -> ProbeResults | None:
         """The probes of the table; None without any."""
         return self.table.results.get(str(self.run.location))
+
+    @property
+    def is_lent(self) -> bool:
+        """Whether the probes that are shown are those of another run."""
+        return self.lender is not None and self.own_results is None
+
+    @property
+    def results(self) -> ProbeResults | None:
+        """The probes that are shown; None without any."""
+        return self.lender.own_results if self.lender is not None and self.is_lent else self.own_results
+
+    @property
+    def probed_rows(self) -> Mapping[str, RetentionRow]:
+        """The rows of the table that say which sites of the shown probes are best, by category."""
+        return self.lender.rows if self.lender is not None and self.is_lent else self.rows
 
     @property
     def view(self) -> str | None:
@@ -98,7 +119,7 @@ class ViewedRun:
     @cached_property
     def refitted(self) -> Mapping[int, ProbeResults]:
         """By captured inference, the probes that were fitted to that inference with otherwise equal settings."""
-        return {} if self.results is None else load_results_by_call(self.run, self.results)
+        return {} if self.own_results is None else load_results_by_call(self.run, self.own_results)
 
     @cached_property
     def probes(self) -> dict[str, FrozenProbes]:
@@ -106,7 +127,12 @@ class ViewedRun:
         results, view = self.results, self.view
         if results is None or view is None:
             return {}
-        return {name: FrozenProbes(self.run, results, name, view) for name in self.probed_categories}
+        return {
+            name: FrozenProbes(
+                self.run, results, name, view, self.readings.setdefault(name, {}) if self.is_lent else None
+            )
+            for name in self.probed_categories
+        }
 
     @cached_property
     def position_of(self) -> dict[int, int]:
@@ -114,10 +140,11 @@ class ViewedRun:
         return {int(number): position for position, number in enumerate(self.run.episodes["episode"])}
 
 
-def view_runs(runs: Sequence[Run]) -> list[ViewedRun]:
+def view_runs(runs: Sequence[Run], probes_of: Run | None = None) -> list[ViewedRun]:
     """The runs as the viewer shows them: of several wordings the first, as in `retention_table`.
 
-    Raises UsageError without runs, or if one is given twice.
+    probes_of: a run whose probes are shown where a run of the same model has none. Raises UsageError without runs,
+    if one is given twice, or if `probes_of` has no probes or is of another model than all runs without probes.
     """
     if not runs:
         raise UsageError("the viewer needs at least one run")
@@ -127,7 +154,33 @@ def view_runs(runs: Sequence[Run]) -> list[ViewedRun]:
     keys: list[str] = []
     for run in runs:
         keys.append(_key(run.location.name, keys))
-    return [ViewedRun(key, run.in_wording()) for key, run in zip(keys, runs, strict=True)]
+    viewed = [ViewedRun(key, run.in_wording()) for key, run in zip(keys, runs, strict=True)]
+    return viewed if probes_of is None else _with_lender(viewed, probes_of)
+
+
+def _with_lender(viewed: Sequence[ViewedRun], probes_of: Run) -> list[ViewedRun]:
+    lender = ViewedRun("probes", probes_of.in_wording())
+    if lender.own_results is None:
+        raise UsageError(f"{probes_of.location} has no probes. Run `probe-kit train {probes_of.location}`")
+    bare = [one for one in viewed if one.own_results is None and one.run.streams]
+    fitting = {one.key for one in bare if _difference(one.run, lender) is None}
+    if bare and not fitting:
+        raise UsageError(
+            f"the probes of {probes_of.location} cannot read {bare[0].run.location}: "
+            f"{_difference(bare[0].run, lender)}"
+        )
+    return [replace(one, lender=lender) if one.key in fitting else one for one in viewed]
+
+
+def _difference(run: Run, lender: ViewedRun) -> str | None:
+    """Why probes of `lender` cannot read the activations of `run`; None if they can."""
+    other = lender.run
+    if run.weights_sha256 != other.weights_sha256:
+        return f"it has other weights, {str(run.weights_sha256)[:12]} instead of {str(other.weights_sha256)[:12]}"
+    for name in dict.fromkeys(site.stream for site in lender.sites):
+        if run.streams.get(name) != other.streams[name] or run.views(name) != other.views(name):
+            return f"its stream {name} has other sites or views"
+    return None
 
 
 def _key(name: str, others: Sequence[str]) -> str:

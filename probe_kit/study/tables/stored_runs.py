@@ -2,14 +2,16 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probe_kit.errors import ProbeKitError, RunIncompleteError
+from probe_kit._terminal.console import say
+from probe_kit.errors import ProbeKitError, RunIncompleteError, UsageError
 from probe_kit.extract import open_run
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.ledger import Ledger
-from probe_kit.study.reading import LoadedStudy
+from probe_kit.study.reading import LoadedStudy, load_study, shipped_studies
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
@@ -127,3 +129,21 @@ def of_blocks(names: Sequence[str]) -> Callable[[Cell], Selection | None]:
         return first
 
     return wanted
+
+
+def stored_runs_by_name(name: str) -> "list[Run] | None":
+    """What is stored of a study file, or of a study of the package; None for a name of neither.
+
+    Runs that are missing are named on the terminal. Raises UsageError if none is stored, and as `load_study` does.
+    """
+    if not (name.endswith(".toml") or (name in shipped_studies() and not Path(name).exists())):
+        return None
+    study = load_study(name)
+    found = stored_runs(
+        study, of_blocks([block for cell in study.cells for block in cell.selections]), partial=True
+    )
+    for remark in found.missing:
+        say(remark)
+    if not found.found:
+        raise UsageError(f"no run of {study.file} is stored. Play it with `probe-kit study run {name}`")
+    return [one.probed for one in found.found]

@@ -67,9 +67,8 @@ def _best_log_odds(viewed: ViewedRun, part: str) -> Packed | None:
     if all(place is None for place in places.values()):
         return None
     found = np.full(len(viewed.run.episodes), np.nan)
-    for position, row in enumerate(viewed.run.episodes.to_dict("records")):
-        place = places.get(row["category"])
+    for position, category in enumerate(viewed.run.episodes["category"]):
+        place = places.get(category)
         if place is not None:
-            probes = viewed.probes[row["category"]]
-            found[position] = probes.decisions(str(row["episode_id"]), str(row["side_correct"]))[place["site"]]
+            found[position] = viewed.probes[category].first(position)[place["site"]]
     return pack_log_odds(found)

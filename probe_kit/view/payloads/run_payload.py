@@ -45,6 +45,7 @@ def run_payload(viewed: ViewedRun, others: Sequence[ViewedRun] = ()) -> dict[str
         "answers": viewed.answers,
         "captured_calls": run.captured_calls,
         "probes": None if results is None else results.key,
+        "probes_of": viewed.lender.run.label if viewed.lender is not None and viewed.is_lent else None,
         "view": viewed.view,
         "target": None if results is None else results.settings.target,
         "refitted": sorted(call for call in viewed.refitted if call),
@@ -75,7 +76,7 @@ def run_payload(viewed: ViewedRun, others: Sequence[ViewedRun] = ()) -> dict[str
 
 def best_places(viewed: ViewedRun, category: str) -> dict[str, Any]:
     """By part, the place of the best site among the run's, and whether it has signal; None without probes."""
-    row = viewed.rows.get(category)
+    row = viewed.probed_rows.get(category)
     if row is None or viewed.curve(category) is None:
         return {"backbone": None, "action": None}
     names = [str(site) for site in viewed.sites]

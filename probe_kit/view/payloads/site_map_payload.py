@@ -3,12 +3,13 @@
 from collections.abc import Hashable, Mapping
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from probe_kit.retention.columns.text import p_text, percent, with_limits
 from probe_kit.suite.categories import category_of
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.view.frozen_probes import decisions_toward_correct
+from probe_kit.view.frozen_probes import Values, decisions_toward_correct
 from probe_kit.view.payloads.coding import pack_log_odds, rounded
 from probe_kit.view.viewed_run import ViewedRun
 
@@ -34,11 +35,7 @@ def site_map_payload(viewed: ViewedRun, category: str) -> dict[str, Any]:
     if results is None or curve is None:
         raise KeyError(category)
     scores = _scores(results, category, viewed.view)
-    positions = {str(name): place for place, name in enumerate(viewed.run.episodes["episode_id"])}
-    shown = [place for place, name in enumerate(curve.episodes.tolist()) if name in positions]
-    rows = [positions[name] for name in curve.episodes[shown].tolist()]
-    every = viewed.run.episodes["side_correct"].astype(str).tolist()
-    sides = [every[row] for row in rows]
+    rows, log_odds = _first_log_odds(viewed, category)
     quantiles = pd.DataFrame(curve.null.T).quantile(NULL_SHARE).tolist() if curve.null.shape[1] else []
     return {
         "category": category,
@@ -54,13 +51,27 @@ def site_map_payload(viewed: ViewedRun, category: str) -> dict[str, Any]:
         ],
         **_shades(scores),
         "rows": rows,
-        "log_odds": pack_log_odds(decisions_toward_correct(curve, shown, sides)),
+        "log_odds": pack_log_odds(log_odds),
         "refitted": {
             str(call): _shades(_scores(other, category, viewed.view))
             for call, other in viewed.refitted.items()
             if call != results.settings.call and (category, viewed.view) in other.curves
         },
     }
+
+
+def _first_log_odds(viewed: ViewedRun, category: str) -> tuple[list[int], Values]:
+    """Rows of the E episodes that the probes of a category read, and (S, E) log-odds."""
+    probes = viewed.probes[category]
+    if viewed.is_lent:
+        rows = np.flatnonzero(viewed.run.episodes["category"] == category).tolist()
+        return rows, np.stack([probes.first(row) for row in rows], axis=-1)
+    curve = probes.curve
+    positions = {str(name): place for place, name in enumerate(viewed.run.episodes["episode_id"])}
+    shown = [place for place, name in enumerate(curve.episodes.tolist()) if name in positions]
+    rows = [positions[name] for name in curve.episodes[shown].tolist()]
+    every = viewed.run.episodes["side_correct"].astype(str).tolist()
+    return rows, decisions_toward_correct(curve, shown, [every[row] for row in rows])
 
 
 def _scores(results: ProbeResults, category: str, view: str | None) -> pd.DataFrame:
