@@ -18,7 +18,13 @@ from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from probe_kit.view import write_viewer
 from probe_kit.view.catalogue import Catalogue
-from tests.support.little_run import STREAMS, certify, episode, little_settings
+from tests.support.little_run import (
+    STREAMS,
+    certify,
+    episode,
+    intervene_on_little_run,
+    little_settings,
+)
 
 CALLS = 2
 FILMED, FILM_STEPS = 2, 9
@@ -89,6 +95,7 @@ def write_run(where: Path, suite: Suite, seed: int) -> Run:
         roles = [*record.roles, *record.roles]
         writer.write(replace(record, arrays={"pooled": pooled}, roles=roles, control_steps=(0, 1)))
     seal(where)
+    intervene_on_little_run(open_run(where))
     for call in range(CALLS):
         train_probes(open_run(where), permutations=60, call=call)
     return open_run(where)

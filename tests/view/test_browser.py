@@ -14,6 +14,7 @@ from PIL import Image
 from probe_kit.extract import Run, open_run
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import decode_frames, read_sheet, read_thumbnail
+from probe_kit.intervene.store.answers import stored_interventions
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
 from probe_kit.view import write_viewer
@@ -228,17 +229,29 @@ def test_a_question_shows_both_layouts_with_what_the_probes_read_and_the_arm_did
     curve, episodes = load_results(runs[0]).curves["color", "mean"], runs[0].episodes
     read = dict(zip(curve.episodes, curve.correct[curve.best("backbone")], strict=True))
     assert page.read("document.querySelectorAll('tbody tr').length") == episodes["item_id"].nunique()
-    disagreeing = []
+    disagreeing, responses = [], responses_of(runs[0])
     for row in episodes.to_dict("records"):
         cell = f"[data-item='{row['item_id']}'] [data-stage='{{}} {row['layout']}']"
         right = row["outcome"] == "correct"
         assert text(page, cell.format("arm")).startswith("✓" if right else "✗")
         assert text(page, cell.format("backbone")).startswith("✓" if read[row["episode_id"]] else "✗")
         assert text(page, cell.format("action")) == "–"
+        assert text(page, cell.format("swap")) == responses[row["episode_id"]]
         if bool(read[row["episode_id"]]) != right:
             disagreeing.append(row["item_id"])
     first = page.read("document.querySelector('tbody tr').dataset.item")
     assert disagreeing.count(first) == max(map(disagreeing.count, disagreeing))
+
+
+def responses_of(run: Run) -> dict[str, str]:
+    """What the page says of the action of every episode once the pictures are swapped."""
+    (stored,) = stored_interventions(run, "image-swap")
+    outcomes, said = stored.outcomes(), {}
+    for number, name in enumerate(outcomes.episodes):
+        toward = 1 if outcomes.sides[number] == "left" else -1
+        clean, swapped = toward * outcomes.displacement[:, number] > 0
+        said[str(name)] = "does not" if clean == swapped else "✓ follows" if clean else "✗ reverses"
+    return said
 
 
 def test_hostile_text_is_text(page: Page, address: str) -> None:

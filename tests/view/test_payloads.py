@@ -17,6 +17,8 @@ from probe_kit.extract import Run, open_run
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.kinds.image_swap.effects import stored_image_swaps
+from probe_kit.intervene.store.answers import stored_interventions
 from probe_kit.retention import retention_table
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
@@ -57,6 +59,24 @@ def test_an_episode_says_how_the_sheet_of_its_frames_is_divided(small_suite: Sui
     assert payload(catalogue, "run/e/00000")["frames"] == {"count": 10, "columns": 8, **size, "all": True}
     assert payload(catalogue, "run/e/00001")["frames"] == {"count": 2, "columns": 2, **size, "all": False}
     assert catalogue.picture("run", 0) == pictures[thumbnail_key(0)]
+
+
+def test_an_episode_says_how_its_action_responds_to_the_stored_image_swap(
+    catalogue: Catalogue, little: Run
+) -> None:
+    (stored,) = stored_interventions(little, "image-swap")
+    outcomes = stored.outcomes()
+    expected = {}
+    for number, name in enumerate(outcomes.episodes):
+        left = outcomes.displacement[:, number] > 0
+        goes_right = left == (outcomes.sides[number] == "left")
+        expected[str(name)] = 0 if left[0] == left[1] else 1 if goes_right[0] else -1
+    found = payload(catalogue, "run/episodes")
+    assert dict(zip(found["id"], found["swap"], strict=True)) == expected
+    assert set(expected.values()) == {-1, 0, 1}
+    shares = {name: list(expected.values()).count(value) / 24 for name, value in (("follow", 1), ("reversal", -1))}
+    effect = stored_image_swaps(little)["color"]
+    assert (effect.follow_rate, effect.reversal_rate) == pytest.approx((shares["follow"], shares["reversal"]))
 
 
 def test_an_item_that_no_fold_tests_takes_the_mean_of_the_folds_and_is_marked(little: Run) -> None:

@@ -12,7 +12,7 @@ function listOf(run) {
     const words = Object.fromEntries(COLUMNS.map((name) => [name, spread(payload[name])]));
     const best = Object.fromEntries(["backbone", "action"].map((part) => [part, payload.log_odds[part] && logOdds(payload.log_odds[part])]));
     const list = payload.id.map((id, i) => ({
-      id, position: i, number: payload.number[i], steps: payload.steps[i], distance: payload.distance[i], pair: `${id} ${payload.seeds[i]}`, frame: payload.first_frame[i],
+      id, position: i, number: payload.number[i], steps: payload.steps[i], distance: payload.distance[i], pair: `${id} ${payload.seeds[i]}`, frame: payload.first_frame[i], swap: payload.swap[i],
       ...Object.fromEntries(COLUMNS.map((name) => [name, words[name][i]])), backbone: best.backbone ? best.backbone[i] : NaN, action: best.action ? best.action[i] : NaN,
     }));
     listed.set(run, { payload, list });

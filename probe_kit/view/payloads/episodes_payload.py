@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from probe_kit.hashing import sha256_json
+from probe_kit.intervene.kinds.image_swap.effects import swap_responses_by_episode
 from probe_kit.view.payloads.coding import Packed, code_words, pack_log_odds, rounded
 from probe_kit.view.payloads.run_payload import best_places
 from probe_kit.view.viewed_run import ViewedRun
@@ -30,7 +31,8 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
     """Numbers, ids and words of all episodes in the order of the plan.
 
     `log_odds`: of the category's best sites, held out, at the inference that the probes are of, toward the correct
-    side. `seeds`: equal where scene and policy seed are equal, by which runs are paired.
+    side. `swap`: of the stored image swap, 1 where the action follows the pictures, -1 where it does the reverse,
+    else 0; None without any. `seeds`: equal where scene and policy seed are equal, by which runs are paired.
     """
     episodes = viewed.run.episodes
     none = [None] * len(episodes)
@@ -48,8 +50,14 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
             for scene, policy in zip(episodes["scene_seed"], episodes["policy_seed"], strict=True)
         ],
         "first_frame": [None if value is None else str(value)[:_SHORT] for value in _first_frames(viewed)],
+        "swap": _swap_responses(viewed),
         "log_odds": {part: _best_log_odds(viewed, part) for part in ("backbone", "action")},
     }
+
+
+def _swap_responses(viewed: ViewedRun) -> list[int | None]:
+    responses = swap_responses_by_episode(viewed.run)
+    return [responses.get(str(name)) for name in viewed.run.episodes["episode_id"]]
 
 
 def _word(value: Any) -> str | None:

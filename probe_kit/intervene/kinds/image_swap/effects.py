@@ -18,6 +18,7 @@ from probe_kit.statistics.student import unbounded_student_interval
 from probe_kit.train.data.run_reader import RunReader
 
 NAME = "image-swap"
+FOLLOWS, REVERSES = 1, -1
 SMALLEST_EFFECT_OF_INTEREST = 0.25
 """Net follow rate below which a category is not acted on; of the closed loop and the erasure too."""
 
@@ -95,8 +96,8 @@ def swap_columns(
 ) -> dict[str, Any]:
     """The columns of `ImageSwapEffect` of one category. swapped: compared with the clean condition."""
     clean, other = (outcomes.correct_sign * outcomes.of(name) for name in (CLEAN, swapped))
-    follows, reverses = (clean > 0) & (other < 0), (clean < 0) & (other > 0)
-    net = follows.astype(float) - reverses
+    responses = swap_responses(outcomes, swapped)
+    net = responses.astype(float)
     displacement = clean - other
     shares = displacement / reach.metres
     follow_p, reversal_p = swap_p_values(outcomes, swapped)
@@ -105,8 +106,8 @@ def swap_columns(
         "n_episodes": net.size,
         "n_items": np.unique(outcomes.items).size,
         "n_groups": np.unique(outcomes.groups).size,
-        "follow_rate": float(follows.mean()),
-        "reversal_rate": float(reverses.mean()),
+        "follow_rate": float((responses == FOLLOWS).mean()),
+        "reversal_rate": float((responses == REVERSES).mean()),
         "net_follow_rate": float(net.mean()),
         "net_follow_rate_ci": net_interval(net, outcomes, suite),
         "follow_p": follow_p,
@@ -118,6 +119,25 @@ def swap_columns(
         "reach_share_ci": unbounded_student_interval(shares, outcomes.groups),
         "moved_share": float(np.abs(shares).mean()),
         **{f"{side}_reached": _reached(outcomes.sides == side, clean, other, reach) for side in ("left", "right")},
+    }
+
+
+def swap_responses(outcomes: ConditionOutcomes, swapped: str = IMAGE_SWAP) -> NDArray[np.int8]:
+    """(E,) `FOLLOWS` for actions to the correct picture in both layouts, `REVERSES` to the wrong one, or 0."""
+    clean, other = (np.sign(outcomes.correct_sign * outcomes.of(name)) for name in (CLEAN, swapped))
+    return np.asarray(np.where(clean * other < 0, clean, 0), np.int8)
+
+
+def swap_responses_by_episode(run: RunReader) -> dict[str, int]:
+    """By episode id, how its action responds in the image swap that tables read; empty without a stored one.
+
+    Raises RunDamagedError.
+    """
+    stored = [result.outcomes for result in preferred_by_category(run, NAME).values()]
+    return {
+        str(name): int(response)
+        for outcomes in stored
+        for name, response in zip(outcomes.episodes, swap_responses(outcomes), strict=True)
     }
 
 
