@@ -54,14 +54,19 @@ def test_a_chunk_is_the_sum_of_cosines_that_its_coefficients_weigh(fast: FastTok
 def test_tokens_of_lerobots_class_decode_as_lerobots_class_decodes_them(
     fast: FastTokenizer, fast_files: Path
 ) -> None:
+    """Its encoding loses coefficients that it was not trained on. It then decodes zeros; here it is a problem."""
     theirs, chunks = fast_processor(fast_files), smooth_chunks(40, seed=7)
     tokens = theirs(chunks)
     wanted = theirs.decode(tokens, time_horizon=CHUNK, action_dim=ACTIONS)
-    for row, expected, chunk in zip(tokens, wanted, chunks, strict=True):
-        found = fast.decode(row, CHUNK, ACTIONS)
-        assert found.problems == ()
-        np.testing.assert_array_equal(found.values, expected)
-        assert np.abs(found.values - chunk).max() < 0.5 * np.sqrt(CHUNK) / fast.scale * 2
+    found = [fast.decode(row, CHUNK, ACTIONS) for row in tokens]
+    assert 1 <= sum(bool(one.problems) for one in found) <= 20
+    for ours, expected, chunk in zip(found, wanted, chunks, strict=True):
+        if ours.problems:
+            assert not expected.any()
+            assert ours.values.any()
+        else:
+            np.testing.assert_array_equal(ours.values, expected)
+            assert np.abs(ours.values - chunk).max() < np.sqrt(CHUNK) / fast.scale
 
 
 def test_what_is_no_whole_chunk_is_a_problem_and_never_zeros_in_silence(fast: FastTokenizer) -> None:
