@@ -1,4 +1,6 @@
-"""Record a golden reference of pi0, pi0.5 or pi0-FAST: what lerobot's own code puts out for a tiny checkpoint.
+"""Record a golden reference of pi0, pi0.5, pi0-FAST or MolmoAct2: what lerobot's own code puts out.
+
+The checkpoint is a tiny one.
 
     uv run python scripts/record_reference.py CHECKPOINT FOLDER --cameras base
 
@@ -183,6 +185,95 @@ def record_tokens(policy: Any, batch: dict[str, Tensor]) -> dict[str, np.ndarray
     return {name: value.detach().numpy() for name, value in found.items()}
 
 
+def record_layers(checkpoint: Path, config: Any, seed: int) -> dict[str, np.ndarray]:
+    """Every quantity of one inference of MolmoAct2; see `hooks.families.molmoact2.verify`.
+
+    The instructions are equally long, because lerobot counts positions from its padding on.
+    """
+    from lerobot.policies.molmoact2.processor_molmoact2 import make_molmoact2_pre_post_processors
+
+    from probe_kit.models.lerobot.molmoact2 import lerobots_policy, network_config
+
+    place, rng = checkpoint / config.checkpoint_path, np.random.default_rng(seed)
+    policy = lerobots_policy(config, network_config(place), place)
+    policy.load_state_dict(load_file(checkpoint / "model.safetensors"))
+    config.action_mode, config.dataset_feature_names = "continuous", {"action": [*"xyzabc", "gripper"]}
+    low, high = quantiles(checkpoint, "preprocessor", "observation.state")
+    least, most = quantiles(checkpoint, "postprocessor", "action")
+    statistics = {"observation.state": {"q01": low, "q99": high}, "action": {"q01": least, "q99": most}}
+    tensors = {
+        key: {name: torch.from_numpy(own) for name, own in rows.items()} for key, rows in statistics.items()
+    }
+    before, behind = make_molmoact2_pre_post_processors(config, tensors)
+    tasks = ("put the cube on the star", "put the cube on the moon")
+    raw = rng.uniform(low, high, (len(tasks), len(low))).astype(np.float32)
+    pictures = rng.integers(0, 256, (len(tasks), 24, 40, 3), np.uint8)
+    batch = before(
+        {
+            "observation.images.image": torch.from_numpy(pictures).permute(0, 3, 1, 2),
+            "observation.state": torch.from_numpy(raw),
+            "task": list(tasks),
+        }
+    )
+    found: dict[str, Any] = {name: batch[name] for name in ("input_ids", "attention_mask", "pixel_values")}
+    backbone, inputs = policy._backbone(), policy._model_inputs(batch)
+    found["vision_resid"] = tower_streams(backbone, inputs)
+    outputs = backbone(**inputs, use_cache=True, output_hidden_states=True)
+    found["backbone_resid"] = torch.stack(outputs.hidden_states[:-1])
+    found["backbone_final_norm"] = outputs.last_hidden_state
+    states = backbone._extract_kv_states(outputs.past_key_values)
+    found |= {name: torch.stack([own[part] for own in states]) for part, name in enumerate(("keys", "values"))}
+    expert, steps = backbone.action_expert, config.num_inference_steps
+    moved = torch.randn((len(tasks), config.chunk_size, 32), generator=torch.Generator().manual_seed(seed))
+    found["in_noise"] = moved
+    padded = batch["action_dim_is_pad"]
+    moved = moved.masked_fill(padded[:, None], 0)
+    context = expert.prepare_context(
+        encoder_kv_states=states,
+        encoder_attention_mask=backbone._get_encoder_attention_mask(inputs["input_ids"], inputs["attention_mask"]),
+        batch_size=len(tasks), seq_len=config.chunk_size, device=moved.device, dtype=moved.dtype,
+    )  # fmt: skip
+    columns: dict[str, list[Tensor]] = {"expert_resid": [], "expert_final_norm": [], "velocity": []}
+    for step in range(steps):
+        condition = expert._time_conditioning(torch.full((len(tasks),), step / steps))
+        stream, entering = expert.action_embed(moved), []
+        for block, kv in zip(expert.blocks, context.kv_contexts, strict=True):
+            entering.append(stream)
+            stream = block(
+                stream, condition, cross_kv=kv, attn_mask=context.cross_mask, rope_cache=context.rope_cache
+            )
+        velocity = expert.final_layer(stream, condition)
+        moved = (moved + velocity / steps).masked_fill(padded[:, None], 0)
+        values = (torch.stack([*entering, stream]), expert.final_layer.norm(stream), velocity)
+        for name, value in zip(columns, values, strict=True):
+            columns[name].append(value)
+    found |= {name: torch.stack(values) for name, values in columns.items()}
+    generator = torch.Generator().manual_seed(seed)
+    found["actions"] = policy.predict_action_chunk(batch, generator=generator, inference_action_mode="continuous")
+    apart = float((found["actions"] - moved[..., : len(least)]).abs().max())
+    if apart > 1e-6:
+        raise SystemExit(f"lerobot's blocks, called one by one, give actions that are off by {apart:.3g}")
+    found["actions_unnormalized"] = behind(found["actions"])
+    arrays = {name: value.detach().numpy() for name, value in found.items()}
+    return arrays | {"in_raw_state": raw, "in_image_image": pictures, "in_tasks": np.array(tasks)}
+
+
+def tower_streams(backbone: Any, inputs: dict[str, Tensor]) -> Tensor:
+    """(L, crops, N, D) entering each block of MolmoAct2's tower."""
+    visual = backbone.vision_backbone
+    crops, _ = backbone.merge_visual_inputs(
+        **{name: inputs[name] for name in ("input_ids", "pixel_values", "image_token_pooling", "image_grids")},
+        image_num_crops=inputs["image_num_crops"],
+    )
+    pixels = torch.round((crops + 1) * 0.5 * 255).clamp(0, 255) / 255 * 2 - 1
+    stream = visual.image_vit.patch_embedding(pixels.flatten(0, 1))
+    stream, found = visual.image_vit.add_pos_emb(stream, visual.image_vit.config.image_num_patch), []
+    for block in visual.image_vit.transformer.resblocks:
+        found.append(stream)
+        stream = block(stream)
+    return torch.stack(found)
+
+
 def vision_streams(joint: Any, image: Tensor) -> Tensor:
     """(L + 1, B, N, D): the embeddings, then what each block of the tower puts out."""
     tower = joint.paligemma.model.vision_tower.vision_model
@@ -229,6 +320,11 @@ def main() -> None:
     parser.add_argument("--cameras", nargs="+", default=["base"])
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
+    config: Any = PreTrainedConfig.from_pretrained(chosen.checkpoint)
+    if config.type == "molmoact2":
+        with torch.inference_mode():
+            write(chosen, config.type, record_layers(chosen.checkpoint, config, chosen.seed))
+        return
     policy, rng = lerobots_policy(chosen.checkpoint), np.random.default_rng(chosen.seed)
     low, high = quantiles(chosen.checkpoint, "preprocessor", "observation.state")
     raw = rng.uniform(low, high, (len(TASKS), len(low))).astype(np.float32)
@@ -259,6 +355,11 @@ def main() -> None:
         found["in_noise"] = noise.numpy()
     found["in_lang_tokens"] = text["input_ids"].numpy()
     found |= {f"in_image_{name}": picture for name, picture in zip(chosen.cameras, pictures, strict=True)}
+    write(chosen, config.type, found)
+
+
+def write(chosen: argparse.Namespace, kind: str, found: dict[str, np.ndarray]) -> None:
+    """The reference beside a copy of the checkpoint, and where both come from."""
     chosen.folder.mkdir(parents=True, exist_ok=True)
     shutil.copytree(chosen.checkpoint, chosen.folder / "checkpoint", dirs_exist_ok=True)
     np.savez_compressed(chosen.folder / "reference.npz", **found)
@@ -268,8 +369,8 @@ def main() -> None:
         "lerobot": lerobot.__version__,
     }
     (chosen.folder / "README.md").write_text(
-        f"# Golden reference: {config.type}\n\nRecorded by `scripts/record_reference.py` with lerobot's own "
-        f"blocks, called one by one; {WEIGHTS.get(config.type, 'random weights')}. {json.dumps(versions)}\n",
+        f"# Golden reference: {kind}\n\nRecorded by `scripts/record_reference.py` with lerobot's own "
+        f"blocks, called one by one; {WEIGHTS.get(kind, 'random weights')}. {json.dumps(versions)}\n",
         encoding="utf-8",
     )
 

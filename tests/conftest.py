@@ -125,6 +125,11 @@ def golden_pi0_fast() -> Path:
 
 
 @pytest.fixture(scope="session")
+def golden_molmoact2() -> Path:
+    return _golden("molmoact2")
+
+
+@pytest.fixture(scope="session")
 def golden_smolvla() -> Path:
     return _golden("smolvla")
 

@@ -23,6 +23,7 @@ FOLDERS = (
     "pi0",
     "pi05",
     "pi0_fast",
+    "molmoact2",
     "smolvla",
     "openvla",
     "spatialvla",

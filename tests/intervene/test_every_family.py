@@ -33,6 +33,7 @@ from probe_kit.intervene.replay.conditions import Intervention
 from probe_kit.suite import Suite
 from tests.support.internvla_checkpoints import write_checkpoint as write_internvla
 from tests.support.magma_checkpoints import write_checkpoint as write_magma
+from tests.support.molmoact2_checkpoints import write_molmoact2
 from tests.support.pi0_fast_checkpoints import write_pi0_fast
 from tests.support.pi05_checkpoints import write_pi05
 from tests.support.prismatic_checkpoints import write_checkpoint as write_openvla
@@ -58,6 +59,7 @@ FAMILIES = {
     "pi0": Tiny(golden="golden_pi0"),
     "pi05": Tiny(write_pi05),
     "pi0-fast": Tiny(write_pi0_fast),
+    "molmoact2": Tiny(write_molmoact2),
     "smolvla": Tiny(golden="golden_smolvla"),
     "openvla": Tiny(write_openvla, options={"tokenizer": "bytes"}),
     "spatialvla": Tiny(write_spatialvla),

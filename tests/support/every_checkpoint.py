@@ -7,6 +7,7 @@ from typing import Any
 from tests.support import (
     internvla_checkpoints,
     magma_checkpoints,
+    molmoact2_checkpoints,
     pi0_checkpoints,
     pi0_fast_checkpoints,
     pi05_checkpoints,
@@ -22,6 +23,7 @@ WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "pi0": (pi0_checkpoints.write_intact, {}),
     "pi05": (pi05_checkpoints.write_pi05, {}),
     "pi0-fast": (pi0_fast_checkpoints.write_pi0_fast, {}),
+    "molmoact2": (molmoact2_checkpoints.write_molmoact2, {}),
     "smolvla": (smolvla_checkpoints.write_smolvla, {}),
     "openvla": (prismatic_checkpoints.write_checkpoint, _BYTES),
     "prismatic": (prismatic_checkpoints.write_checkpoint, _BYTES),

@@ -79,7 +79,7 @@ class EvaluatedPi0(LerobotFlow):
             "proprio, or none if its numbers are metres and radians"
         )
 
-    def _own(self, feature: str, kind: str) -> Normaliser | None:
+    def _own(self, feature: str, kind: str) -> Units | None:
         try:
             return self.own_units(feature, kind)
         except CheckpointError:

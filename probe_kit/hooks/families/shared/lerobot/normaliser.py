@@ -17,6 +17,12 @@ from probe_kit.models.bounds import check_bounds, check_deviations
 from probe_kit.models.lerobot.pi0_keys import STATISTICS
 
 _EPS = 1e-8
+_STEPS = (
+    "normalizer_processor",
+    "unnormalizer_processor",
+    "molmoact2_masked_normalizer",
+    "molmoact2_masked_unnormalizer",
+)
 # The two statistics each mode needs, as (offset-like, scale-like).
 _NEEDED = {"MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99")}
 
@@ -100,7 +106,7 @@ def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Nor
         raise CheckpointError(f"{path} is missing: without it the units of {feature} are unknown")
     steps = read_json_object(path, CheckpointError, "Download the checkpoint again").get("steps")
     for step in steps if isinstance(steps, list) else ():
-        if step["registry_name"] in ("normalizer_processor", "unnormalizer_processor"):
+        if step["registry_name"] in _STEPS:
             config = step["config"]
             mode = config["norm_map"].get(kind, "IDENTITY")
             if mode == "IDENTITY":

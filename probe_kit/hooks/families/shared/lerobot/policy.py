@@ -28,7 +28,6 @@ from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.normaliser import (
-    Normaliser,
     Units,
     from_buffers,
     read_buffers,
@@ -116,11 +115,6 @@ class LerobotPolicy(Policy):
     @abstractmethod
     def masked_cameras(self) -> int:
         """Cameras without a picture that still occupy positions, masked, after the shown ones."""
-
-    @property
-    @abstractmethod
-    def tokens_per_camera(self) -> int:
-        """Patches of one picture in the backbone."""
 
     @abstractmethod
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
@@ -401,7 +395,7 @@ class LerobotPolicy(Policy):
             "its units are unknown"
         )
 
-    def own_units(self, feature: str, kind: str) -> Normaliser | None:
+    def own_units(self, feature: str, kind: str) -> Units | None:
         """What the checkpoint itself says: its processor files, or old buffers; None if it normalises nothing."""
         pipeline = "policy_preprocessor" if kind == "STATE" else "policy_postprocessor"
         if (self.folder / f"{pipeline}.json").is_file():

@@ -58,7 +58,8 @@ class TokenStack(Stack):
 
 def _projection(attention: Any) -> Any:
     """The output projection of an attention of a language model or a vision tower."""
-    return getattr(attention, "o_proj", None) or attention.out_proj
+    names = ("o_proj", "out_proj", "attn_out")
+    return next(getattr(attention, name) for name in names if hasattr(attention, name))
 
 
 def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int) -> dict[str, Stack]:

@@ -23,6 +23,20 @@ def digits(state: NDArray[np.float32]) -> list[str]:
     return [" ".join(map(str, row)) for row in np.digitize(state, BINS) - 1]
 
 
+def label_groups(pieces: Sequence[str], pattern: re.Pattern[str]) -> list[str]:
+    """A label per piece of a text: the named group of `pattern` that it has characters in, else `special`."""
+    ends = np.cumsum([len(piece) for piece in pieces])
+    labels = ["special"] * len(pieces)
+    if (found := pattern.search("".join(pieces))) is None:
+        return labels
+    for role in pattern.groupindex:
+        first, last = found.span(role)
+        for position, (piece, end) in enumerate(zip(pieces, ends, strict=True)):
+            if piece and end - len(piece) < last and end > first:
+                labels[position] = role
+    return labels
+
+
 class StatePrompt(LerobotPolicy):
     """A lerobot policy that reads its state in its prompt."""
 
@@ -45,16 +59,8 @@ class StatePrompt(LerobotPolicy):
             "" if one in special or not kept else piece.replace("\u2581", " ")
             for one, kept, piece in zip(ids, valid, self.tokenizer.convert_ids_to_tokens(list(ids)), strict=True)
         ]
-        ends = np.cumsum([len(piece) for piece in pieces])
-        labels = ["special" if kept else PADDING for kept in valid]
-        if (found := _PROMPT.search("".join(pieces))) is None:
-            return labels
-        for role in ("language", "state"):
-            first, last = found.span(role)
-            for position, (piece, end) in enumerate(zip(pieces, ends, strict=True)):
-                if piece and end - len(piece) < last and end > first:
-                    labels[position] = role
-        return labels
+        labels = label_groups(pieces, _PROMPT)
+        return [label if kept else PADDING for label, kept in zip(labels, valid, strict=True)]
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each prompt without padding and without the digits, which change at every inference."""

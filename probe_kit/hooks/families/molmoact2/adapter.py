@@ -1,0 +1,278 @@
+"""The adapter for MolmoAct2.
+
+Prefix: crops of every picture, then a prompt with the instruction and the state as tokens. Only pictures attend
+both ways.
+Suffix: the action chunk. Block n of the expert attends to the keys and values of block n of the backbone.
+
+Source: arXiv 2605.02881, through lerobot's `MolmoAct2Policy`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.numpy import load_file
+from torch import Tensor, nn
+
+from probe_kit.errors import CaptureError, CheckpointError
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, side_files
+from probe_kit.hooks.contract.model import Tap
+from probe_kit.hooks.contract.observation import Observation, checked_picture
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import Site, Stream, kv_stream
+from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.molmoact2 import EXPERT, LAYERWISE
+from probe_kit.hooks.families.molmoact2.packing import PackedRow, Packing, padded_labels
+from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser, Units
+from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
+from probe_kit.hooks.families.shared.lerobot.stacks import Stack
+from probe_kit.hooks.families.shared.prompt_kv import kv_tap
+from probe_kit.models.lerobot.molmoact2 import build_molmoact2, flow_actions, network_config, uses_cuda_graphs
+
+
+@dataclass(frozen=True)
+class ClampedUnits:
+    """Units with numbers between −1 and 1, and numbers that stay as they are. mask: False for those."""
+
+    units: Normaliser
+    mask: NDArray[np.bool_]
+
+    @property
+    def mode(self) -> str:
+        """The kind of map."""
+        return self.units.mode
+
+    @property
+    def source(self) -> str:
+        """The file the statistics come from."""
+        return self.units.source
+
+    def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Physical units to the numbers the network reads; (..., D)."""
+        return np.where(self.mask, self.units.normalise(values).clip(-1, 1), values).astype(np.float32)
+
+    def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Network output to physical units; (..., D)."""
+        inside = values.clip(-1, 1)
+        return np.where(self.mask, self.units.restore(inside), inside).astype(np.float32)
+
+    def slope(self, numbers: int) -> NDArray[np.float32]:
+        """(D,) of `restore`, where it does not clip."""
+        return np.where(self.mask, self.units.slope(numbers), 1).astype(np.float32)
+
+
+class ExpertStack(Stack):
+    """The expert: what a block adds is read behind its gates, and its end in front of the last modulation."""
+
+    def tap(self, site: Site) -> Tap:
+        """As in other stacks, with two attentions in a block."""
+        if site.quantity in ("attention", "cross_attention", "mlp") and site.layer < len(self.layers):
+            gate = getattr(self.layers[site.layer], f"{site.quantity}_gate")
+            return Tap(gate, self.iterations or 1, "output")
+        return super().tap(site)
+
+    def stream(self, name: str) -> Stream:
+        """Without heads: keys of its self-attention are its own positions, not the prompt's."""
+        return Stream(name, len(self.layers) + 1, self.width, self.iterations, quantities=EXPERT, sums=False)
+
+
+class TowerStack(Stack):
+    """The vision tower, whose last blocks are read in two places and meet no final norm."""
+
+    def stream(self, name: str) -> Stream:
+        """What enters each block."""
+        return Stream(name, len(self.layers), self.width, part="vision", quantities=("residual",))
+
+
+class MolmoAct2(LerobotPolicy):
+    """A loaded MolmoAct2."""
+
+    family = "molmoact2"
+    config_type = "molmoact2"
+    interventions = LAYERWISE
+    unread = ("model.lm_head.weight",)
+
+    acting_stream = "expert"
+    other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
+    suffix_roles = ("action",)
+    masked_cameras = 0
+
+    def __init__(self, network: Any, folder: Path) -> None:
+        super().__init__(network, folder)
+        text = network.model.config.text_config
+        self.prompt_kv = kv_stream(int(text.num_hidden_layers), int(text.num_key_value_heads * text.head_dim))
+
+    # -- loading -----------------------------------------------------------------------------------------
+
+    @classmethod
+    def build(cls, config: Any, folder: Path) -> nn.Module:
+        """lerobot's policy of the size that the VLM's configuration has. Raises CheckpointError."""
+        if config.enable_lora_vlm:
+            raise CheckpointError(f"{folder} holds LoRA adapters; merge them into its weights with lerobot first")
+        if config.action_mode == "discrete":
+            raise CheckpointError(f"{folder} was trained for discrete actions only; the flow expert acts here")
+        config.model_dtype = getattr(config, "dtype", None) or config.model_dtype
+        config.inference_action_mode = "continuous"
+        place = network_folder(folder, config.checkpoint_path)
+        network: nn.Module = build_molmoact2(config, network_config(place), place)
+        return network
+
+    @classmethod
+    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """As lerobot stores them."""
+        return dict(tensors)
+
+    def side_files(self) -> dict[str, Path]:
+        """Also the VLM's configuration and tokenizer."""
+        return {**super().side_files(), **side_files(Path(self.config.checkpoint_path), "vlm/")}
+
+    def own_units(self, feature: str, kind: str) -> Units | None:
+        """Clamped, and without the numbers that a mask leaves as they are."""
+        units = super().own_units(feature, kind)
+        if units is None or units.mode == "IDENTITY":
+            return units
+        assert isinstance(units, Normaliser)
+        stored = load_file(self.folder / units.source).get(f"{feature}.mask")
+        mask = np.ones(units.low.shape, bool) if stored is None else stored.astype(bool)
+        return ClampedUnits(units, mask)
+
+    # -- acting ------------------------------------------------------------------------------------------
+
+    def batch(self, seen: Sequence[Observation], state: NDArray[np.float32] | None = None) -> dict[str, Tensor]:
+        """In lerobot's keys; see `Packing`. state: (B, numbers) as the network reads them."""
+        packed = self.packing.batch(self._rows(seen, self.state(seen) if state is None else state))
+        return {name: tensor.to(self.config.device) for name, tensor in packed.items()}
+
+    def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """The end of the flow from the noise of the seeds."""
+        chunk: NDArray[np.float32] = self.infer(batch, self.noise(seeds)).float().cpu().numpy()
+        return chunk
+
+    def infer(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
+        """(B, chunk, D) normalised actions from noise (B, chunk, 32). Raises CaptureError for CUDA graphs."""
+        self._check_graphs()
+        with torch.inference_mode():
+            end = flow_actions(self.network, batch, noise, batch["action_dim_is_pad"])
+        return end[..., : self._action_numbers]
+
+    def noise(self, seeds: Sequence[int]) -> Tensor:
+        """(B, chunk, 32) float32 flow noise, a row per seed, the same on every device."""
+        shape = (self.config.chunk_size, self.config.expected_max_action_dim)
+        rows = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+        return torch.stack(rows).to(self.config.device)
+
+    @property
+    def _action_numbers(self) -> int:
+        return int(self.config.output_features["action"].shape[0])
+
+    def _check_graphs(self) -> None:
+        if uses_cuda_graphs(self.network):
+            raise CaptureError(
+                "CUDA graphs of this MolmoAct2 are on: a replayed graph runs no hook, and captures would be old. "
+                "Call network._set_inference_cuda_graph_enabled(False)"
+            )
+
+    # -- the prompt --------------------------------------------------------------------------------------
+
+    @cached_property
+    def packing(self) -> Packing:
+        """lerobot's packing."""
+        return Packing(self.config, self._action_numbers)
+
+    @cached_property
+    def tokenizer(self) -> Any:
+        """The VLM's."""
+        return self.packing.tokenizer
+
+    def _rows(self, seen: Sequence[Observation], state: NDArray[np.float32]) -> list[PackedRow]:
+        pictures = [
+            {camera: checked_picture(one.image if camera == self.cameras[0] else one.cameras[camera])
+             for camera in self.shown}
+            for one in seen
+        ]  # fmt: skip
+        rows = zip(pictures, seen, state, strict=True)
+        return [self.packing.row(shown, one.instruction, own) for shown, one, own in rows]
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """From the packing itself."""
+        zeros = np.zeros((len(seen), self._state_numbers), np.float32)
+        rows = self._rows(seen, zeros if self.zero_filled_inputs() else self.state(seen))
+        suffix = Roles.from_labels(self.suffix_labels())
+        return {
+            "backbone": [Roles.from_labels(labels) for labels in padded_labels(rows)],
+            "expert": [suffix] * len(rows),
+        }
+
+    def prefix_labels(self, language: Sequence[str]) -> list[str]:
+        """The packing says every position."""
+        return list(language)
+
+    def suffix_labels(self) -> list[str]:
+        """The chunk."""
+        return ["action"] * int(self.config.chunk_size)
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each prompt, without pictures and without the state, which change at every inference."""
+        size = tuple(self.config.image_features[f"observation.images.{self.cameras[0]}"].shape[-2:])
+        blank = {camera: np.zeros((*size, 3), np.uint8) for camera in self.shown}
+        state = np.zeros(self._state_numbers, np.float32)
+        rows = [self.packing.row(blank, text, state) for text in instructions]
+        return [
+            tuple(
+                one
+                for one, label in zip(row.inputs["input_ids"][0].tolist(), row.labels, strict=True)
+                if label in ("language", "special")
+            )
+            for row in rows
+        ]
+
+    # -- capture -----------------------------------------------------------------------------------------
+
+    def _show(self, cameras: tuple[str, ...]) -> None:
+        self.shown = cameras
+        self.further_streams = {"vision": self.stacks["vision"].stream("vision")}
+        images = tuple(f"image.{camera}" for camera in cameras)
+        self.role_names = {"backbone": (*images, *self.other_roles, PADDING), "expert": self.suffix_roles}
+
+    def _stacks(self) -> dict[str, Stack]:
+        backbone = self.network._backbone()
+        text, expert, tower = backbone.transformer, backbone.action_expert, backbone.vision_backbone.image_vit
+        steps = int(self.config.num_inference_steps or backbone.config.flow_matching_num_steps)
+        last = expert.final_layer.norm
+        return {
+            "backbone": Stack(text.blocks, text.ln_f, text.config.hidden_size, None, "attn_norm"),
+            "expert": ExpertStack(expert.blocks, last, expert.config.hidden_size, steps, "self_norm"),
+            "vision": TowerStack(
+                tower.transformer.resblocks, last, tower.config.hidden_size, None, "attention_norm"
+            ),
+        }
+
+    def tap(self, site: Site) -> Tap:
+        """The first norm of the block the site enters, the final norm, or what a block adds behind its gate."""
+        self._check_graphs()
+        stream = self.stream_of(site)
+        if stream is self.prompt_kv:
+            return kv_tap(self.network._backbone().prompt_kv, site)
+        return self.stacks[site.stream].tap(site)
+
+
+def network_folder(folder: Path, named: str) -> Path:
+    """Where the VLM's configuration and tokenizer lie: in the checkpoint, or on the hub, without its weights."""
+    inside = folder / named
+    return inside if inside.is_dir() else checkpoint_folder(named, SMALL_FILES)
+
+
+def load_molmoact2(
+    checkpoint: str,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    weights_seed: int = 0,
+) -> MolmoAct2:
+    """Load a lerobot MolmoAct2 checkpoint; see `LerobotPolicy.load`."""
+    return MolmoAct2.load(checkpoint, device, dtype, random_weights, weights_seed)

@@ -1,0 +1,198 @@
+"""MolmoAct2 keeps the contract, gives lerobot's actions, and refuses CUDA graphs while it is captured."""
+
+import shutil
+from copy import copy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies.molmoact2.processor_molmoact2 import (
+    make_molmoact2_pre_post_processors,
+)
+from safetensors.torch import load_file, save_file
+
+from probe_kit.errors import CaptureError, CheckpointError, InstructionError, WeightsError
+from probe_kit.hooks import Observation, capture
+from probe_kit.hooks.families.molmoact2.adapter import MolmoAct2, load_molmoact2
+from probe_kit.hooks.testing import AdapterContract
+from probe_kit.models.lerobot import molmoact2 as network
+from tests.support.molmoact2_checkpoints import MASK, write_molmoact2
+from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_molmoact2(tmp_path_factory.mktemp("molmoact2"))
+
+
+@pytest.fixture(scope="module")
+def molmoact2(folder: Path) -> MolmoAct2:
+    return load_molmoact2(str(folder))
+
+
+@pytest.fixture
+def seen(molmoact2: MolmoAct2) -> list[Observation]:
+    return AdapterContract.examples(molmoact2, "Put the cube on the star", "Put the cube on the red shape")
+
+
+class TestMolmoAct2(AdapterContract):
+    family = "molmoact2"
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self, folder: Path) -> Path:
+        return folder
+
+    @pytest.fixture
+    def policy(self, molmoact2: MolmoAct2) -> MolmoAct2:
+        return molmoact2
+
+
+def test_actions_are_those_of_lerobots_own_policy_bit_for_bit(
+    molmoact2: MolmoAct2, folder: Path, seen: list[Observation]
+) -> None:
+    """Its own sampling, with its own blocks, draws the noise of the same seed."""
+    batch = molmoact2.batch(seen[:1])
+    ours = molmoact2.infer(batch, molmoact2.noise([5]))
+    place = folder / "vlm"
+    plain = network.lerobots_policy(molmoact2.config, network.network_config(place), place)
+    assert not hasattr(plain._backbone().action_expert.blocks[0], "mlp_gate")
+    plain.load_state_dict(molmoact2.network.state_dict())
+    theirs = plain.predict_action_chunk(batch, generator=torch.Generator().manual_seed(5))
+    torch.testing.assert_close(theirs, ours, rtol=0, atol=0)
+    assert theirs.abs().max() > 0.1
+
+
+def test_the_network_reads_what_lerobots_processors_make(molmoact2: MolmoAct2, seen: list[Observation]) -> None:
+    """From the raw observation: units, clamped numbers, words, pictures, and back to metres."""
+    statistics = {"observation.state": {"q01": LOW, "q99": HIGH}, "action": {"q01": LEAST, "q99": MOST}}
+    config = copy(molmoact2.config)
+    config.action_mode = "continuous"  # the other one reads a FAST tokenizer on the hub
+    config.dataset_feature_names = {"action": [*"xyzabc", "gripper"]}
+    tensors = {
+        key: {name: torch.from_numpy(own) for name, own in rows.items()} for key, rows in statistics.items()
+    }
+    before, behind = make_molmoact2_pre_post_processors(config, tensors)
+    one = seen[0]
+    theirs = before(
+        {
+            "observation.images.image": torch.from_numpy(one.image).permute(2, 0, 1),
+            "observation.state": torch.from_numpy(np.asarray(one.state, np.float32)),
+            "task": one.instruction,
+        }
+    )
+    ours = molmoact2.batch([one])
+    for name in ("input_ids", "attention_mask", "token_type_ids", "pixel_values", "image_token_pooling"):
+        torch.testing.assert_close(ours[name], theirs[name], rtol=0, atol=0)
+    chunk = torch.linspace(-1.5, 1.5, 28).reshape(1, 4, 7)
+    restored = molmoact2.action_units.restore(chunk.numpy())
+    np.testing.assert_allclose(restored, behind(chunk).numpy(), atol=1e-6)
+    assert (restored[..., ~MASK] == chunk.numpy()[..., ~MASK].clip(-1, 1)).all()
+
+
+def test_cuda_graphs_are_off_and_an_error_while_they_are_on(folder: Path, seen: list[Observation]) -> None:
+    policy = load_molmoact2(str(folder))
+    assert not network.uses_cuda_graphs(policy.network)
+    policy.network._set_inference_cuda_graph_enabled(True)
+    with pytest.raises(CaptureError, match="CUDA graphs"), capture(policy, policy.sites()):
+        policy.act(seen, [0, 0])
+    with pytest.raises(CaptureError, match="CUDA graphs"):
+        policy.act(seen, [0, 0])
+
+
+def test_every_block_of_the_expert_reads_the_keys_and_values_of_its_own_layer(
+    molmoact2: MolmoAct2, seen: list[Observation]
+) -> None:
+    """Zeros in block n's change what block n of the expert reads, and nothing that enters it."""
+    from probe_kit.hooks import Site, edit
+
+    read = [Site("expert", layer, "cross_attention", 0) for layer in range(2)]
+    entering = [Site("expert", layer, iteration=0) for layer in range(3)]
+    with capture(molmoact2, [*read, *entering]) as plain:
+        molmoact2.act(seen, [0, 0])
+    for layer in range(2):
+        with (
+            edit(molmoact2, {Site("kv", layer, "values"): torch.zeros_like}),
+            capture(molmoact2, [*read, *entering]) as changed,
+        ):
+            molmoact2.act(seen, [0, 0])
+        assert torch.equal(plain[entering[layer]], changed[entering[layer]])
+        assert not torch.equal(plain[read[layer]], changed[read[layer]])
+
+
+def test_what_a_block_adds_makes_the_next_residual_with_both_attentions(
+    molmoact2: MolmoAct2, seen: list[Observation]
+) -> None:
+    stream = molmoact2.streams["expert"]
+    parts = [site for name in ("residual", "attention", "cross_attention", "mlp") for site in stream.sites(name)]
+    with capture(molmoact2, parts) as cache:
+        molmoact2.act(seen, [0, 0])
+    for site in stream.sites("mlp"):
+        added = sum(
+            cache[replace(site, quantity=name)] for name in ("residual", "attention", "cross_attention", "mlp")
+        )
+        behind = cache[replace(site, layer=site.layer + 1, quantity="residual")]
+        torch.testing.assert_close(added, behind, rtol=0, atol=1e-5)
+
+
+def test_roles_name_pictures_instruction_and_state(molmoact2: MolmoAct2, seen: list[Observation]) -> None:
+    row = molmoact2.packing.row({"image": seen[0].image}, "Put the cube on the star", np.zeros(8, np.float32))
+    pieces = molmoact2.tokenizer.convert_ids_to_tokens(row.inputs["input_ids"][0].tolist())
+    by_role = {role: "".join(piece for piece, label in zip(pieces, row.labels, strict=True) if label == role)
+               for role in ("language", "state", "image.image")}  # fmt: skip
+    assert by_role["language"].replace("\u0120", " ") == "put the cube on the star"
+    assert by_role["state"] == "<state_8>" * 8
+    assert by_role["image.image"] == "<im_patch>" * by_role["image.image"].count("<im_patch>")
+
+
+def test_two_cameras_are_told_apart(tmp_path: Path) -> None:
+    policy = load_molmoact2(str(write_molmoact2(tmp_path, cameras=("image", "wrist")))).showing(["image", "wrist"])
+    (one,) = AdapterContract.examples(policy, "put the cube on the star")
+    one = replace(one, cameras={"wrist": one.image[:, ::-1].copy()})
+    (roles,) = policy.roles([one])["backbone"]
+    counts = [int(roles.mask(f"image.{camera}").sum()) for camera in ("image", "wrist")]
+    assert counts[0] == counts[1] > 0
+    assert np.isfinite(policy.act([one], [0])).all()
+
+
+def test_a_prompt_that_does_not_fit_is_refused_and_never_cut(
+    molmoact2: MolmoAct2, seen: list[Observation]
+) -> None:
+    with pytest.raises(InstructionError, match="does not fit"):
+        molmoact2.act([replace(seen[0], instruction="put the cube on " + "the red shape " * 30)], [0])
+
+
+@pytest.mark.parametrize(("field", "value"), [("action_mode", "discrete"), ("enable_lora_vlm", True)])
+def test_what_the_flow_expert_cannot_do_is_refused(
+    folder: Path, tmp_path: Path, field: str, value: object
+) -> None:
+    import json
+
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    config = json.loads((tmp_path / "config.json").read_text(encoding="utf-8"))
+    config |= {field: value, "inference_action_mode": None}
+    (tmp_path / "config.json").write_text(json.dumps(config), encoding="utf-8")
+    with pytest.raises(CheckpointError):
+        load_molmoact2(str(tmp_path))
+
+
+def test_weights_without_an_expert_are_refused(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    tensors = load_file(tmp_path / "model.safetensors")
+    save_file(
+        {name: own for name, own in tensors.items() if "action_expert" not in name}, tmp_path / "model.safetensors"
+    )
+    with pytest.raises(WeightsError, match="action_expert"):
+        load_molmoact2(str(tmp_path))
+
+
+@pytest.mark.slow  # seconds for a network of 48 layers, on the meta device
+def test_the_default_size_has_the_tensors_of_lerobots_network() -> None:
+    """Gates add no parameter. The released configuration is on the hub."""
+    ours = network.full_size_molmoact2().state_dict()
+    with torch.device("meta"):
+        theirs = network.MolmoAct2ForConditionalGeneration(network.network_config()).state_dict()
+    assert {name: tensor.shape for name, tensor in ours.items()} == {
+        f"model.{name}": tensor.shape for name, tensor in theirs.items()
+    }
