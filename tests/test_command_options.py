@@ -30,7 +30,7 @@ from probe_kit.extract.run_layout import (
     VideoChoice,
 )
 from probe_kit.extract.settings import SCENE_OPTIONS, AskSettings, ExtractSettings
-from probe_kit.extract.store.export import WRITERS
+from probe_kit.extract.store.export import FOLDER_WRITERS, WRITERS
 from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
 from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.hooks.contract.protocol import ROTATIONS, ProtocolName
@@ -85,7 +85,7 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("intervene", "--kind"): KINDS,
     ("intervene", "--readout"): get_args(Readout),
     ("intervene", "--format"): get_args(get_args(Format)[0]),
-    ("export", "--format"): WRITERS,
+    ("export", "--format"): WRITERS | FOLDER_WRITERS,
     ("retention", "--format"): get_args(TableFormat),
     ("retention", "--details"): (*get_args(Section), "all"),
     ("retention", "--rule"): RULES,
@@ -146,7 +146,8 @@ def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> No
         (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Target, TARGETS),
         (Task, TASKS), (LabelControl, LABEL_CONTROLS),
         (Incomplete, INCOMPLETE), (Baseline, BASELINES), (FoldUnit, FOLD_UNITS), (Wording, WORDINGS),
-        (SuiteVersion, SUITE_VERSIONS), (ExportFormat, WRITERS), (RuleName, RULES), (AnswerScore, SCORES),
+        (SuiteVersion, SUITE_VERSIONS), (ExportFormat, WRITERS | FOLDER_WRITERS),
+        (RuleName, RULES), (AnswerScore, SCORES),
     ],
 )  # fmt: skip
 def test_a_vocabulary_names_what_the_library_offers(names: Any, declared: Collection[object]) -> None:

@@ -83,14 +83,17 @@ def copy(
 
 def export(
     run: RunFolder,
-    style: Annotated[ExportFormat, typer.Option("--format", help="Format of the file.")],
+    style: Annotated[
+        ExportFormat,
+        typer.Option("--format", help="Format. mp4 and lerobot write a folder, of a run with --frames all."),
+    ],
     out_file: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="File to write. Default: <run>.<format> beside the run."),
+        typer.Option("--out", metavar="FILE", help="What to write. Default: <run>.<format> beside the run."),
     ] = None,
     partial: Partial = False,
 ) -> None:
-    """Write a run to one file, and the sha256 of this file beside it."""
+    """Write a run to one file, and the sha256 of this file beside it; or its frames to a folder."""
     from probe_kit.extract import export_run
     from probe_kit.extract.store.locations.locate import locate
 

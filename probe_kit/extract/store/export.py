@@ -1,4 +1,4 @@
-"""Export of a run as one file, for tools that need one.
+"""Export of a run as one file, for tools that need one, or as a folder of films.
 
 Everything is written row by row, so that a run larger than memory can be exported; every row passes its checksum
 on the way, and the sha256 of the file is written beside it in the form `sha256sum --check` reads.
@@ -16,6 +16,8 @@ from probe_kit._system.drafts import draft_of, write_whole
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import LATER, MEAN_VIEW, ArrayKind, ExportFormat, StoredStream
+from probe_kit.extract.store.films.lerobot_dataset import write_lerobot
+from probe_kit.extract.store.films.videos import write_films
 from probe_kit.extract.store.format.arrays import decode_bfloat16
 from probe_kit.extract.store.format.rows import Rows
 from probe_kit.extract.store.locations.location import Location
@@ -23,11 +25,12 @@ from probe_kit.extract.store.run import Run, open_run
 
 
 def export_run(path: Path | str | Location, style: ExportFormat, out: Path, allow_partial: bool = False) -> Path:
-    """Write the run at `path` to the file `out` and its sha256 to `out`.sha256; returns `out`.
+    """Write the run at `path` to `out`, whole or not at all, and the sha256 of a file beside it; returns `out`.
 
     h5: `<stream>/pooled`, `<stream>/later`, `<stream>/tokens`, and a dataset per column under `episodes`.
     safetensors: the same with a dot, the last two true bfloat16; episodes in the metadata.
     parquet: a row per episode, inference, site and view with its vector; no tokens.
+    mp4: a folder with a film per episode. lerobot: a LeRobotDataset. Both need a run with `--frames all`.
     Array axes are (episode, call, [iteration,] layer, view or token, feature).
     Raises UsageError for another format or a file that exists, MissingExtraError, RunDamagedError.
     """
@@ -35,6 +38,10 @@ def export_run(path: Path | str | Location, style: ExportFormat, out: Path, allo
     if out.exists():
         raise UsageError(f"{out} exists; choose another --out or remove it")
     run = open_run(path, allow_partial)
+    if style in FOLDER_WRITERS:
+        with draft_of(out) as draft:
+            FOLDER_WRITERS[style](run, draft)
+            return draft.rename(out)
     if not run.streams:
         raise UsageError(f"{path} has no activations to export; its episodes are in `open_run(...).episodes`")
     with draft_of(out) as draft:
@@ -47,8 +54,8 @@ def export_run(path: Path | str | Location, style: ExportFormat, out: Path, allo
 
 def check_format(style: str) -> None:
     """Raise UsageError for a format that is not offered."""
-    if style not in WRITERS:
-        raise UsageError(f"unknown format {style!r}; expected one of {', '.join(WRITERS)}")
+    if style not in (known := {**WRITERS, **FOLDER_WRITERS}):
+        raise UsageError(f"unknown format {style!r}; expected one of {', '.join(known)}")
 
 
 def _arrays(run: Run) -> Iterator[tuple[str, str, Rows]]:
@@ -133,6 +140,7 @@ def _vectors(stored: StoredStream, kind: str, row: Any) -> Iterator[dict[str, An
                 yield {"call": call, "site": str(site), "view": view, "vector": vector}
 
 
+FOLDER_WRITERS: dict[ExportFormat, Callable[[Run, Path], None]] = {"mp4": write_films, "lerobot": write_lerobot}
 WRITERS: dict[ExportFormat, Callable[[Run, Path], None]] = {
     "h5": _write_h5,
     "safetensors": _write_safetensors,

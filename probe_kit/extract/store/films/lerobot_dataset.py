@@ -1,0 +1,60 @@
+"""A run as a LeRobotDataset, written by lerobot itself: frames, state and actions step by step."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from probe_kit._system.optional_dependencies import require
+from probe_kit.env.scoring.trajectory import MOTION, STATE
+from probe_kit.extract.store.films.filmed_episodes import control_rate, filmed_episodes
+from probe_kit.extract.store.run import Run
+
+CAMERA = "observation.images.scene"
+EPISODES = "probe_kit_episodes.csv"
+"""In `meta`: a row per episode of the data set with all that the run says of it; lerobot does not read it."""
+_STATE = [*STATE["tool"], "opening"]
+
+
+def write_lerobot(run: Run, folder: Path) -> None:
+    """The data set in `folder`: an episode of T steps has T rows, each with what the policy did next.
+
+    `observation.state` is the measured tool, x, y, z, roll, pitch, yaw in metres and radians, and the opening of
+    the gripper; `action` is the commanded action. The frame behind the last action is left out.
+    Raises UsageError for a run without all frames, NoTrajectoryError, MissingExtraError, and RunDamagedError.
+    """
+    for needed in ("datasets", "av"):
+        require(needed, "datasets")
+    datasets = require("lerobot.datasets.lerobot_dataset", "datasets")
+    require("datasets", "datasets").disable_progress_bars()
+    trajectories, data = run.trajectories, None
+    for one in filmed_episodes(run):
+        trajectory = trajectories[one.position]
+        if data is None:
+            data = datasets.LeRobotDataset.create(
+                f"probe_kit/{run.location.name}", round(control_rate(run)), _features(one.frames[0].shape),
+                root=folder, robot_type=str(run.settings["scene"]["arm"]),
+            )  # fmt: skip
+        for step in range(trajectory.steps):
+            state = np.append(trajectory.tool[step], trajectory.opening[step]).astype(np.float32)
+            data.add_frame(
+                {
+                    CAMERA: one.frames[step],
+                    "observation.state": state,
+                    "action": trajectory.commanded[step].astype(np.float32),
+                    "task": str(one.row["instruction"]),
+                }
+            )
+        data.save_episode()
+    if data is not None:
+        data.finalize()
+    table = run.episodes.rename_axis("episode_index")
+    table.to_csv(folder / "meta" / EPISODES)
+
+
+def _features(shape: tuple[int, ...]) -> dict[str, Any]:
+    return {
+        CAMERA: {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]},
+        "observation.state": {"dtype": "float32", "shape": (len(_STATE),), "names": _STATE},
+        "action": {"dtype": "float32", "shape": (len(MOTION),), "names": list(MOTION)},
+    }
