@@ -17,6 +17,8 @@ from probe_kit.view.viewed_run import view_runs
 
 SCHEMA = 1
 """Of the payloads; the page refuses another one."""
+INDEX_PAYLOAD = "index"
+"""The payload that a page reads first."""
 _NUMBER = re.compile(r"[0-9]{5,8}")
 
 
@@ -39,7 +41,7 @@ class Catalogue:
 
     def names(self, categories: Collection[str] | None = None) -> Iterator[str]:
         """All names in the order of export. categories: whose episodes and maps are named, all by default."""
-        yield "index"
+        yield INDEX_PAYLOAD
         for key, viewed in self.runs.items():
             yield from (f"{key}/run", f"{key}/episodes")
             chosen = [name for name in viewed.probed_categories if categories is None or name in categories]
@@ -58,13 +60,17 @@ class Catalogue:
         return payload_script(name, self._payload(name), places)
 
     def stamp(self, name: str) -> str:
-        """A hash that changes with the commits and probes that a payload is made of. Raises KeyError."""
+        """A hash that changes with the commits and probes that a payload is made of. Raises KeyError.
+
+        That of the index needs no table, so that a page begins at once.
+        """
         parts = name.split("/")
-        shown = [self.runs[parts[0]]] if parts[0] in self.runs else list(self.runs.values())
-        own = [viewed.results for viewed in shown]
-        refitted = [sorted(other.key for other in viewed.refitted.values()) for viewed in shown]
-        keys = [refitted, [None if results is None else results.key for results in own]]
-        return sha256_json([SCHEMA, name, [viewed.run.stamp for viewed in shown], keys])
+        if parts[0] not in self.runs:
+            return sha256_json([SCHEMA, name, [[key, one.run.stamp] for key, one in self.runs.items()]])
+        viewed = self.runs[parts[0]]
+        refitted = sorted(other.key for other in viewed.refitted.values())
+        probes = None if viewed.results is None else viewed.results.key
+        return sha256_json([SCHEMA, name, viewed.run.stamp, probes, refitted])
 
     def picture(self, key: str, number: int) -> bytes | None:
         """The committed frames of an episode, None without any. Raises KeyError; RunDamagedError if changed."""
@@ -74,7 +80,7 @@ class Catalogue:
         return None if sheet is None else sheet.content
 
     def _payload(self, name: str) -> Any:
-        if name == "index":
+        if name == INDEX_PAYLOAD:
             return self._index()
         match name.split("/"):
             case [key, "run"]:

@@ -11,8 +11,9 @@ import re
 import secrets
 import socket
 from collections.abc import AsyncIterator
+from contextlib import suppress
 from http.cookies import SimpleCookie
-from threading import Lock
+from threading import Lock, Thread
 from urllib.parse import parse_qs
 
 import uvicorn
@@ -26,7 +27,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.view.catalogue import Catalogue
+from probe_kit.view.catalogue import INDEX_PAYLOAD, Catalogue
 from probe_kit.view.follower import Follower, Growth
 from probe_kit.view.page_files import INDEX, page_files
 
@@ -88,7 +89,7 @@ class _Guard:
 
 
 class _Pages:
-    """The endpoints. The catalogue is used by one thread at a time."""
+    """The endpoints. The catalogue is used by one thread at a time, but for the index, which needs no table."""
 
     def __init__(self, catalogue: Catalogue, tick_s: float) -> None:
         self._catalogue, self._tick_s, self._lock = catalogue, tick_s, Lock()
@@ -107,6 +108,8 @@ class _Pages:
     def data(self, request: Request) -> Response:
         """A payload or a picture."""
         name = str(request.path_params["name"])
+        if name == f"{INDEX_PAYLOAD}.js":
+            return self._payload(request, INDEX_PAYLOAD)
         try:
             with self._lock:
                 if found := _PICTURE.fullmatch(name):
@@ -117,14 +120,22 @@ class _Pages:
                 own = name.removesuffix(".js")
                 if own == name:
                     return _missing()
-                tag = self._catalogue.stamp(own)
-                if request.headers.get("if-none-match") == f'"{tag}"':
-                    return _tagged(request, b"", tag, _KINDS["js"])
-                return _tagged(request, self._catalogue.script(own), tag, _KINDS["js"])
+                return self._payload(request, own)
         except KeyError:
             return _missing()
         except ProbeKitError as error:
             return PlainTextResponse(str(error), 500)
+
+    def _payload(self, request: Request, name: str) -> Response:
+        tag = self._catalogue.stamp(name)
+        known = request.headers.get("if-none-match") == f'"{tag}"'
+        return _tagged(request, b"" if known else self._catalogue.script(name), tag, _KINDS["js"])
+
+    def prepare(self) -> None:
+        """Compute the tables of the runs, while the browser that will ask for them starts."""
+        for key in list(self._catalogue.runs):
+            with self._lock, suppress(ProbeKitError):  # the page asks again, and shows the error
+                _ = self._catalogue.stamp(f"{key}/run"), self._catalogue.runs[key].table
 
     async def follow(self, request: Request) -> Response:
         """Events of runs that grow: how many episodes are committed. Nothing where every run is finished."""
@@ -159,9 +170,8 @@ def _tagged(request: Request, content: bytes, tag: str, kind: str) -> Response:
     return Response(content, headers=headers, media_type=kind)
 
 
-def viewer_app(catalogue: Catalogue, port: int, token: str, tick_s: float) -> Starlette:
-    """The application that serves the page of `catalogue` at `127.0.0.1:port` to who knows `token`."""
-    pages = _Pages(catalogue, tick_s)
+def _application(pages: _Pages, port: int, token: str) -> Starlette:
+    """What serves the pages at `127.0.0.1:port` to who knows `token`."""
     return Starlette(
         routes=[
             Route("/", pages.file),
@@ -186,7 +196,8 @@ class ViewerServer:
         self._socket.listen()
         self.port: int = self._socket.getsockname()[1]
         self._token = secrets.token_urlsafe(16)
-        app = viewer_app(catalogue, self.port, self._token, TICK_S)
+        self._pages = _Pages(catalogue, TICK_S)
+        app = _application(self._pages, self.port, self._token)
         self._server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
 
     @property
@@ -196,6 +207,7 @@ class ViewerServer:
 
     def run(self) -> None:
         """Serve until interrupted, or until `stop`."""
+        Thread(target=self._pages.prepare, daemon=True).start()
         self._server.run(sockets=[self._socket])
 
     def stop(self) -> None:

@@ -42,7 +42,7 @@ function App() {
   useEffect(() => { if (run) document.title = `${VIEWS[place.view]} · ${run.label} · probe_kit`; }, [run, place.view]);
   if (index && !known) return html`<p class="trouble" role="alert">The data have schema ${String(index.schema)}; this page reads schema ${SCHEMA}. Export the runs again.</p>`;
   if (trouble || lost) return html`<p class="trouble" role="alert">The data of this page cannot be read: ${trouble ?? lost}</p>`;
-  if (!run || !episodes) return html`<p class="loading">Loading the run …</p>`;
+  if (!run || !episodes) { const named = index?.runs.find((r) => r.key === key); return html`<p class="loading">Loading ${named ? html`<${Text}>${named.label}<//>, ${named.episodes.toLocaleString("en")} episodes` : "the run"} …</p>`; }
   const list = listOf(run.key), View = VIEW[place.view];
   return html`<header class="bar"><a class="brand" href="#/overview">probe_kit</a>
       <label class="run"><span class="sr">Run</span><select value=${run.key} onChange=${(e) => go({ ...CLEARED, run: e.target.value })}>${index.runs.map((r) => html`<option value=${r.key}>${r.label} (${r.key}, ${r.episodes})</option>`)}</select></label>
