@@ -23,7 +23,7 @@ OF_LARGEST = 2e-3
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the model put out tokens that name no action")
+@pytest.mark.filterwarnings("ignore:the model put out tokens")
 @pytest.mark.parametrize("family", WRITERS)
 def test_a_device_changes_nothing_but_roundings(family: str, device: str, tmp_path: Path) -> None:
     write, options = WRITERS[family]

@@ -51,7 +51,10 @@ class Decoding(Evaluation):
 
 
 class Pi0Fast(StatePrompt, PaliGemmaPolicy):
-    """A loaded pi0-FAST."""
+    """A loaded pi0-FAST.
+
+    problems: per row of the last inference, why its tokens are no whole chunk of actions; empty where they are.
+    """
 
     family = "pi0-fast"
     config_type = "pi0_fast"
@@ -62,6 +65,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     def __init__(self, network: Any, folder: Path, decoding: Decoding | None = None) -> None:
         self.decoding = decoding or Decoding()
+        self.problems: list[tuple[str, ...]] = []
         super().__init__(network, folder)
         self.prompt_kv: Stream | None = kept_prompt(self._decoder.config)
 
@@ -126,9 +130,10 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
         """The chunks in the tokens; a row whose tokens are no whole chunk is flagged, with a warning."""
         chunks = self.chunks(self.tokens(batch, seeds))
-        self.flagged = np.array([bool(chunk.problems) for chunk in chunks])
+        self.problems = [chunk.problems for chunk in chunks]
+        self.flagged = np.array([bool(row) for row in self.problems])
         if self.flagged.any():
-            _warn_of_problems(chunks)
+            _warn_of_problems()
         return np.stack([chunk.values for chunk in chunks]).astype(np.float32)
 
     def tokens(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> Tensor:
@@ -203,12 +208,12 @@ class _FinalNorm(nn.Module):
         return normed
 
 
-def _warn_of_problems(chunks: Sequence[DecodedChunk]) -> None:
-    problems = dict.fromkeys(problem for chunk in chunks for problem in chunk.problems)
+def _warn_of_problems() -> None:
+    """The same words at every step, so that a run says it once."""
     warnings.warn(
-        f"the model put out tokens that are no whole chunk of actions: {'; '.join(problems)}. What is missing "
-        "counts as zero before units are restored, and the step as flagged. Random weights do this; if trained "
-        "ones do, prompt, tokenizers or max_decoding_steps are wrong",
+        "the model put out tokens that are no whole chunk of actions; `problems` of the policy says why. What is "
+        "missing counts as zero before units are restored, and the step as flagged. Random weights do this; if "
+        "trained ones do, prompt, tokenizers or max_decoding_steps are wrong",
         stacklevel=3,
     )
 

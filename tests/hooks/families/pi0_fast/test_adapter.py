@@ -86,8 +86,9 @@ def test_tokens_are_those_of_lerobots_sampling(untrained: Pi0Fast, seen: list[Ob
 def test_a_chunk_that_does_not_end_is_flagged_and_warned_of(folder: Path, seen: list[Observation]) -> None:
     cut = load_pi0_fast(str(folder))
     cut.config.max_decoding_steps = 12
-    with pytest.warns(UserWarning, match="no end of the actions in 12 tokens"):
+    with pytest.warns(UserWarning, match="no whole chunk of actions"):
         actions = cut.act(seen, [0, 0])
+    assert all("no end of the actions in 12 tokens" in row for row in cut.problems)
     assert cut.flagged is not None
     assert cut.flagged.all()
     assert np.isfinite(actions).all()
