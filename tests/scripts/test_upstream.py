@@ -1,0 +1,53 @@
+"""The weekly check of the newest lerobot and transformers runs tests that exist, and reports every failure."""
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / ".ci" / "upstream"
+
+
+def test_the_workflow_installs_the_newest_and_runs_a_script_over_tests_that_exist() -> None:
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "upstream.yml").read_text(encoding="utf-8"))
+    commands = [step["run"] for step in workflow["jobs"]["conformance"]["steps"] if "run" in step]
+    assert any("--upgrade" in command and "lerobot" in command for command in commands)
+    assert (ROOT / commands[-1].split()[0]) == SCRIPT
+    assert os.access(SCRIPT, os.X_OK)
+    named = re.findall(r"tests/[\w/.]+", SCRIPT.read_text(encoding="utf-8"))
+    assert named
+    assert all((ROOT / place).exists() for place in named)
+
+
+@pytest.mark.parametrize(
+    ("output", "code", "said"),
+    [
+        ("1 passed", 0, "Nothing broke."),
+        (
+            "FAILED tests/x.py::test_y - AssertionError\n1 failed",
+            1,
+            "- FAILED tests/x.py::test_y - AssertionError",
+        ),
+        ("ERROR tests/x.py - ImportError\n1 error", 2, "- ERROR tests/x.py - ImportError"),
+        ("INTERNALERROR> torch is gone", 3, "pytest ended with code 3, and no test failed"),
+    ],
+)
+def test_the_report_says_what_broke(tmp_path: Path, output: str, code: int, said: str) -> None:
+    """With an interpreter that ends as pytest would."""
+    python, report = tmp_path / "python", tmp_path / "summary.md"
+    python.write_text(
+        f"#!/bin/sh\n[ \"$1\" = -c ] && echo '- lerobot 9.9' && exit 0\nprintf '%s\\n' '{output}'\nexit {code}\n",
+        encoding="utf-8",
+    )
+    python.chmod(0o755)
+    variables = {**os.environ, "PYTHON": str(python), "GITHUB_STEP_SUMMARY": str(report)}
+    ended = subprocess.run([str(SCRIPT)], env=variables, capture_output=True, text=True, encoding="utf-8")
+    text = report.read_text(encoding="utf-8")
+    assert ended.returncode == code
+    assert said in text
+    assert "- lerobot 9.9" in text
+    assert ("Nothing broke." in text) == (code == 0)
