@@ -28,6 +28,7 @@ from probe_kit.hooks.contract.sites import Site, Stream, kv_stream
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.molmoact2 import EXPERT, LAYERWISE
 from probe_kit.hooks.families.molmoact2.packing import PackedRow, Packing, padded_labels
+from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser, Units
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
@@ -163,8 +164,7 @@ class MolmoAct2(LerobotPolicy):
     def noise(self, seeds: Sequence[int]) -> Tensor:
         """(B, chunk, 32) float32 flow noise, a row per seed, the same on every device."""
         shape = (self.config.chunk_size, self.config.expected_max_action_dim)
-        rows = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
-        return torch.stack(rows).to(self.config.device)
+        return seeded_noise(seeds, shape, self.config.device)
 
     @property
     def _action_numbers(self) -> int:

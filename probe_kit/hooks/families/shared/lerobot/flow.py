@@ -80,9 +80,7 @@ class LerobotFlow(LerobotPolicy):
 
     def noise(self, seeds: Sequence[int]) -> Tensor:
         """(B, chunk, max_action_dim) float32 flow noise, a row per seed, the same on every device."""
-        shape = (self.config.chunk_size, self.config.max_action_dim)
-        rows = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
-        return torch.stack(rows).to(self.config.device)
+        return seeded_noise(seeds, (self.config.chunk_size, self.config.max_action_dim), self.config.device)
 
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the stack's final norm, or a block's output.
@@ -93,6 +91,12 @@ class LerobotFlow(LerobotPolicy):
         if stream is self.prompt_kv:
             return kv_tap(self._kept, site)
         return self.stacks[site.stream].tap(site)
+
+
+def seeded_noise(seeds: Sequence[int], shape: tuple[int, int], device: str) -> Tensor:
+    """(B, *shape) float32 standard normal, a row per seed, the same on every device."""
+    rows = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+    return torch.stack(rows).to(device)
 
 
 def undecorated(method: Callable[..., Any]) -> Callable[..., Any]:
