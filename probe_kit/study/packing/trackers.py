@@ -94,7 +94,7 @@ def _log_to_mlflow(tracked: TrackedStudy, project: str) -> tuple[str, bool]:
 
 
 def _log_to_wandb(tracked: TrackedStudy, project: str) -> tuple[str, bool]:
-    """The hash is the run's id, so that a second call goes on with the same run."""
+    """The hash is the run's id: a second call continues the same run."""
     wandb = require("wandb", "trackers")
     with wandb.init(
         project=project,
