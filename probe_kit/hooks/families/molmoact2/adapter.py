@@ -117,7 +117,7 @@ class MolmoAct2(LerobotPolicy):
             raise CheckpointError(f"{folder} holds LoRA adapters; merge them into its weights with lerobot first")
         if config.action_mode == "discrete":
             raise CheckpointError(f"{folder} was trained for discrete actions only; the flow expert acts here")
-        config.model_dtype = getattr(config, "dtype", None) or config.model_dtype
+        config.model_dtype = config.dtype = getattr(config, "dtype", None) or config.model_dtype
         config.inference_action_mode = "continuous"
         place = network_folder(folder, config.checkpoint_path)
         network: nn.Module = build_molmoact2(config, network_config(place), place)

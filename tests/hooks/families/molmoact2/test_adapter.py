@@ -49,18 +49,20 @@ class TestMolmoAct2(AdapterContract):
         return molmoact2
 
 
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_actions_are_those_of_lerobots_own_policy_bit_for_bit(
-    molmoact2: MolmoAct2, folder: Path, seen: list[Observation]
+    folder: Path, seen: list[Observation], dtype: str
 ) -> None:
     """Its own sampling, with its own blocks, draws the noise of the same seed."""
-    batch = molmoact2.batch(seen[:1])
-    ours = molmoact2.infer(batch, molmoact2.noise([5]))
-    place = folder / "vlm"
-    plain = network.lerobots_policy(molmoact2.config, network.network_config(place), place)
+    policy, place = load_molmoact2(str(folder), dtype=dtype), folder / "vlm"
+    batch = policy.batch(seen[:1])
+    plain = network.lerobots_policy(policy.config, network.network_config(place), place)
     assert not hasattr(plain._backbone().action_expert.blocks[0], "mlp_gate")
-    plain.load_state_dict(molmoact2.network.state_dict())
+    plain.load_state_dict(policy.network.state_dict())
+    drawn = torch.randn((1, 4, 32), generator=torch.Generator().manual_seed(5), dtype=network.DTYPES[dtype])
+    ours = policy.infer(batch, drawn)
     theirs = plain.predict_action_chunk(batch, generator=torch.Generator().manual_seed(5))
-    torch.testing.assert_close(theirs, ours, rtol=0, atol=0)
+    torch.testing.assert_close(theirs, ours.float(), rtol=0, atol=0)
     assert theirs.abs().max() > 0.1
 
 
@@ -196,3 +198,14 @@ def test_the_default_size_has_the_tensors_of_lerobots_network() -> None:
     assert {name: tensor.shape for name, tensor in ours.items()} == {
         f"model.{name}": tensor.shape for name, tensor in theirs.items()
     }
+
+
+def test_half_precision_acts_as_captured_and_is_named_in_the_card(folder: Path, seen: list[Observation]) -> None:
+    policy = load_molmoact2(str(folder), dtype="bfloat16")
+    assert policy.card.dtype == "bfloat16"
+    plain = policy.act(seen, [0, 1])
+    with capture(policy, policy.sites()) as cache:
+        np.testing.assert_array_equal(policy.act(seen, [0, 1]), plain)
+    assert cache["backbone.01.residual"].dtype == torch.bfloat16
+    full = load_molmoact2(str(folder)).act(seen, [0, 1])
+    np.testing.assert_allclose(plain, full, atol=0.05 * np.abs(full).max())

@@ -71,16 +71,18 @@ def test_whole_chunks_are_acted_on_without_a_flag(pi0_fast: Pi0Fast, seen: list[
     assert np.abs(actions - wanted).max() <= 0.1 * np.abs(pi0_fast.action_units.slope(7)).max()
 
 
-def test_tokens_are_those_of_lerobots_sampling(untrained: Pi0Fast, seen: list[Observation]) -> None:
-    batch, policy = untrained.batch(seen), untrained.network
-    ours = untrained.tokens(batch, [0, 0])
-    policy.model._paligemma_tokenizer = untrained.tokenizer
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_tokens_are_those_of_lerobots_sampling(untrained: Pi0Fast, seen: list[Observation], dtype: str) -> None:
+    fast = untrained if dtype == "float32" else load_pi0_fast(str(untrained.folder), dtype=dtype)
+    batch, policy = fast.batch(seen), fast.network
+    ours = fast.tokens(batch, [0, 0])
+    policy.model._paligemma_tokenizer = fast.tokenizer
     pictures, masks = policy._preprocess_images(batch)
     text = (batch["observation.language.tokens"], batch["observation.language.attention_mask"])
     with torch.inference_mode():
         theirs = policy.model.sample_actions_fast_kv_cache(pictures, masks, *text, ours.shape[1])
     assert torch.equal(ours, theirs)
-    assert ours.unique().numel() > 10
+    assert ours.unique().numel() > 5
 
 
 def test_a_chunk_that_does_not_end_is_flagged_and_warned_of(folder: Path, seen: list[Observation]) -> None:
@@ -127,6 +129,17 @@ def test_drawn_tokens_come_from_the_rows_own_seed(folder: Path, seen: list[Obser
     alone = policy.tokens(policy.batch([seen[0]]), [2])[0]
     shared = min(len(alone), ids.shape[1])
     assert torch.equal(ids[1, :shared], alone[:shared])
+
+
+def test_half_precision_acts_as_captured_and_puts_out_whole_chunks(folder: Path, seen: list[Observation]) -> None:
+    policy = load_pi0_fast(str(folder), dtype="bfloat16")
+    assert policy.card.dtype == "bfloat16"
+    plain = policy.act(seen, [0, 0])
+    with capture(policy, policy.sites()) as cache:
+        np.testing.assert_array_equal(policy.act(seen, [0, 0]), plain)
+    assert cache["action.01.residual@3"].dtype == torch.bfloat16
+    assert policy.flagged is not None
+    assert not policy.flagged.any()
 
 
 def test_prompts_are_those_of_lerobots_processor(pi0_fast: Pi0Fast) -> None:
