@@ -33,6 +33,7 @@ FAMILIES = (
         ),
         verifier="probe_kit.hooks.families.molmoact2.verify:verify_molmoact2",
         config_types=("molmoact2",),
+        words="probe_kit.hooks.families.molmoact2.adapter:check_molmoact2_words",
         full_size="probe_kit.models.lerobot.molmoact2:full_size_molmoact2",
         interventions=LAYERWISE,
     ),

@@ -28,9 +28,10 @@ from probe_kit.hooks.contract.sites import Site, Stream, kv_stream
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.molmoact2 import EXPERT, LAYERWISE
 from probe_kit.hooks.families.molmoact2.packing import PackedRow, Packing, padded_labels
+from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser, Units
-from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
+from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, LerobotPolicy
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.prompt_kv import kv_tap
 from probe_kit.models.lerobot.molmoact2 import build_molmoact2, flow_actions, network_config, uses_cuda_graphs
@@ -216,9 +217,19 @@ class MolmoAct2(LerobotPolicy):
         """The chunk."""
         return ["action"] * int(self.config.chunk_size)
 
+    @classmethod
+    def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
+        """Raise InstructionError for a prompt that does not fit, from configuration and tokenizer alone."""
+        text = cls.__new__(cls)  # what packs needs no network
+        text.folder = checkpoint_folder(checkpoint, SMALL_FILES)
+        text.config = cls._read_config(text.folder, evaluation)
+        text.config.checkpoint_path = str(network_folder(text.folder, text.config.checkpoint_path))
+        text.cameras = text.shown = (next(iter(text.config.image_features)).removeprefix(IMAGES),)
+        text.token_ids(instructions)
+
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each prompt, without pictures and without the state, which change at every inference."""
-        size = tuple(self.config.image_features[f"observation.images.{self.cameras[0]}"].shape[-2:])
+        size = tuple(self.config.image_features[f"{IMAGES}{self.cameras[0]}"].shape[-2:])
         blank = {camera: np.zeros((*size, 3), np.uint8) for camera in self.shown}
         state = np.zeros(self._state_numbers, np.float32)
         rows = [self.packing.row(blank, text, state) for text in instructions]
@@ -276,3 +287,8 @@ def load_molmoact2(
 ) -> MolmoAct2:
     """Load a lerobot MolmoAct2 checkpoint; see `LerobotPolicy.load`."""
     return MolmoAct2.load(checkpoint, device, dtype, random_weights, weights_seed)
+
+
+def check_molmoact2_words(checkpoint: str, instructions: Sequence[str], **_: Any) -> None:
+    """See `Family.words`."""
+    MolmoAct2.check_words(checkpoint, instructions)

@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CaptureError, CheckpointError, InstructionError, WeightsError
 from probe_kit.hooks import Observation, capture
-from probe_kit.hooks.families.molmoact2.adapter import MolmoAct2, load_molmoact2
+from probe_kit.hooks.families.molmoact2.adapter import MolmoAct2, check_molmoact2_words, load_molmoact2
 from probe_kit.hooks.testing import AdapterContract
 from probe_kit.models.lerobot import molmoact2 as network
 from tests.support.molmoact2_checkpoints import MASK, write_molmoact2
@@ -161,8 +161,12 @@ def test_two_cameras_are_told_apart(tmp_path: Path) -> None:
 def test_a_prompt_that_does_not_fit_is_refused_and_never_cut(
     molmoact2: MolmoAct2, seen: list[Observation]
 ) -> None:
+    long = "put the cube on " + "the red shape " * 30
     with pytest.raises(InstructionError, match="does not fit"):
-        molmoact2.act([replace(seen[0], instruction="put the cube on " + "the red shape " * 30)], [0])
+        molmoact2.act([replace(seen[0], instruction=long)], [0])
+    check_molmoact2_words(str(molmoact2.folder), ["put the cube on the star"])
+    with pytest.raises(InstructionError, match="does not fit"):
+        check_molmoact2_words(str(molmoact2.folder), ["put the cube on the star", long])
 
 
 @pytest.mark.parametrize(("field", "value"), [("action_mode", "discrete"), ("enable_lora_vlm", True)])

@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.hooks import Observation, capture
-from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast, load_pi0_fast
+from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast, check_pi0_fast_words, load_pi0_fast
 from probe_kit.hooks.testing import AdapterContract
 from probe_kit.models.lerobot import pi0_fast as network
 from tests.support.pi0_fast_checkpoints import HEAD, INSTRUCTIONS, TRAINED, write_pi0_fast
@@ -165,8 +165,14 @@ def test_roles_name_the_instruction_the_digits_and_the_words_around_them(pi0_fas
 
 
 def test_a_prompt_that_does_not_fit_is_refused_and_never_cut(pi0_fast: Pi0Fast, seen: list[Observation]) -> None:
+    long = "put the cube on " + "the red shape " * 12
     with pytest.raises(InstructionError, match="this checkpoint reads 64"):
-        pi0_fast.act([replace(seen[0], instruction="put the cube on " + "the red shape " * 12)], [0])
+        pi0_fast.act([replace(seen[0], instruction=long)], [0])
+    check_pi0_fast_words(str(pi0_fast.folder), ["put the cube on the star"])
+    with pytest.raises(InstructionError, match="this checkpoint reads 64"):
+        check_pi0_fast_words(str(pi0_fast.folder), ["put the cube on the star", long])
+    with pytest.raises(InstructionError, match="does not know"):
+        check_pi0_fast_words(str(pi0_fast.folder), ["put the cube on the zebra"])
 
 
 @pytest.mark.parametrize("left_out", [HEAD, EMBEDDING])
