@@ -130,7 +130,7 @@ def why_alone(before: RunReader, after: RunReader, view: str = "mean") -> str:
 def _why_alone_beside_vlm(before: RunReader, after: RunReader, view: str) -> str:
     asked, acted = (before, after) if ask_of(before) is not None else (after, before)
     ask = ask_of(asked) or {}
-    if ask_of(acted) is not None or "{instruction}" not in ask["template"]:
+    if ask_of(acted) is not None or "{instruction}" not in ask.get("template", ""):
         return "other words"
     if ask["picture"] != "frame" or _picture_size(asked) != _picture_size(acted):
         return "other pictures"
