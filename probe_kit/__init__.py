@@ -16,7 +16,7 @@ from probe_kit.version import __version__ as __version__
 if TYPE_CHECKING:
     from probe_kit.env import Act2AnswerEnv, SceneSpec
     from probe_kit.errors import ProbeKitError
-    from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
+    from probe_kit.extract import ExtractSettings, LeRobotSource, Run, extract_run, open_run
     from probe_kit.hooks import Site, capture, load_policy
     from probe_kit.intervene import (
         AttentionReadout,
@@ -60,6 +60,7 @@ __all__ = [
     "KnowledgeActionDisplay",
     "Labels",
     "LayerCurveDisplay",
+    "LeRobotSource",
     "ModelDepthDisplay",
     "ProbeKitError",
     "ReplaySource",
@@ -104,6 +105,7 @@ __getattr__, __dir__ = lazy_names(
         "KnowledgeActionDisplay": "retention.displays",
         "Labels": "train",
         "LayerCurveDisplay": "retention.displays",
+        "LeRobotSource": "extract",
         "ModelDepthDisplay": "retention.displays",
         "ProbeKitError": "errors",
         "Run": "extract",

@@ -22,7 +22,7 @@ from probe_kit.check_adapter.command import check_adapter
 from probe_kit.demo.commands import demo
 from probe_kit.doctor_command import doctor
 from probe_kit.extract.ask_commands import ask
-from probe_kit.extract.commands import extract
+from probe_kit.extract.commands import dataset_app, extract
 from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from probe_kit.extract import Run
 
 ORDER = (
-    "demo", "doctor", "models", "suite", "extract", "ask", "run", "labels", "train", "power", "intervene",
-    "retention", "stages", "view", "study", "export", "new-adapter", "check-adapter", "verify",
+    "demo", "doctor", "models", "suite", "dataset", "extract", "ask", "run", "labels", "train", "power",
+    "intervene", "retention", "stages", "view", "study", "export", "new-adapter", "check-adapter", "verify",
 )  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 
@@ -157,6 +157,7 @@ def _stored_runs_of_study(name: str) -> "list[Run] | None":
 app.add_typer(suite_app, name="suite")
 app.add_typer(run_app, name="run")
 app.add_typer(study_app, name="study")
+app.add_typer(dataset_app, name="dataset")
 run_app.command()(show)
 suite_app.command()(words)
 for command in (

@@ -79,6 +79,12 @@ class SceneError(ProbeKitError):
     exit_code = 2
 
 
+class RecordingError(ProbeKitError):
+    """A data set of recordings cannot be read, or does not fit the model."""
+
+    exit_code = 3
+
+
 class ActionError(ProbeKitError, ValueError):
     """An action has the wrong shape or is not finite; the environment did not move."""
 

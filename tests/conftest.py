@@ -230,6 +230,18 @@ def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory)
 
 
 @pytest.fixture(scope="session")
+def shown_run(tmp_path_factory: pytest.TempPathFactory) -> "Run":
+    """A run on recordings without a model, twelve episodes of four frames; see `tests.support.recorded_run`."""
+    from probe_kit.extract import open_run
+    from tests.support.recorded_run import write_recorded_run
+
+    def make(folder: Path) -> None:
+        write_recorded_run(folder / "run")
+
+    return open_run(made_once(tmp_path_factory, "shown", make) / "run")
+
+
+@pytest.fixture(scope="session")
 def labelled_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a run without a model, four inferences per episode; see `tests.support.labelled_run`."""
     from tests.support.labelled_run import write_labelled_run

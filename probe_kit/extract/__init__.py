@@ -6,6 +6,7 @@ from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction, ask_run, extract_run, prepare, prepare_asks
+    from probe_kit.extract.recordings.lerobot_source import LeRobotSource
     from probe_kit.extract.settings import AskSettings, ExtractSettings
     from probe_kit.extract.store.copying import copy_run
     from probe_kit.extract.store.export import export_run
@@ -23,6 +24,7 @@ __all__ = [
     "Audit",
     "ExtractSettings",
     "Extraction",
+    "LeRobotSource",
     "Location",
     "Run",
     "ask_run",
@@ -45,6 +47,7 @@ __getattr__, __dir__ = lazy_names(
         "AskSettings": "settings",
         "ExtractSettings": "settings",
         "Extraction": "extraction",
+        "LeRobotSource": "recordings.lerobot_source",
         "copy_run": "store.copying",
         "export_run": "store.export",
         "ask_run": "extraction",

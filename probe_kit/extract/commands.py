@@ -2,17 +2,27 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, out, progress, say
+from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.extract import command_options as own
+from probe_kit.extract.recordings import options as recorded
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
     from probe_kit.extract import Extraction, Run
+    from probe_kit.extract.recordings.recorded_plan import RecordedPlan
     from probe_kit.extract.store.locations.location import Location
     from probe_kit.suite.ladder import Wording
+
+
+OUTER_FOLDS = 5
+"""Groups that probes need at least."""
+dataset_app = typer.Typer(help="Inspect data sets of recordings.", no_args_is_help=True)
 
 
 def extract(
@@ -39,6 +49,14 @@ def extract(
     frames: own.Frames = "ends",
     video: own.Video = "none",
     codec: own.StorageCodec = "zstd",
+    dataset: recorded.Dataset = None,
+    episodes: recorded.Episodes = None,
+    select: recorded.Select = None,
+    cameras: recorded.Cameras = None,
+    rotations: recorded.Rotations = None,
+    instruction: recorded.Instruction = None,
+    no_pixels: recorded.NoPixels = False,
+    accept_units: recorded.AcceptUnits = False,
     max_steps: own.MaxSteps = None,
     tile_side: own.TileSide = None,
     light_level: own.LightLevel = None,
@@ -69,13 +87,14 @@ def extract(
     \b
     probe-kit extract --model pi0-tiny --items 12 --out runs/mine
     probe-kit extract --model pi0 --categories color,shape --dry-run
+    probe-kit extract --model pi0 --checkpoint DIR --dataset FOLDER --episodes 0:5 --select every:5
     """
     chosen = own.settings_of(locals())
     from probe_kit.extract import ExtractSettings, prepare
     from probe_kit.extract.store.locations.locate import locate
 
     settings = ExtractSettings.from_options(**chosen)
-    with err.status("loading suite and model"):
+    with err.status("loading suite and model" if dataset is None else "loading recordings and model"):
         extraction = prepare(settings, out_folder, fetch=not dry_run)
     location = locate(out_folder or Path("runs") / extraction.default_name())
     print_plan(extraction, location)
@@ -106,11 +125,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         **_rows_of_plan(extraction),
         **({"grows": growth.words} if growth and growth.words else {}),
         "streams": ("; ".join(_describe(s) for s in plan.streams) or "none") + declared,
-        **(
-            {"acts": "no: only captured, once per episode; no success rate"}
-            if identity.get("capture_only")
-            else {}
-        ),
+        **_acts_row(identity),
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
         "disk": f"up to {needed} with columns, probes and report; "
         + ("no bound" if free is None else f"{in_units(free)} free"),
@@ -128,8 +143,11 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
 def _rows_of_plan(extraction: "Extraction") -> dict[str, str]:
     """What is shown to the model."""
     from probe_kit.extract.plan import Plan
+    from probe_kit.extract.recordings.recorded_plan import RecordedPlan
 
     plan = extraction.plan
+    if isinstance(plan, RecordedPlan):
+        return recorded_facts(plan)
     assert isinstance(plan, Plan)
     return {
         "suite": plan.suite.identity,
@@ -140,6 +158,29 @@ def _rows_of_plan(extraction: "Extraction") -> dict[str, str]:
     }
 
 
+def recorded_facts(plan: "RecordedPlan") -> dict[str, str]:
+    """Data set, cameras and frames of a plan, in words."""
+    own, source = plan.dataset, {one.source_episode for one in plan.episodes}
+    turned = dict(own["rotations"])
+    cameras = [
+        f"{camera} from {feature} ({kind})" + (f", rotated by {turned[camera]}°" if camera in turned else "")
+        for camera, feature, kind in own["cameras"]
+    ]
+    where = f"{own['repo']}@{own['revision']}" if "repo" in own else plan.name
+    return {
+        "data set": f"{terminal_safe(where)}, {own['fps']:g} frames per second",
+        "cameras": terminal_safe("; ".join(cameras)) or "mapped when the model is loaded",
+        "frames": f"{plan.frames} of {len(source)} episodes ({own['frames']}), in {len(plan.episodes)} rows",
+    }
+
+
+def _acts_row(identity: Mapping[str, Any]) -> dict[str, str]:
+    if not identity.get("capture_only"):
+        return {}
+    shown = "recorded frames are shown" if "dataset" in identity else "only captured, once per episode"
+    return {"acts": f"no: {shown}; no success rate"}
+
+
 def print_sufficiency(extraction: "Extraction") -> None:
     """What the plan is enough for, said before any work; too few items in yellow."""
     from rich.table import Table
@@ -148,7 +189,11 @@ def print_sufficiency(extraction: "Extraction") -> None:
     from probe_kit.suite.validation.sufficiency import Smallest, sufficiencies
 
     plan, scored = extraction.plan, not getattr(extraction.settings, "capture_only", False)
-    assert isinstance(plan, Plan)
+    if not isinstance(plan, Plan):
+        episodes = len({row.to_json()["group_id"] for row in plan.episodes})
+        if episodes < OUTER_FOLDS:
+            say(marked("[yellow]{} recorded episodes; probes need {} or more[/]", episodes, OUTER_FOLDS))
+        return
     table = Table(show_header=False, title=f"enough for ({Smallest.of(plan.suite).words})", box=None)
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
@@ -195,6 +240,57 @@ def _print_outcomes(run: "Run") -> None:
     counts = run.episodes["outcome"].value_counts()
     text = ", ".join(f"{name} {count}" for name, count in counts.items())
     say(f"{len(run.episodes)} episodes: {text}")
-    step = "retention" if not run.streams else "train"
+    step = "retention" if not run.streams else "labels" if run.recorded else "train"
     say(marked("next: [bold]probe-kit {} {}[/]", step, run.location))
     out.print(str(run.location), soft_wrap=True)
+
+
+@dataset_app.command("show")
+def show_dataset(
+    folder: Annotated[
+        str, typer.Argument(metavar="FOLDER", help="A LeRobotDataset, or USER/NAME@COMMIT of the hub.")
+    ],
+    model: Annotated[str | None, typer.Option("--model", help="Compare with the inputs of this model.")] = None,
+    checkpoint: common.Checkpoint = None,
+    options: common.ModelOptions = None,
+    episodes: recorded.Episodes = None,
+    select: recorded.Select = None,
+    cameras: recorded.Cameras = None,
+    rotations: recorded.Rotations = None,
+    instruction: recorded.Instruction = None,
+) -> None:
+    """Show what a data set holds and how a model would be shown it. Writes nothing.
+
+    With a model, the state of every chosen frame is compared with the statistics of the checkpoint.
+
+    \b
+    probe-kit dataset show FOLDER
+    probe-kit dataset show FOLDER --model pi0 --checkpoint DIR --camera base=observation.images.top
+    """
+    from rich.table import Table
+
+    from probe_kit.extract.prepared import load_acting_policy, open_recording
+    from probe_kit.extract.rollout.recorded.described import describe_fit, describe_recording
+    from probe_kit.extract.rollout.recorded.recorded_controller import fit
+    from probe_kit.extract.settings import ExtractSettings
+
+    settings = ExtractSettings.from_options(
+        model=model or "pi0-tiny", checkpoint=checkpoint, options=options, dataset=folder, episodes=episodes,
+        select=select, cameras=cameras, rotations=rotations, instruction=instruction,
+    )  # fmt: skip
+    assert settings.source is not None
+    with err.status("reading the data set"):
+        recording = open_recording(settings.source)
+        facts, warnings = describe_recording(recording), list[str]()
+    if model is not None:
+        with err.status("loading the model"):
+            fitted, warnings = describe_fit(fit(recording, load_acting_policy(settings)))
+        facts |= fitted
+    table = Table(show_header=False, box=None)
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in facts.items():
+        table.add_row(name, marked("{}", terminal_safe(value)))
+    out.print(table)
+    for warning in warnings:
+        say(marked("[yellow]{}[/]", terminal_safe(warning)))

@@ -72,7 +72,7 @@ def check_place(settings: RunSettings, suite: "Suite", location: "Location") -> 
     """
     from probe_kit.extract.store.format.root import read_root
 
-    _check_writable(location)
+    check_writable(location)
     with location.in_words():
         if not location.exists(RUN_FILE):
             return
@@ -108,7 +108,8 @@ def asked_objects(settings: RunSettings, suite: "Suite") -> Mapping[str, str]:
     return {} if settings.query == "target" else {item: phrase.with_article for item, phrase in named.items()}
 
 
-def _check_writable(location: "Location") -> None:
+def check_writable(location: "Location") -> None:
+    """Raise UsageError for a place that cannot be written, DiskSpaceError for a read-only disk."""
     if "://" in location.address:
         return  # a bucket says so itself, and creating anything there is no check
     place = Path(location.address)

@@ -1,19 +1,24 @@
 """Preparation of an extraction: finds the suite, loads the model, plans the episodes. Writes nothing."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.calibration import Calibration, calibrated
-from probe_kit.extract.early import asked_objects, check_model, check_place, check_words
+from probe_kit.extract.early import asked_objects, check_model, check_place, check_words, check_writable
 from probe_kit.extract.needs import declared_streams
 from probe_kit.extract.plan import Plan, RowPlan, instructions_of, make_plan, plan_episodes, skipped_items
 from probe_kit.extract.protocols import protocol_identity
+from probe_kit.extract.recordings.lerobot_folder import fetched, open_lerobot
+from probe_kit.extract.recordings.lerobot_source import LeRobotSource
+from probe_kit.extract.recordings.recorded_plan import RecordedPlan, Recording
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
 from probe_kit.extract.rollout.examples import check_unfit, example_observations
 from probe_kit.extract.rollout.preflight import run_preflight
+from probe_kit.extract.rollout.recorded.recorded_controller import check_units, fit, recorded_controller
+from probe_kit.extract.rollout.recorded.recorded_stage import example_of
 from probe_kit.extract.rollout.settings_checks import check_embodiment, check_meaningless, check_unreachable
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
@@ -53,7 +58,7 @@ class Prepared:
             **self.settings.choices(),
             **self.card,
             **self.plan.identity,
-            "scene": self.settings.scene.to_json(),
+            **({"scene": self.settings.scene.to_json()} if isinstance(self.plan, Plan) else {}),
             **(protocol_identity(self.settings) if isinstance(self.settings, ExtractSettings) else {}),
         }
 
@@ -101,6 +106,8 @@ def load(
     raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     settings = as_protocol(settings)
+    if isinstance(settings, ExtractSettings) and settings.source is not None:
+        return _load_recorded(settings, settings.source, location, policy, fetch)
     suite = check_run(settings, location, loaded=not (answer_model is None and policy is None), fetch=fetch)
     if not rehearsed:
         run_preflight(settings.scene, plan_episodes(suite, settings.seed))
@@ -136,8 +143,72 @@ def _plan(suite: Suite, streams: list[StoredStream], settings: RunSettings, obje
 
 
 def as_protocol(settings: RunSettings) -> RunSettings:
-    """The settings with what their protocol decides; see `ExtractSettings.followed`."""
-    return settings.followed() if isinstance(settings, ExtractSettings) else settings
+    """The settings with what their protocol or recording decides; see `ExtractSettings.followed`."""
+    if not isinstance(settings, ExtractSettings):
+        return settings
+    return settings.followed() if settings.source is None else _with_recording(settings, settings.source)
+
+
+def _with_recording(settings: ExtractSettings, source: LeRobotSource) -> ExtractSettings:
+    """The settings of a run on recordings: every frame of a row is captured, nothing acts, no thumbnails are kept.
+
+    A revision of the hub becomes its commit. Raises what `open_lerobot` raises.
+    """
+    check_meaningless(settings)
+    folder = open_lerobot(source)
+    if folder.repo is not None:
+        source = replace(source, folder=f"{folder.repo}@{folder.revision}")
+    calls = Recording.of(folder, source).most_frames
+    return replace(settings, source=source, captured_calls=calls, capture_only=True, frames="none")
+
+
+def _load_recorded(
+    settings: ExtractSettings,
+    source: LeRobotSource,
+    location: Location | None,
+    loaded: "Policy | None",
+    fetch: bool,
+) -> Prepared:
+    """As `load`, of recordings."""
+    if loaded is None:
+        check_model(settings, tuple(SCRIPTED), fetch)
+    if location is not None:
+        check_writable(location)
+    recording = open_recording(source)
+    instructions = recording.instructions()
+    if loaded is None:
+        check_words(settings, instructions, tuple(SCRIPTED))
+        _check_instructions(settings, instructions, fetch)
+    if not fetch and (streams := declared_streams(settings)) is not None:
+        planned = recorded_plan(recording, streams, settings, (0, 0))
+        return Prepared(settings, planned, _declared_card(settings), None, declared=True)
+    if loaded is not None:
+        _check_loaded(settings, loaded)
+    fitted = fit(recording, load_acting_policy(settings) if loaded is None else loaded)
+    check_units(fitted)
+    settings = replace(settings, source=fitted.recording.source)
+    controller = recorded_controller(fitted, settings)
+    check_unfit(fitted.policy.card, settings.batch, example_of(fitted.recording, instructions[0]))
+    planned = recorded_plan(fitted.recording, controller.streams, settings, fitted.prediction)
+    return Prepared(settings, planned, controller.identity, controller)
+
+
+def open_recording(source: LeRobotSource) -> Recording:
+    """What `source` chooses, with the numbers of the chosen episodes here. Raises as `open_lerobot`."""
+    recording = Recording.of(open_lerobot(source), source)
+    fetched(recording.folder, recording.episodes, ())
+    recording.folder.check_files(recording.episodes, ())
+    return recording
+
+
+def recorded_plan(
+    recording: Recording, streams: Sequence[StoredStream], settings: ExtractSettings, prediction: tuple[int, int]
+) -> RecordedPlan:
+    """The rows of a recording. prediction: (chunk, D) of the model."""
+    rows = tuple(recording.stretches(settings.seed))
+    per_call = sum(stream.raw_bytes(settings.tokens == "all") for stream in streams)
+    size = per_call * settings.stored_calls * len(rows)
+    return RecordedPlan(rows, tuple(streams), size, recording.dataset(prediction), recording.source.name)
 
 
 def check_run(

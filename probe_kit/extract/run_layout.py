@@ -10,6 +10,7 @@ RUN/
   failed/<n>.json    why an episode was given up; removed when it is tried again
   certificate.json   what was really loaded, and what was checked
   data.zarr/         <stream>/pooled; with --tokens all <stream>/tokens; with --later-views mean <stream>/later
+                     of recordings also inputs/<kind>
   columns.zarr/      the pooled rows again, by site and view; derived, see `columns`
   sealed/<stamp>.json  hashes of the columns, and of which commits they were made
   probes/            results of `probe-kit train`
@@ -44,6 +45,8 @@ PROBE_DIRECTIONS = "directions.npz"
 INTERVENTIONS = "interventions"
 TRAJECTORY, TRAJECTORY_AXES = "trajectory", 3
 """The array of what happened in episodes, beside those of streams; an episode that did not act has no object."""
+INPUTS = "inputs"
+"""The group of arrays that hold what a run on recordings showed: state, actions, small pictures."""
 ILLUSTRATIONS = (FRAMES, VIDEOS)
 """Pictures for people, which a run can do without."""
 Codec = Literal["zstd", "fast", "none"]
@@ -69,6 +72,8 @@ MOST_FRAMES = FRAME_COLUMNS * 68
 ExportFormat = Literal["h5", "safetensors", "parquet", "mp4", "lerobot"]
 CAPTURE_ONLY = "capture_only"
 """Outcome of an episode whose model was captured and did not act: there is no success rate."""
+DATASET = "dataset"
+"""The part of a run's settings that says which recordings it was made of; scene runs have `suite` and `scene`."""
 
 
 def _is_count(value: Any) -> bool:

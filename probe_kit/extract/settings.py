@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal, Self, get_args
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.extract.protocols import has_network, protocol_identity, protocol_row, scene_of
+from probe_kit.extract.recordings.lerobot_source import LeRobotSource
 from probe_kit.extract.run_layout import (
     MOST_FRAMES,
     AskTokens,
@@ -43,6 +44,7 @@ _ELSEWHERE = {
     "protocol",
     "rotation",
     "later_views",
+    "source",
 }
 _MOST = {
     "captured_calls": 10_000,
@@ -256,6 +258,7 @@ class ExtractSettings(RunSettings):
     capture_only: capture the first inference of every episode and do not act; for checkpoints of other arms.
     edits: what is changed in the streams at every inference; vectors: their directions and sources, by hash.
     video: GIF of the first episode, of all, or none; changes no stored number.
+    source: recordings to show in place of suite and scene; the model then does not act.
     """
 
     wordings: tuple[Wording, ...] | None = None
@@ -268,6 +271,7 @@ class ExtractSettings(RunSettings):
     edits: tuple[Edit, ...] = ()
     vectors: Vectors = field(default_factory=dict)
     video: str = "none"
+    source: LeRobotSource | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -294,9 +298,40 @@ class ExtractSettings(RunSettings):
             raise UsageError("--later-views mean and --tokens all contradict each other; leave one out")
 
     @classmethod
+    def from_options(
+        cls, *, model: str, dataset: str | None = None, episodes: str | None = None, select: str | None = None,
+        cameras: Sequence[str] | None = None, rotations: Sequence[str] | None = None,
+        instruction: str | None = None, no_pixels: bool = False, accept_units: bool = False, **given: Any,
+    ) -> Self:  # fmt: skip
+        """As of every run. dataset: of recordings, which the options behind it choose; see `LeRobotSource`."""
+        of_recordings = {
+            "--episodes": episodes, "--select": select, "--camera": cameras, "--rotate": rotations,
+            "--instruction": instruction, "--no-pixels": no_pixels, "--accept-units": accept_units,
+        }  # fmt: skip
+        if dataset is None:
+            if wrong := [option for option, value in of_recordings.items() if value]:
+                raise UsageError(
+                    f"{', '.join(wrong)} is for recordings; give --dataset FOLDER too, or leave it out"
+                )
+            return super().from_options(model=model, **given)
+        changed = [name for name in ("scene", *SCENE_OPTIONS) if given.get(name) not in (None, False)]
+        changed += ["captured_calls"] * (given.get("captured_calls", 1) != 1)
+        if changed:
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
+            raise UsageError(
+                f"{options} does not apply with --dataset, which has no scene and captures every chosen frame; "
+                "remove it"
+            )
+        source = LeRobotSource.from_options(
+            dataset, episodes, select or "every:1", cameras or (), rotations or (),
+            instruction=instruction, pixels=not no_pixels, accept_units=accept_units,
+        )  # fmt: skip
+        return super().from_options(model=model, source=source, **given)
+
+    @classmethod
     def _calibrates_by_default(cls, model: str, given: Mapping[str, Any]) -> bool:
         """On a GPU, where a batch of one leaves most of it unused; scripts have no network."""
-        on_gpu = str(given.get("device", "cpu")).startswith("cuda")
+        on_gpu = str(given.get("device", "cpu")).startswith("cuda") and given.get("source") is None
         return on_gpu and given.get("env_workers") is None and has_network(model)
 
     def choices(self) -> dict[str, Any]:
@@ -469,6 +504,7 @@ def run_label(settings: RunSettings) -> str:
     if settings.label is not None:
         return " · ".join([settings.label, *(settings.marks() if asks else [])])
     parts = [settings.model]
+    source = settings.source if isinstance(settings, ExtractSettings) else None
     if isinstance(settings, ExtractSettings) and settings.protocol is not None:
         said = protocol_identity(settings)["protocol"]
         variant = [said["variant"]] if "variant" in said and "checkpoint" not in said["deviations"] else []
@@ -476,6 +512,7 @@ def run_label(settings: RunSettings) -> str:
         parts += [settings.protocol, *variant, *differing]
     else:
         parts += [] if settings.checkpoint is None else [Path(settings.checkpoint).name]
+        parts += [] if source is None else [f"on {source.name}"]
         parts += [f"{name}={value}" for name, value in sorted(settings.options.items())]
     if settings.random_weights and settings.weights_seed:
         parts.append(f"twin {settings.weights_seed}")

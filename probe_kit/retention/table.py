@@ -9,6 +9,7 @@ from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
 from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
+from probe_kit.extract.store.recorded.scene_only import check_scene_run
 from probe_kit.retention.behaviour.mixed_settings import chosen_wordings, mixed_episodes, mixed_settings
 from probe_kit.retention.behaviour.run_labels import distinct_labels
 from probe_kit.retention.behaviour.success_rate import capture_only
@@ -240,6 +241,8 @@ def retention_table(
     """
     check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
+    for run in (one for of_group in groups.values() for one in of_group):
+        check_scene_run(run, "a retention table")
     listed = [(name, scored(run, score, with_side_words)) for name, of_group in groups.items() for run in of_group]
     if keys is not None and len(keys) != len(listed):
         raise UsageError(f"{len(keys)} keys for {len(listed)} runs; give one per run, or None for the newest")

@@ -9,6 +9,7 @@ import numpy as np
 
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
+from probe_kit.extract.store.recorded.scene_only import check_scene_run
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import Baseline, Incomplete, LabelControl, Target
 from probe_kit.train.controls.fit_controls import add_baselines, add_untrained, check_untrained, prepare_baselines
@@ -149,6 +150,7 @@ def train_probes(
         )
     if window is not None:
         raise UsageError(f"window={window} without labels; it needs labels of single inferences")
+    check_scene_run(run, f"a probe of the side ({target})")
     crew = ExecutionSettings(jobs, device, ray)
     if len(run.episodes) == 0:
         raise RunIncompleteError(f"{run.location} has no finished episode to probe. Finish it first")

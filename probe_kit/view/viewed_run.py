@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.extract import Run
 from probe_kit.extract.store.format.commits import WITH_CONTROL_STEPS
+from probe_kit.extract.store.recorded.scene_only import check_scene_run
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.behaviour.vlm_answers import ask_of
@@ -148,6 +149,8 @@ def view_runs(runs: Sequence[Run], probes_of: Run | None = None) -> list[ViewedR
     """
     if not runs:
         raise UsageError("the viewer needs at least one run")
+    for run in runs:
+        check_scene_run(run, "the viewer")
     places = [run.location.address for run in runs]
     if doubles := [place for at, place in enumerate(places) if place in places[:at]]:
         raise UsageError(f"{doubles[0]} is given twice. Leave one out")

@@ -1,6 +1,6 @@
 """The episode loop: two groups of stages alternate; one simulates while the policy infers for the other."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
@@ -27,7 +27,7 @@ class Rollout:
 
     trajectory: (T + 1, C) float32 frames of the whole episode. instruction_ids: what the policy was delivered
     as its instruction, None if it reads none or cannot say. control_steps: of every inference, how many actions of
-    the episode came before it.
+    the episode came before it. inputs: what was shown of recordings, see `Ending`.
     """
 
     planned: PlannedRow
@@ -39,6 +39,7 @@ class Rollout:
     instruction_ids: Sequence[int] | None = None
     control_steps: Sequence[int] = ()
     seconds: Seconds = field(default_factory=Seconds)
+    inputs: Mapping[str, NDArray[Any]] | None = None
 
     @property
     def record(self) -> EpisodeRecord:
@@ -49,7 +50,7 @@ class Rollout:
         }  # fmt: skip
         return EpisodeRecord(
             self.planned, self.outcome, arrays, buffers.roles, self.trajectory, self.instruction_ids,
-            control_steps=self.control_steps, seconds=self.seconds,
+            control_steps=self.control_steps, seconds=self.seconds, inputs=self.inputs or {},
         )  # fmt: skip
 
 
@@ -205,6 +206,7 @@ class EpisodeLoop:
                     yield Rollout(
                         slot.planned, outcome, slot.buffers, answer.frames, answer.small_frames, answer.trajectory,
                         slot.instruction_ids, slot.control_steps, Seconds(slot.seconds, answer.seconds),
+                        answer.inputs,
                     )  # fmt: skip
                     self._begin_next(slot, ended=True)
             if not any(slot.seen or (slot.planned and slot.ahead) for slot in group):

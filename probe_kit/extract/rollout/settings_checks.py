@@ -21,6 +21,9 @@ def check_meaningless(settings: RunSettings) -> None:
         )
     if not isinstance(settings, ExtractSettings):
         return
+    if settings.source is not None:
+        _check_recorded(settings)
+        return
     if settings.capture_only:
         _check_acting(settings)
     if settings.model not in SCRIPTED:
@@ -42,6 +45,30 @@ def check_meaningless(settings: RunSettings) -> None:
             f"{', '.join(meaningless)} does not apply: {settings.model} is scripted and has no network. Remove "
             "it, or choose a model with weights"
         )
+
+
+def _check_recorded(settings: ExtractSettings) -> None:
+    """Raise UsageError for what only scenes have; `with_recording` decides captured_calls by itself."""
+    given = {
+        "--suite": settings.suite is not None,
+        "--categories": settings.categories is not None,
+        "--items": settings.items is not None,
+        "--wordings": settings.wordings is not None,
+        "--protocol": settings.protocol is not None,
+        "--execute": settings.execute is not None,
+        "--rotation": settings.rotation is not None,
+        "--video": settings.video != "none",
+        "--later-views": settings.later_views != "all",
+        "--batch auto": settings.calibrate,
+        "edits": bool(settings.edits),
+    }
+    if meaningless := [option for option, is_given in given.items() if is_given]:
+        raise UsageError(
+            f"{', '.join(meaningless)} does not apply with --dataset, which shows recorded frames and executes no "
+            "action; remove it"
+        )
+    if settings.model in SCRIPTED:
+        raise UsageError(f"{settings.model} is scripted and looks at nothing; choose a model with weights")
 
 
 def _check_acting(settings: ExtractSettings) -> None:

@@ -19,6 +19,7 @@ from probe_kit.errors import (
     ObservationError,
     PolicyFailedError,
     ProbeKitError,
+    RecordingError,
     SceneError,
     StageDiedError,
 )
@@ -36,6 +37,7 @@ EPISODE_ERRORS = (
     NonFiniteActivationError,
     ObservationError,
     PolicyFailedError,
+    RecordingError,
     SceneError,
     StageDiedError,
 )
@@ -46,7 +48,7 @@ class Ending:
     """The end of an episode: its record as flat columns, a frame per action if it was filmed, its small frames.
 
     trajectory: (T + 1, C) float32; see `probe_kit.env.scoring.trajectory`. seconds: that the stage worked on the
-    episode, by the wall clock.
+    episode, by the wall clock. inputs: (n, …) by kind what was shown in n inferences, of recordings.
     """
 
     outcome: dict[str, Any]
@@ -54,6 +56,7 @@ class Ending:
     small_frames: SmallFrames = ()
     trajectory: NDArray[np.float32] | None = None
     seconds: float = 0.0
+    inputs: Mapping[str, NDArray[Any]] | None = None
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import EpisodeLoop, Failure, Rollout
 from probe_kit.extract.rollout.events import Done, Event, Failed
 from probe_kit.extract.rollout.question_loop import Asking
+from probe_kit.extract.rollout.recorded.recorded_stage import RecordedStage
 from probe_kit.extract.rollout.stage import AskableStage, LocalStage
 from probe_kit.extract.rollout.stage_process import ProcessStage
 from probe_kit.extract.run_layout import VIDEOS
@@ -71,7 +72,12 @@ class Worker:
         if wanted is None:
             wanted = 2 * self._settings.batch if self._episodes >= WORTH_PROCESSES else 0
         kind = ProcessStage if position < wanted else LocalStage
-        stage: AskableStage = kind(self._settings.scene, self._controller.script, self._settings.frames)
+        recorded = getattr(self._settings, "source", None)
+        stage: AskableStage = (
+            kind(self._settings.scene, self._controller.script, self._settings.frames)
+            if recorded is None
+            else kind(recorded, None, kind=RecordedStage)
+        )
         stack.callback(stage.close)
         return stage
 

@@ -122,6 +122,7 @@ def _write_header(file: BinaryIO, header: dict[str, Any]) -> None:
 def _write_parquet(run: Run, out: Path) -> None:
     pa, pq = require("pyarrow", "export"), require("pyarrow.parquet", "export")
     keys = ["episode_id", "item_id", "category", "layout", "side_correct", "outcome"]
+    keys = [key for key in keys if key in run.episodes]
     fields = [*((key, pa.string()) for key in keys), ("call", pa.int32()), ("site", pa.string())]
     schema = pa.schema([*fields, ("view", pa.string()), ("vector", pa.list_(pa.float32()))])
     arrays = [(run.stored(stream), kind, rows) for stream, kind, rows in _arrays(run) if kind != "tokens"]

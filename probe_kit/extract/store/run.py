@@ -22,6 +22,8 @@ from probe_kit.errors import (
 )
 from probe_kit.extract.run_layout import (
     DATA,
+    DATASET,
+    INPUTS,
     MEAN_VIEW,
     PROVENANCE,
     TRAJECTORY,
@@ -53,6 +55,7 @@ from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.locations.summary import run_html, run_text
 from probe_kit.extract.store.outcomes_by_rule import Watched, judged, watch, with_outcomes
 from probe_kit.extract.store.provenance import Provenance, differences, read_provenances
+from probe_kit.extract.store.recorded.inputs import StoredInputs
 from probe_kit.extract.store.seconds import Seconds, read_seconds
 from probe_kit.extract.store.selection import select_items
 from probe_kit.hooks.contract.sites import Site, Stream
@@ -179,9 +182,28 @@ class Run:
         return bool(self.settings.get("capture_only"))
 
     @property
+    def recorded(self) -> bool:
+        """Whether it was made of recordings: there are no sides, no outcomes and no scene."""
+        return DATASET in self.settings
+
+    @property
     def suite(self) -> str:
-        """Identity of the suite that was run, `name@version#hash`."""
+        """Identity of the suite that was run, `name@version#hash`; of recordings the data set's `name#hash`."""
+        if self.recorded:
+            return f"{self.settings['recording']['name']}#{self.settings[DATASET]['meta_blake2b'][:12]}"
         return str(self.settings["suite"]["identity"])
+
+    @cached_property
+    def inputs(self) -> StoredInputs | None:
+        """State, actions and small pictures of every recorded frame; None for a run that is not of recordings.
+
+        Raises ActivationsLeftOutError in a copy without activations.
+        """
+        if not self.recorded:
+            return None
+        if any(name.startswith(f"{INPUTS}/") for name in self.root.left_out):
+            self.root.refuse_left_out("there are no inputs")
+        return StoredInputs(self.data, self._numbers, self.settings[DATASET])
 
     @property
     def suite_parent(self) -> str | None:
@@ -371,7 +393,8 @@ class Run:
     def control_steps(self) -> NDArray[np.int64]:
         """(E, N) int64: the control step at which each inference of an episode was made, -1 behind its last one.
 
-        A control step is one executed action; an inference at step 4 saw the state after four actions. N: most
+        A control step is one executed action; an inference at step 4 saw the state after four actions. Of
+        recordings it is the number of the frame in its episode. N: most
         inferences of an episode; 0 for scripts. Captured inference `call` is column `call`. An episode in which
         nothing moves (`ask`, or without acting) has one inference, at step 0.
         Raises UsageError for a run of schema 3, which does not hold them.
@@ -625,7 +648,8 @@ class Run:
             array = array.rename(own).transpose("episode", "call", *own.values())
             arrays[f"{name}_pooled"] = array.assign_coords({f"{name}_view": list(stored.views)})
         labels = ("episode_id", "category", "layout", "side_correct", "outcome")
-        return xr.Dataset(arrays, coords={label: ("episode", self.episodes[label]) for label in labels})
+        there = [label for label in labels if label in self.episodes]
+        return xr.Dataset(arrays, coords={label: ("episode", self.episodes[label]) for label in there})
 
     # -- tokens ----------------------------------------------------------------------------------------
 

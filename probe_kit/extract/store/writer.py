@@ -17,7 +17,7 @@ from zarr.storage import MemoryStore
 
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract.plan import PlannedRow, RowPlan
-from probe_kit.extract.run_layout import COMMITS, DATA, FAILED, LABEL_FILE, PLANS, RUN_FILE, StoredStream
+from probe_kit.extract.run_layout import COMMITS, DATA, DATASET, FAILED, LABEL_FILE, PLANS, RUN_FILE, StoredStream
 from probe_kit.extract.settings import check_other_settings
 from probe_kit.extract.store.certificates import write_certificate
 from probe_kit.extract.store.format.arrays import at_extent, create_arrays
@@ -46,6 +46,7 @@ from probe_kit.extract.store.provenance import (
     provenance_here,
     read_provenances,
 )
+from probe_kit.extract.store.recorded.inputs import create_inputs, write_inputs
 from probe_kit.extract.store.seconds import Seconds, write_seconds
 from probe_kit.hashing import canonical_json
 
@@ -63,7 +64,7 @@ class EpisodeRecord:
     instruction_ids: the instruction as the policy was delivered it. pictures: encoded, by key in the run. frames:
     how many one of them holds, if it holds all of the episode.
     control_steps: of every inference, how many actions of the episode came before it; rising. seconds: what the
-    episode took, which no hash of the run covers.
+    episode took, which no hash of the run covers. inputs: what was shown of recordings, by kind.
     """
 
     planned: PlannedRow
@@ -76,6 +77,7 @@ class EpisodeRecord:
     control_steps: Sequence[int] = ()
     seconds: Seconds = field(default_factory=Seconds)
     frames: int | None = None
+    inputs: Mapping[str, NDArray[Any]] = field(default_factory=dict)
 
 
 class RunWriter:
@@ -124,6 +126,9 @@ class RunWriter:
         if "scene" in self.settings and not still:  # who is asked or captured does not move
             frames = self.settings["scene"]["max_steps"] + 1
             create_trajectories(store, 0, frames, self.settings["codec"])
+        if DATASET in self.settings:
+            shapes = self.settings[DATASET]["inputs"]
+            create_inputs(store, self.settings["captured_calls"], shapes, self.settings["codec"])
         objects = {f"{DATA}/{key}": at_extent(value.to_bytes(), 0) for key, value in arrays.items()}
         root = new_root(self.settings, [self._without_length(one) for one in self.plan.streams], objects)
         return {**objects, LABEL_FILE: label_record(record_hash(root), self._label), RUN_FILE: root}
@@ -268,6 +273,7 @@ class RunWriter:
                 array[planned.index] = values
         if episode.trajectory is not None and self._keeps_trajectories:
             write_trajectory(store, planned.index, episode.trajectory, _WRITE_ALL)
+        write_inputs(store, planned.index, episode.inputs, _WRITE_ALL)
         for key, content in episode.pictures.items():
             self.location.write(key, content)
         pictures = {key: Sum.of(content) for key, content in episode.pictures.items()}

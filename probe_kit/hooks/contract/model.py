@@ -266,6 +266,36 @@ class Policy(Model):
             f"{type(self).__name__} declares gradients and does not implement `differentiable`"
         )
 
+    @property
+    def state_numbers(self) -> int | None:
+        """How many numbers a recorded state must have; None for a policy that takes any, or reads none."""
+        return None
+
+    def with_cameras(self, cameras: Sequence[str]) -> "Policy":
+        """The same policy, given pictures of these cameras; all but the first from `Observation.cameras`.
+
+        Raises ObservationError for cameras that it cannot be given together.
+        """
+        if tuple(cameras) != self.card.cameras[:1]:
+            raise ObservationError(
+                f"cameras {list(cameras)} given; {self.card.family} is given {list(self.card.cameras[:1])} alone"
+            )
+        return self
+
+    def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(n, D) which numbers of recorded states (n, D) lie far outside the checkpoint's own statistics.
+
+        Raises CheckpointError for a checkpoint without statistics.
+        """
+        return np.zeros(states.shape, bool)
+
+    def predict(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One chunk of actions per recorded observation, in the checkpoint's own units and width.
+
+        Returns (B, chunk, D) float32. It makes no claim that the actions fit an arm; states are taken as recorded.
+        """
+        return self.act(seen, seeds)
+
     @abstractmethod
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation.

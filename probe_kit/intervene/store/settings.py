@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from probe_kit.errors import UnknownCategoryError, UsageError
+from probe_kit.extract.store.recorded.scene_only import check_scene_run
 from probe_kit.extract.store.run import Run
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.interventions import Readout
@@ -86,6 +87,7 @@ def key_of(settings: Mapping[str, Any]) -> str:
 
 def check_run_fits(run: Run) -> None:
     """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
+    check_scene_run(run, "an intervention")
     settings = run.settings
     why = None
     if "ask" in settings:

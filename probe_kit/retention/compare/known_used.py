@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import OtherFramesError, UsageError
+from probe_kit.extract.store.recorded.scene_only import check_scene_run
 from probe_kit.hashing import derive_seed
 from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
@@ -145,6 +146,7 @@ def match_runs(
     Raises UsageError for runs of the wrong kinds or without a question in common, OtherFramesError if their first
     frames differ or carry no hash.
     """
+    check_scene_run(acted, "a comparison with answers")
     _check_kinds(asked, acted)
     pairs = _same_questions(asked, acted)
     chosen = None if results is None else view or results.settings.views[0]

@@ -16,15 +16,18 @@ from probe_kit.train.labels.label_table import EPISODE, INFERENCE, Cell
 if TYPE_CHECKING:
     import pandas as pd
 
-SIM, ITEM = "sim.", "item."
+SIM, ITEM, RECORDED = "sim.", "item.", "dataset."
 PHASES = ("before grasp", "holding", "after release")
 
 
 @dataclass(frozen=True)
 class BuiltinColumn:
-    """A built-in column. episodes: (n,) ids. inferences: (n,), None for one label per episode. cells: (n,)."""
+    """A built-in column. episodes: (n,) ids. inferences: (n,), None for one label per episode. cells: (n,).
 
-    task: Task
+    task: None where the values decide it.
+    """
+
+    task: Task | None
     episodes: tuple[str, ...]
     inferences: tuple[int, ...] | None
     cells: tuple[Cell, ...]
@@ -110,7 +113,37 @@ def builtin_column(run: RunReader, name: str) -> BuiltinColumn:
     if name.startswith(ITEM) and name.removeprefix(ITEM) in ITEM_COLUMNS:
         ids = tuple(run.episodes[EPISODE].astype(str))
         return BuiltinColumn("classes", ids, None, tuple(_of_item(run, name.removeprefix(ITEM))))
+    if name.startswith(RECORDED):
+        return _of_recording(run, name.removeprefix(RECORDED))
     raise UsageError(f"there is no built-in column {name!r}; there are: {', '.join(builtin_names())}")
+
+
+def _of_recording(run: RunReader, name: str) -> BuiltinColumn:
+    """A column of the data set for every shown frame: a feature of one number, `state.NAME` or `action.NAME`."""
+    columns = recorded_columns(run)
+    if name not in columns:
+        there = ", ".join(RECORDED + one for one in columns) or "none, because the run is not of recordings"
+        raise UsageError(f"{run.location} has no column {RECORDED}{name}; there are: {there}")
+    found = list(_inferences(run))
+    rows = _rows(run, [episode for episode, _ in found])
+    calls = [call for _, call in found]
+    cells = tuple(_finite(float(value)) for value in columns[name][rows, calls])
+    episodes, inferences = zip(*found, strict=True)
+    return BuiltinColumn(None, episodes, inferences, cells)
+
+
+def recorded_columns(run: RunReader) -> dict[str, NDArray[np.float64]]:
+    """(E, C) values of the data set by name, of every shown frame; none for a run that is not of recordings."""
+    inputs = getattr(run, "inputs", None)
+    if inputs is None:
+        return {}
+    found = {name: inputs.column(name) for name in inputs.columns}
+    for kind, names in inputs.names.items():
+        if kind in inputs.kinds:
+            values = inputs.read(kind)
+            now = values if kind == "state" else values[:, :, 0]
+            found |= {f"{kind}.{name}": now[..., place].astype(np.float64) for place, name in enumerate(names)}
+    return found
 
 
 def builtin_names() -> list[str]:
@@ -122,22 +155,29 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
     """Keys and built-in columns of a run: a row per episode and captured inference, to be extended by columns.
 
     Besides the keys `episode_id` and `inference` there are `control_step`, `group_id`, `category` and the built-in
-    columns that the run has; one without trajectories or control steps has no `sim.*`, see `why_no_sim`.
+    columns that the run has; one without trajectories or control steps has no `sim.*`, see `why_no_sim`. Of
+    recordings there are `source_episode`, `frame`, `instruction` and the columns `dataset.*` instead.
     """
     import pandas as pd
 
     ids, inferences = zip(*_inferences(run), strict=True)
     rows = _rows(run, ids)
     table: dict[str, Sequence[Any]] = {EPISODE: ids, INFERENCE: inferences}
-    sim: dict[str, Sequence[Any]] = {}
+    sim: dict[str, Any] = {}
     if why_no_sim(run) is None:
         values = _of_frames(run, [value for _, value in SIM_COLUMNS.values()])
         sim = dict(zip((SIM + name for name in SIM_COLUMNS), zip(*values, strict=True), strict=True))
         table["control_step"] = [frame for _, _, frames in frames_of_inferences(run) for frame in frames]
+    if getattr(run, "recorded", False):
+        steps = run.control_steps  # type: ignore[attr-defined]
+        table["source_episode"] = run.episodes["source_episode"].iloc[rows].tolist()
+        table["frame"] = steps[rows, list(inferences)].tolist()
+        table["instruction"] = run.episodes["instruction"].iloc[rows].tolist()
+        sim = {RECORDED + name: own[rows, list(inferences)] for name, own in recorded_columns(run).items()}
     for name in ("group_id", "category"):
         table[name] = run.episodes[name].iloc[rows].tolist()
     table |= sim
-    for name in ITEM_COLUMNS:
+    for name in () if getattr(run, "recorded", False) else ITEM_COLUMNS:
         if set(_needed(name)) <= set(run.episodes):
             cells = list(_of_item(run, name))
             table[ITEM + name] = [cells[row] for row in rows]

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ from probe_kit.train.labels.label_results import (
 from probe_kit.train.labels.labelled_samples import LabelledSamples
 
 if TYPE_CHECKING:
+    from probe_kit.extract.store.recorded.inputs import StoredInputs
     from probe_kit.suite import Suite
 
 RANDOM: Name = "random-features"
@@ -51,8 +52,10 @@ class ControlInputs:
     def features(self, name: Name) -> Features:
         """(n, D) features of a control but `random-features`. Raises UsageError where the run lacks them."""
         if name == "step":
-            return step_features(self.samples)
+            return step_features(self.samples, self._frames())
         if name == "state":
+            if self.recorded is not None:
+                return self._recorded("state").astype(np.float32)
             return state_features(self.run, self.samples)
         if name == "instruction":
             return word_counts(self.run)[self.samples.rows]
@@ -66,20 +69,60 @@ class ControlInputs:
     def _layer_inputs(self) -> list[Features]:
         """Read once for the layers of all streams."""
         parts = [self._pixels(SIDE), self.features("instruction")]
-        if why_no_sim(self.run) is None:
+        if why_no_state(self.run) is None:
             parts.append(self.features("state"))
         return parts
 
+    @cached_property
+    def recorded(self) -> "StoredInputs | None":
+        """What was shown of recordings."""
+        found: StoredInputs | None = getattr(self.run, "inputs", None)
+        return found
+
+    def _recorded(self, kind: str) -> NDArray[Any]:
+        """(n, …) stored inputs of the samples."""
+        assert self.recorded is not None
+        found: NDArray[Any] = self.recorded.read(kind)[self.samples.rows, self.samples.inferences]
+        return found
+
+    def _frames(self) -> NDArray[np.intp] | None:
+        """(n,) place of every recorded frame among those of its number, None for scenes."""
+        if self.recorded is None:
+            return None
+        steps = self.run.control_steps[self.samples.rows, self.samples.inferences]  # type: ignore[attr-defined]
+        return np.asarray(np.unique(steps, return_inverse=True)[1], np.intp)
+
     def _pixels(self, side: int) -> Features:
+        if self.recorded is not None:
+            return small_pictures(self._recorded("pixels"), side)
         assert self.suite is not None, "what needs pictures is given them"
         rows, place = np.unique(self.samples.rows, return_inverse=True)
         return tile_pixels(self.run.episodes.iloc[rows], self.suite, side)[place]
 
 
-def step_features(samples: LabelledSamples) -> Features:
-    """(n, at most 50): which part of the window an inference is in, one-hot."""
-    bins = min(samples.window, MOST_BINS)
-    found: Features = np.eye(bins, dtype=np.float32)[samples.inferences * bins // samples.window]
+def step_features(samples: LabelledSamples, places: NDArray[np.intp] | None = None) -> Features:
+    """(n, at most 50): which part of the window an inference is in, one-hot.
+
+    places: (n,) of recorded frames in the order of their numbers, which take the place of inferences.
+    """
+    steps, count = samples.inferences, samples.window
+    if places is not None:
+        steps, count = places, int(places.max()) + 1
+    bins = min(count, MOST_BINS)
+    found: Features = np.eye(bins, dtype=np.float32)[steps * bins // count]
+    return found
+
+
+def small_pictures(pixels: NDArray[np.uint8], side: int) -> Features:
+    """(n, cameras · side² · 3) of (n, cameras, 32, 32, 3): RGB from 0 to 1, each pixel the mean of its part."""
+    from PIL import Image
+
+    box = Image.Resampling.BOX
+    rows = [
+        np.concatenate([np.asarray(Image.fromarray(one).resize((side, side), box)).ravel() for one in cameras])
+        for cameras in pixels
+    ]
+    found: Features = np.stack(rows).astype(np.float32) / np.float32(255)
     return found
 
 
@@ -97,6 +140,14 @@ def state_features(run: RunReader, samples: LabelledSamples) -> Features:
             frame = frames[samples.inferences[place]]
             found[place] = [*seen.tool[frame], seen.opening[frame]]
     return found
+
+
+def why_no_state(run: RunReader) -> str | None:
+    """Why a run has no control `state`; None if it has one."""
+    inputs = getattr(run, "inputs", None)
+    if inputs is None:
+        return why_no_sim(run)
+    return None if "state" in inputs.kinds else "the data set has no state"
 
 
 def prepare_controls(
@@ -117,7 +168,7 @@ def prepare_controls(
     left_out: dict[str, str] = {name: impossible[name] for name in asked if name in impossible}
     chosen = [name for name in asked if name not in impossible]
     suite = None
-    if PICTURED.intersection(chosen):
+    if PICTURED.intersection(chosen) and not getattr(run, "recorded", False):
         try:
             suite = suite_of(run, folder)
         except SuiteNotFoundError as error:
@@ -139,8 +190,11 @@ def _impossible(run: RunReader, samples: LabelledSamples) -> dict[str, str]:
     found = {}
     if samples.window == 1:
         found["step"] = "every episode has one inference with a label"
-    if (reason := why_no_sim(run)) is not None:
+    if (reason := why_no_state(run)) is not None:
         found["state"] = reason
+    inputs = getattr(run, "inputs", None)
+    if inputs is not None and "pixels" not in inputs.kinds:
+        found |= dict.fromkeys(PICTURED, "the run was extracted with --no-pixels")
     if "instruction" not in run.episodes:
         found |= dict.fromkeys(("instruction", RANDOM), "the episodes have no column 'instruction'")
     return found

@@ -18,7 +18,9 @@ from probe_kit.errors import (
 )
 from probe_kit.extract.run_layout import (
     DATA,
+    DATASET,
     FORMER_PLAN_FILE,
+    INPUTS,
     MEAN_VIEW,
     PLANS,
     READABLE_SCHEMAS,
@@ -55,6 +57,12 @@ _EPISODE = {
     **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "layout", "side_correct"), str),
     "episode": int,
 }
+_STRETCH = {
+    **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "instruction", "content_blake2b"), str),
+    **dict.fromkeys(("episode", "source_episode", "first_frame", "frame_step", "frames"), int),
+}
+"""The same of a run on recordings."""
+_RECORDED = {"meta_blake2b": str, "inputs": dict, "columns": list, "names": dict}
 _WITH_ITEM_HASHES = 4
 """The first schema whose plan holds item hashes and the suite's parent."""
 _WITH_PLANS = 5
@@ -260,6 +268,8 @@ class Root:
 
     @property
     def _episode_parts(self) -> dict[str, type]:
+        if DATASET in self.own_settings:
+            return _STRETCH
         return _EPISODE if self.schema < _WITH_ITEM_HASHES else {**_EPISODE, "item_content_sha256": str}
 
     @cached_property
@@ -272,7 +282,11 @@ class Root:
         """Arrays of `data.zarr` in which every episode has one object, and how many axes each has."""
         with_tokens = self.own_settings["tokens"] == "all"
         streams = self.own_streams.values()
-        return {name: axes for one in streams for name, axes in one.arrays(with_tokens, self.later_views).items()}
+        arrays = {
+            name: axes for one in streams for name, axes in one.arrays(with_tokens, self.later_views).items()
+        }
+        shapes = self.own_settings.get(DATASET, {}).get("inputs", {})
+        return {**arrays, **{f"{INPUTS}/{name}": 2 + len(shape) for name, shape in shapes.items()}}
 
     @property
     def later_views(self) -> LaterViews:
@@ -326,6 +340,9 @@ def find_root(location: Location) -> Root | None:
     settings = in_current_words(card["settings"], "settings")
     there = {part: kind for part, kind in _FURTHER.items() if part in settings}
     expect(settings, {**_SETTINGS, **there}, f"{name}: the settings", RESTORE)
+    if DATASET in settings:
+        expect(settings, {DATASET: dict}, f"{name}: the settings", RESTORE)
+        expect(settings[DATASET], _RECORDED, f"{name}: the data set", RESTORE)
     check_sums(card["objects"], name, RESTORE)
     streams = _read_streams(card["streams"], name)
     root = Root(location, card, settings, card[HASH], streams, read_sums(card["objects"]))

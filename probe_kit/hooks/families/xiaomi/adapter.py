@@ -61,6 +61,7 @@ class Xiaomi(QwenVLA):
 
     interventions = INTERVENTIONS
     fast_pictures: ClassVar[bool] = False
+    state_numbers = ARM_NUMBERS
 
     def __init__(
         self,

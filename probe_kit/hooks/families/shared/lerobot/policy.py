@@ -39,6 +39,9 @@ from probe_kit.models.initialisation import initialise
 
 IMAGES, STATE = "observation.images.", "observation.state"
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
+USUAL_DEVIATIONS = 5.0
+"""From the mean of the statistics; a recorded state further away is unusual."""
+_ROUNDING = 1e-3
 _DIMENSIONS = 7
 """Of the arm's actions."""
 
@@ -245,6 +248,33 @@ class LerobotPolicy(Policy):
         zeros = np.zeros((len(seen), self._state_numbers), np.float32) if self.zero_filled_inputs() else None
         return self.put_out(self.batch(seen, zeros), seeds)
 
+    def predict(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """One chunk per recorded observation, by the checkpoint's own statistics; see the contract."""
+        self.check(seen, seeds)
+        states = np.stack([np.asarray(one.state, np.float32) for one in seen])
+        if states.shape[1] != self._state_numbers:
+            raise ObservationError(
+                f"the recorded state has {states.shape[1]} numbers; this checkpoint reads {self._state_numbers}"
+            )
+        restore, normalised = self.action_units.restore, self.state_units.normalise(states)
+        return restore(self.put_out(self.batch(seen, normalised), seeds))
+
+    @property
+    def state_numbers(self) -> int:
+        """As the checkpoint's configuration says."""
+        return self._state_numbers
+
+    def with_cameras(self, cameras: Sequence[str]) -> Self:
+        """See `showing`."""
+        return self.showing(cameras)
+
+    def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
+        units, read = self.state_units, np.abs(self.state_units.normalise(states))
+        if units.mode == "IDENTITY":
+            return np.zeros(states.shape, bool)
+        return np.asarray(read > (USUAL_DEVIATIONS if units.mode == "MEAN_STD" else 1 + _ROUNDING))
+
     def embodiment_mismatch(self) -> str | None:
         """Other actions than an end-effector delta, another state, or no units for either."""
         return self._action_misfit() or self._state_misfit()
@@ -410,7 +440,9 @@ class LerobotPolicy(Policy):
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Prefix and suffix as the family packs them."""
-        state = None if self.zero_filled_inputs() else self.state(seen)
+        recorded = {np.shape(one.state) for one in seen} == {(self._state_numbers,)}
+        unread = self.zero_filled_inputs() and not (recorded and _problem(lambda: self.state_units) is None)
+        state = None if unread else self.state(seen)
         return self.packed_roles(*self.tokenise([o.instruction for o in seen], state))
 
     def packed_roles(self, tokens: Tensor, mask: Tensor) -> dict[str, list[Roles]]:

@@ -1,0 +1,355 @@
+"""Recordings that lerobot wrote, from the folder to the stored activations, and every trap on the way."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from probe_kit.env import SceneSpec
+from probe_kit.errors import RecordingError, SettingsMismatchError
+from probe_kit.extract import ExtractSettings, LeRobotSource, Run, extract_run, prepare, verify_run
+from probe_kit.extract.plan import Plan
+from probe_kit.extract.recordings.lerobot_folder import LeRobotFrames, as_bytes, open_lerobot
+from probe_kit.extract.recordings.recorded_plan import SIDE, RecordedPlan
+from probe_kit.extract.rollout.controllers import PolicyController, Turn
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.suite import Suite
+from tests.extract.recordings.conftest import STATE, observations
+from tests.support.lerobot_recordings import CAMERA, write_recording
+
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("_lerobot_cache")]
+
+
+def settings(folder: Path, **source: Any) -> ExtractSettings:
+    return ExtractSettings("pi0-tiny", source=LeRobotSource(str(folder), **source), env_workers=0)
+
+
+def shown(folder: Path, out: Path, policy: Pi0, **source: Any) -> Run:
+    return prepare(settings(folder, **source), out, policy=policy).run(out)
+
+
+def rows(run: Run) -> dict[str, np.ndarray]:
+    """(E, C, …) pooled rows of every stream."""
+    return {name: np.stack([run.rows(name)[row] for row in range(len(run.episodes))]) for name in run.streams}
+
+
+@pytest.fixture(scope="module")
+def run(recording: Path, pi0_tiny: Pi0, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return shown(recording, tmp_path_factory.mktemp("shown") / "run", pi0_tiny)
+
+
+# -- the acceptance -------------------------------------------------------------------------------------------
+
+
+def test_a_data_set_written_from_a_scene_run_gives_that_runs_activations_bit_for_bit(
+    small_suite: Suite, pi0_tiny: Pi0, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pictures of 640 × 480 as PNG, batch 1, the seeds of the scene run."""
+    seen: dict[int, list[Observation]] = {}
+    act = PolicyController.act
+
+    def watched(controller: PolicyController, turns: list[Turn]) -> Any:
+        for turn in turns:
+            seen.setdefault(turn.seed, []).append(turn.seen)
+        return act(controller, turns)
+
+    monkeypatch.setattr(PolicyController, "act", watched)
+    scene = ExtractSettings(
+        "pi0-tiny", suite=small_suite.folder, categories=("color",), items=2, scene=SceneSpec(max_steps=6),
+        captured_calls=3, execute=2, env_workers=0,
+    )  # fmt: skip
+    prepared = prepare(scene, policy=pi0_tiny)
+    assert isinstance(prepared.plan, Plan)
+    acted = prepared.run(tmp_path / "scene")
+    monkeypatch.setattr(PolicyController, "act", act)
+    seeds = [int(seed) for seed in acted.episodes["policy_seed"]]
+    folder = write_recording(tmp_path / "rec", [seen[seed] for seed in seeds])
+
+    again = prepare(settings(folder), policy=pi0_tiny)
+    assert isinstance(again.plan, RecordedPlan)
+    stretches = tuple(replace(one, policy_seed=seed) for one, seed in zip(again.plan.episodes, seeds, strict=True))
+    replayed = replace(again, plan=replace(again.plan, episodes=stretches)).run(tmp_path / "run")
+    ours, theirs = rows(replayed), rows(acted)
+    assert ours.keys() == theirs.keys()
+    for name, values in theirs.items():
+        assert np.isfinite(values).all()
+        np.testing.assert_array_equal(ours[name], values)
+    assert replayed.inputs is not None
+    np.testing.assert_array_equal(replayed.inputs.read("state")[0, 0], seen[seeds[0]][0].state)
+    check = replayed.certificate["capture_check"]
+    assert replayed.certificate["hooks_on_equals_hooks_off"], check
+
+
+# -- what is stored -------------------------------------------------------------------------------------------
+
+
+def test_states_actions_and_columns_are_the_recorded_ones(run: Run) -> None:
+    assert verify_run(run.path, deep=True).ok
+    assert run.inputs is not None
+    states, actions, reward = run.inputs.read("state"), run.inputs.read("action"), run.inputs.column("next.reward")
+    expected = observations()
+    for row, episode in enumerate(expected):
+        np.testing.assert_array_equal(states[row, : len(episode)], [one.state for one in episode])
+        np.testing.assert_array_equal(actions[row, : len(episode), 0, 0], 10 * row + np.arange(len(episode)))
+        np.testing.assert_array_equal(reward[row, : len(episode)], np.arange(len(episode)) >= 3)
+        assert np.isnan(actions[row, len(episode) - 1, 1:]).all(), "nothing was recorded behind the end"
+    assert run.inputs.read("prediction").shape == (3, 7, 16, 7)
+    assert list(run.control_steps[0]) == [0, 1, 2, 3, 4, -1, -1]
+    assert set(run.episodes["outcome"]) == {"capture_only"}
+    assert list(run.episodes["instruction"])[:2] == [one[0].instruction for one in expected[:2]]
+
+
+def test_predictions_are_what_the_policy_acts_in_a_scene(run: Run, pi0_tiny: Pi0) -> None:
+    """Of the embedded policy, whose own units are those of the arm."""
+    assert run.inputs is not None
+    seed = int(run.episodes["policy_seed"].iloc[0])
+    own = pi0_tiny.act(
+        [observations()[0][0]], [Turn(observations()[0][0], seed, 0, None).derived_seed("inference")]
+    )  # type: ignore[arg-type]
+    np.testing.assert_array_equal(run.inputs.read("prediction")[0, 0], own[0])
+
+
+def test_pictures_leave_lerobot_as_the_bytes_that_were_written(recording: Path) -> None:
+    folder = open_lerobot(LeRobotSource(str(recording)))
+    frames = LeRobotFrames(folder, [0, 1, 2])
+    for episode, frame in ((2, 6), (0, 0), (1, 3)):
+        np.testing.assert_array_equal(
+            frames.pictures(episode, frame, [CAMERA])[CAMERA], observations()[episode][frame].image
+        )
+
+
+def test_no_thumbnails_and_no_pixels_are_kept_where_they_are_not_wanted(
+    recording: Path, pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    found = shown(recording, tmp_path / "run", pi0_tiny, episodes=(0,), every=4, pixels=False)
+    assert not (tmp_path / "run" / "frames").exists()
+    assert found.inputs is not None
+    assert "pixels" not in found.inputs.kinds
+    assert str(recording.parent) not in (tmp_path / "run" / "run.json").read_text(encoding="utf-8")
+
+
+# -- selection ------------------------------------------------------------------------------------------------
+
+
+def test_which_frames_and_episodes_are_chosen_changes_no_number_of_a_frame(
+    run: Run, recording: Path, pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    some = shown(recording, tmp_path / "run", pi0_tiny, episodes=(2, 0), every=2)
+    assert list(some.episodes["source_episode"]) == [0, 2], "in the order of the data set"
+    for name, every in rows(run).items():
+        own = rows(some)[name]
+        np.testing.assert_array_equal(own[0, :3], every[0, [0, 2, 4]])
+        np.testing.assert_array_equal(own[1, :4], every[2, [0, 2, 4, 6]])
+
+
+def test_frames_are_decoded_in_child_processes_with_the_same_numbers(
+    run: Run, recording: Path, pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    own = replace(settings(recording, episodes=(0, 1)), env_workers=2)
+    found = prepare(own, policy=pi0_tiny).run(tmp_path / "run")
+    for name, every in rows(run).items():
+        np.testing.assert_array_equal(rows(found)[name][:, :5], every[:2, :5])
+
+
+def test_a_run_grows_by_further_episodes_of_the_same_data_set(
+    recording: Path, pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    shown(recording, tmp_path / "run", pi0_tiny, episodes=(1,), every=3)
+    grown = shown(recording, tmp_path / "run", pi0_tiny, every=3)
+    assert list(grown.episodes["source_episode"]) == [0, 1, 2]
+    assert sorted(path.name for path in (tmp_path / "run" / "plan").iterdir()) == [
+        "00000000.json",
+        "00000001.json",
+    ]
+
+
+def test_the_task_of_a_frame_is_what_the_model_reads(tmp_path: Path) -> None:
+    """A row ends where the task changes."""
+    words = {(0, frame): "Put the cube on the blue shape" for frame in (3, 4)}
+    folder = write_recording(tmp_path / "rec", observations(1), tasks=words)
+    plan = prepare(settings(folder)).plan
+    assert [(one.episode_id, one.instruction.split()[-2]) for one in plan.episodes] == [
+        ("episode-000000", "red"),
+        ("episode-000000.1", "blue"),
+    ]
+    assert [
+        one.instruction for one in prepare(settings(folder, instruction="Put the cube on the star")).plan.episodes
+    ] == ["Put the cube on the star"]
+
+
+def test_rotated_pictures_are_another_run(run: Run, recording: Path, pi0_tiny: Pi0, tmp_path: Path) -> None:
+    turned = shown(recording, tmp_path / "run", pi0_tiny, episodes=(0,), rotations={"base": 180})
+    assert turned.settings_sha256 != run.settings_sha256
+    assert turned.inputs is not None
+    picture = Image.fromarray(np.rot90(observations()[0][0].image, 2).copy())
+    expected = np.asarray(picture.resize((SIDE, SIDE), Image.Resampling.BOX))
+    np.testing.assert_array_equal(turned.inputs.read("pixels")[0, 0, 0], expected)
+
+
+# -- identity -------------------------------------------------------------------------------------------------
+
+
+def test_where_the_folder_lies_is_no_part_of_a_run_and_what_it_holds_is(recording: Path, tmp_path: Path) -> None:
+    moved = shutil.copytree(recording, tmp_path / "elsewhere")
+    one, two = (prepare(settings(folder, episodes=(0,))) for folder in (recording, moved))
+    assert one.identity() == two.identity()
+    assert one.plan.to_json() == two.plan.to_json()
+    info = json.loads((moved / "meta" / "info.json").read_text(encoding="utf-8"))
+    (moved / "meta" / "info.json").write_text(json.dumps({**info, "robot_type": "other"}), encoding="utf-8")
+    assert prepare(settings(moved, episodes=(0,))).identity() != one.identity()
+
+
+def test_changed_data_of_an_episode_is_not_continued(recording: Path, pi0_tiny: Pi0, tmp_path: Path) -> None:
+    moved = shutil.copytree(recording, tmp_path / "rec")
+    shown(moved, tmp_path / "run", pi0_tiny, episodes=(0,), every=4)
+    rewrite(moved, lambda table: table.assign(**{"next.reward": np.float32(1) - table["next.reward"]}))
+    with pytest.raises(SettingsMismatchError, match="content_blake2b"):
+        shown(moved, tmp_path / "run", pi0_tiny, episodes=(0,), every=4)
+
+
+# -- traps ----------------------------------------------------------------------------------------------------
+
+
+def rewrite(folder: Path, change: Any) -> None:
+    """Change the data file of a recording as a data frame."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    (file,) = (folder / "data").rglob("*.parquet")
+    table = pq.read_table(file)
+    pq.write_table(
+        pa.Table.from_pandas(change(table.to_pandas()), schema=table.schema, preserve_index=False), file
+    )
+
+
+def test_an_episode_outside_the_data_set_is_refused_and_not_a_warning(recording: Path) -> None:
+    with pytest.raises(RecordingError, match="has 3 episodes, counted from 0; asked for 7"):
+        prepare(settings(recording, episodes=(1, 7)))
+
+
+def test_a_missing_file_is_named_and_the_hub_is_not_asked(recording: Path, tmp_path: Path) -> None:
+    broken = shutil.copytree(recording, tmp_path / "rec")
+    next((broken / "data").rglob("*.parquet")).unlink()
+    with pytest.raises(RecordingError, match=r"data/chunk-000/file-000\.parquet of episode 0 is missing"):
+        prepare(settings(broken))
+
+
+def test_data_that_lacks_an_episode_that_its_meta_names_is_refused(recording: Path, tmp_path: Path) -> None:
+    broken = shutil.copytree(recording, tmp_path / "rec")
+    rewrite(broken, lambda table: table[table["episode_index"] != 1])
+    with pytest.raises(RecordingError, match="lerobot cannot read rec"):
+        prepare(settings(broken))
+
+
+def test_timestamps_off_the_grid_are_refused_with_their_frame(recording: Path, tmp_path: Path) -> None:
+    broken = shutil.copytree(recording, tmp_path / "rec")
+    late = np.float32(0.07)
+    rewrite(broken, lambda table: table.assign(timestamp=table["timestamp"] + late * (table["index"] == 8)))
+    with pytest.raises(
+        RecordingError, match=r"episode 1: line 3 is frame 3 at 0\.6700 s; expected frame 3 at 0\.6"
+    ):
+        prepare(settings(broken))
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (np.full((3, 4, 4), 1.2, np.float32), "values from 1.2 to 1.2; expected 0 to 1"),
+        (np.full((3, 4, 4), np.nan, np.float32), "expected 0 to 1"),
+        (np.zeros((3, 4, 4), np.uint8), "expected floats"),
+        (np.zeros((1, 4, 4), np.float32), "expected floats"),
+    ],
+)
+def test_pictures_in_another_range_are_refused(picture: np.ndarray, message: str) -> None:
+    with pytest.raises(RecordingError, match=message):
+        as_bytes(picture, CAMERA)
+
+
+def test_every_byte_survives_the_way_over_floats() -> None:
+    every = np.arange(256, dtype=np.uint8).reshape(1, 16, 16).repeat(3, axis=0)
+    np.testing.assert_array_equal(
+        as_bytes(every.astype(np.float32) / np.float32(255), CAMERA), every.transpose(1, 2, 0)
+    )
+
+
+def test_a_state_of_another_robot_is_refused(tmp_path: Path) -> None:
+    other = [[replace(one, state=one.state[:6]) for one in episode] for episode in observations(1)]
+    folder = write_recording(tmp_path / "rec", other)
+    with pytest.raises(RecordingError, match=r"6 numbers as observation\.state; embedded reads 8"):
+        prepare(settings(folder))
+
+
+def test_states_far_outside_the_checkpoints_statistics_are_refused_unless_accepted(
+    pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    """Millimetres where the checkpoint reads metres; its own statistics decide, never those of the data set."""
+    scale = np.array([1000, 1000, 1000, 1, 1, 1, 1, 1], np.float32)
+    other = [[replace(one, state=one.state * scale) for one in episode] for episode in observations(1)]
+    folder = write_recording(tmp_path / "rec", other)
+    with pytest.raises(RecordingError, match=r"outside the statistics of embedded \(s0 100%.*--accept-units"):
+        prepare(settings(folder), policy=pi0_tiny)
+    assert prepare(settings(folder, accept_units=True), policy=pi0_tiny).plan.episodes
+
+
+def test_statistics_of_the_data_set_change_nothing(
+    run: Run, recording: Path, pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    other = shutil.copytree(recording, tmp_path / "rec")
+    stats = json.loads((other / "meta" / "stats.json").read_text(encoding="utf-8"))
+    stats["observation.state"]["mean"] = (100 + STATE).tolist()
+    (other / "meta" / "stats.json").write_text(json.dumps(stats), encoding="utf-8")
+    found = shown(other, tmp_path / "run", pi0_tiny, episodes=(0,))
+    for name, every in rows(run).items():
+        np.testing.assert_array_equal(rows(found)[name][0], every[0])
+
+
+def test_a_recording_as_video_says_so_and_gives_nearly_the_numbers_of_its_pictures(
+    pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    smooth = [
+        [replace(one, image=_smooth(row, frame)) for frame, one in enumerate(episode)]
+        for row, episode in enumerate(observations(2))
+    ]
+    pictures = shown(write_recording(tmp_path / "png", smooth), tmp_path / "one", pi0_tiny)
+    videos = shown(write_recording(tmp_path / "video", smooth, videos=True), tmp_path / "two", pi0_tiny)
+    kinds = [run.settings["dataset"]["cameras"][0][2] for run in (pictures, videos)]
+    assert kinds[0] == "image"
+    assert kinds[1] != "image"
+    ours, theirs = rows(videos)["backbone"], rows(pictures)["backbone"]
+    there = np.isfinite(theirs)
+    assert 0 < np.abs(ours[there] - theirs[there]).mean() < 0.1 * np.abs(theirs[there]).mean()
+
+
+def _smooth(row: int, frame: int) -> np.ndarray:
+    y, x = np.mgrid[:48, :64]
+    return np.stack([2 * y + 5 * row, 2 * x, np.full_like(x, 20 * frame)], axis=2).astype(np.uint8)
+
+
+def test_an_interrupted_run_continues_with_the_same_bytes(
+    run: Run, recording: Path, pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    class EnoughError(Exception):
+        pass
+
+    def stop(*_: object) -> None:
+        raise EnoughError
+
+    with pytest.raises(EnoughError):
+        prepare(settings(recording), policy=pi0_tiny).run(tmp_path / "run", progress=stop)
+    again = prepare(settings(recording), policy=pi0_tiny).run(tmp_path / "run")
+    assert [one["objects"] for one in again.commits()] == [one["objects"] for one in run.commits()]
+
+
+def test_the_python_interface_is_that_of_the_command_line(recording: Path, tmp_path: Path) -> None:
+    typed = ExtractSettings.from_options(
+        model="pi0-tiny", dataset=str(recording), episodes="0:2", select="every:3", cameras=[f"base={CAMERA}"],
+        env_workers=0,
+    )  # fmt: skip
+    assert typed.source == LeRobotSource(str(recording), range(2), 3, {"base": CAMERA})  # type: ignore[arg-type]
+    assert len(extract_run(typed, tmp_path / "run").episodes) == 2

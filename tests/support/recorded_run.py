@@ -1,0 +1,90 @@
+"""A run on recordings through the real writer, without a model and without lerobot."""
+
+from pathlib import Path
+
+import numpy as np
+
+from probe_kit.extract import Run, open_run, seal
+from probe_kit.extract.recordings.recorded_plan import SIDE, PlannedStretch, RecordedPlan
+from probe_kit.extract.run_layout import CAPTURE_ONLY, StoredStream
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
+from probe_kit.hashing import derive_seed
+from tests.support.little_run import certify
+
+STREAMS = (StoredStream("backbone", 2, 6, None, 4, ("mean",), quantities=("residual",)),)
+CALLS, EVERY, STATE, ACTION, CHUNK = 4, 5, 3, 2, 2
+SHORT = 11
+"""The episode that has a frame less."""
+PLANTED = 2
+"""The feature of `backbone.layer1` that holds the first number of the state."""
+
+
+def recorded_plan(episodes: int, pixels: bool = True) -> RecordedPlan:
+    """Frames 0, 5, 10 and 15 of every episode but SHORT, which has three; of two tasks in turn."""
+    rows = tuple(
+        PlannedStretch(
+            number, number, 0, 0, EVERY, CALLS - (number == SHORT), 20,
+            f"Open the {('door', 'drawer')[number % 2]}", number, f"{number:032x}",
+        )
+        for number in range(episodes)
+    )  # fmt: skip
+    inputs = {"columns": [2], "state": [STATE], "action": [CHUNK, ACTION], "prediction": [CHUNK, ACTION]}
+    dataset = {
+        "kind": "lerobot",
+        "meta_blake2b": "0" * 32,
+        "fps": 5.0,
+        "frames": f"every:{EVERY}",
+        "cameras": [["base", "observation.images.top", "image"]],
+        "rotations": [],
+        "instruction": None,
+        "inputs": inputs | ({"pixels": [1, SIDE, SIDE, 3]} if pixels else {}),
+        "columns": ["timestamp", "next.reward"],
+        "names": {"state": ["x", "y", "z"], "action": ["dx", "grip"]},
+    }
+    return RecordedPlan(rows, STREAMS, 1000, dataset, "kitchen")
+
+
+def write_recorded_run(where: Path | str, episodes: int = 12, pixels: bool = True) -> Run:
+    """Every number is drawn; the first of the state wanders, and lies in the features too."""
+    plan = recorded_plan(episodes, pixels)
+    settings = {
+        "model": "shown",
+        "weights_sha256": "0" * 64,
+        "random_weights": False,
+        "captured_calls": CALLS,
+        "tokens": "pooled",
+        "codec": "zstd",
+        "seed": 0,
+        "capture_only": True,
+        **plan.identity,
+    }
+    writer = RunWriter(locate(where), plan, settings)
+    certify(writer)
+    for planned in plan.episodes:
+        draw = np.random.default_rng(derive_seed("recorded", planned.index))
+        count = planned.count
+        state = draw.normal(size=(count, STATE)).astype(np.float32)
+        pooled = np.full((CALLS, 2, 1, 6), np.nan, np.float32)
+        pooled[:count] = draw.normal(size=(count, 2, 1, 6))
+        pooled[:count, 1, 0, PLANTED] = 5 * state[:, 0]
+        inputs = {
+            "state": state,
+            "action": draw.normal(size=(count, CHUNK, ACTION)).astype(np.float32),
+            "prediction": draw.normal(size=(count, CHUNK, ACTION)).astype(np.float32),
+            "columns": np.column_stack([np.arange(count) * EVERY / 5.0, draw.integers(0, 2, count)]),
+        }
+        if pixels:
+            inputs["pixels"] = draw.integers(0, 256, (count, 1, SIDE, SIDE, 3), dtype=np.uint8)
+        writer.write(
+            EpisodeRecord(
+                planned,
+                {"outcome": CAPTURE_ONLY, "frames_blake2b": "0" * 32},
+                {"pooled": {"backbone": pooled}},
+                [{"backbone": [("language", 0, 4)]}] * count,
+                control_steps=tuple(planned.frames),
+                inputs=inputs,
+            )
+        )
+    seal(where)
+    return open_run(where)

@@ -1,0 +1,130 @@
+"""Labels on runs of recordings: columns of the data set, controls from the stored inputs, groups that exchange."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from probe_kit.errors import UsageError
+from probe_kit.extract import Run, open_run
+from probe_kit.train import LabelResults, Labels, train_probes
+from probe_kit.train.labels.builtin_columns import label_frame
+from probe_kit.train.labels.label_controls import prepare_controls, small_pictures, step_features
+from probe_kit.train.labels.labelled_samples import LabelledSamples, labelled_samples
+from tests.support.recorded_run import CALLS, EVERY, PLANTED, write_recorded_run
+
+
+@pytest.fixture(scope="module")
+def results(shown_run: Run) -> LabelResults:
+    labels = Labels.of_run(shown_run, "dataset.state.x")
+    controls = ("step", "state", "instruction", "pixels", "random-features")
+    return train_probes(shown_run, labels=labels, permutations=99, controls=controls)
+
+
+def samples_of(run: Run, target: str = "dataset.state.x") -> LabelledSamples:
+    return labelled_samples(run, Labels.of_run(run, target), None, 0, None)
+
+
+def test_a_number_of_the_state_is_a_label_and_what_the_state_says_alone_is_no_signal(
+    results: LabelResults,
+) -> None:
+    """Planted at one site: found there; but the recorded state says it too, so no signal."""
+    scores = results.scores.set_index("site")
+    best = scores.loc["backbone.01.residual"]
+    assert results.settings.task == "continuous"
+    assert best["score"] > 0.9
+    assert best["p_fwe"] < 0.05
+    assert scores.loc["backbone.00.residual", "p_fwe"] > 0.05
+    assert best["exceeds_instruction"]
+    assert not best["exceeds_state"]
+    assert not best["signal"]
+
+
+def test_groups_are_recorded_episodes_and_exchange_as_wholes(shown_run: Run, results: LabelResults) -> None:
+    assert set(results.groups) == set(shown_run.episodes["item_id"][:-1]), (
+        "the short one is left out of the window"
+    )
+    assert results.left_out == {"episodes that end before inference 3": 1}
+    assert results.settings.group_by == "group_id"
+    assert results.settings.suite == shown_run.suite
+
+
+def test_the_controls_are_made_of_what_was_shown(shown_run: Run) -> None:
+    samples = samples_of(shown_run)
+    names, inputs, left_out = prepare_controls(shown_run, samples, None, None)
+    assert names == ("step", "state", "instruction", "pixels", "random-features")
+    assert not left_out
+    assert shown_run.inputs is not None
+    expected = shown_run.inputs.read("state")[samples.rows, samples.inferences]
+    np.testing.assert_array_equal(inputs.features("state"), expected)
+    assert inputs.features("pixels").shape == (samples.rows.size, 32 * 32 * 3)
+    np.testing.assert_allclose(
+        inputs.features("pixels")[0], shown_run.inputs.read("pixels")[0, 0].ravel() / 255, rtol=1e-6
+    )
+    step = inputs.features("step")
+    np.testing.assert_array_equal(step.argmax(axis=1), samples.inferences)
+    assert inputs.layer(6, 0).shape == (samples.rows.size, 6)
+
+
+def test_the_step_of_recordings_is_the_frame_and_not_the_place_in_its_row() -> None:
+    """The second stretch of a long episode begins at frame 64, not at inference 0."""
+    samples = LabelledSamples(
+        np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]), np.zeros(4), np.full(4, "a"), np.full(4, "all"), 2, {}
+    )
+    found = step_features(samples, np.array([0, 1, 2, 3]))
+    np.testing.assert_array_equal(found, np.eye(4))
+
+
+def test_small_pictures_are_means_of_the_stored_ones() -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (2, 1, 32, 32, 3), dtype=np.uint8)
+    found = small_pictures(pixels, 16).reshape(2, 16, 16, 3)
+    expected = pixels[:, 0].reshape(2, 16, 2, 16, 2, 3).mean(axis=(2, 4)) / 255
+    np.testing.assert_allclose(found, expected, atol=1.01 / 255)
+
+
+def test_a_run_without_pixels_says_why_two_controls_are_left_out(tmp_path: Path) -> None:
+    run = write_recorded_run(tmp_path / "run", 6, pixels=False)
+    names, _, left_out = prepare_controls(run, samples_of(run), None, None)
+    assert names == ("step", "state", "instruction")
+    assert set(left_out) == {"pixels", "random-features"}
+    with pytest.raises(UsageError, match="'pixels' is not possible: the run was extracted with --no-pixels"):
+        prepare_controls(run, samples_of(run), ("pixels",), None)
+
+
+def test_the_table_to_be_extended_has_source_frames_and_the_columns_of_the_data_set(shown_run: Run) -> None:
+    table = label_frame(shown_run)
+    assert len(table) == 12 * CALLS - 1
+    assert list(table["frame"][:CALLS]) == [EVERY * call for call in range(CALLS)]
+    assert set(table["source_episode"]) == set(range(12))
+    assert {"dataset.timestamp", "dataset.next.reward", "dataset.state.x", "dataset.action.grip"} <= set(table)
+    assert not [name for name in table if str(name).startswith(("sim.", "item."))]
+    labels = Labels.read(table.assign(mine=range(len(table))), "mine", task="continuous")
+    assert np.isfinite(labels.coded.values).all()
+
+
+def test_features_and_label_of_one_frame_belong_together(shown_run: Run) -> None:
+    samples = samples_of(shown_run)
+    features = samples.features(shown_run, "mean", shown_run.sites("backbone")[1])
+    np.testing.assert_allclose(features[:, PLANTED], 5 * samples.values, rtol=1e-5)
+
+
+def test_a_column_that_the_data_set_lacks_is_named_with_those_it_has(shown_run: Run, labelled_run: Path) -> None:
+    with pytest.raises(UsageError, match=r"no column dataset\.next\.done; there are: dataset\.timestamp"):
+        Labels.of_run(shown_run, "dataset.next.done")
+    with pytest.raises(UsageError, match="none, because the run is not of recordings"):
+        Labels.of_run(open_run(labelled_run), "dataset.next.done")
+
+
+def test_fewer_than_five_recorded_episodes_are_refused(tmp_path: Path) -> None:
+    run = write_recorded_run(tmp_path / "run", 4)
+    with pytest.raises(Exception, match=r"4 groups \(group_id\) have labels; expected at least 5"):
+        train_probes(run, labels=Labels.of_run(run, "dataset.state.x"))
+
+
+def test_groups_that_split_a_recorded_episode_are_refused(shown_run: Run) -> None:
+    table = label_frame(shown_run)
+    table["mine"] = np.arange(len(table), dtype=float)
+    table["half"] = pd.Series(table["inference"] % 2).astype(str)
+    with pytest.raises(UsageError, match="expected one value"):
+        train_probes(shown_run, labels=Labels.read(table, "mine", task="continuous", group_by="half"))
