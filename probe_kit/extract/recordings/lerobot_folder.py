@@ -83,7 +83,7 @@ class LeRobotFolder:
         return int(shape[0])
 
     def names(self, feature: str) -> list[str]:
-        """What the numbers of a feature are called; their positions where the data set says nothing."""
+        """What the numbers of a feature are called; their positions where the data set names none."""
         named = self.features[feature].get("names")
         if isinstance(named, Mapping):
             named = next(iter(named.values()), None)
