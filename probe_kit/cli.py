@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from probe_kit.extract import Run
 
 ORDER = (
-    "demo", "doctor", "models", "suite", "dataset", "extract", "ask", "run", "labels", "train", "power",
+    "demo", "doctor", "models", "suite", "extract", "ask", "dataset", "run", "labels", "train", "power",
     "intervene", "retention", "stages", "view", "study", "export", "new-adapter", "check-adapter", "verify",
 )  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""

@@ -162,7 +162,8 @@ def test_no_command_function_is_longer_than_100_lines(command: str) -> None:
 def test_every_option_of_extract_and_ask_is_a_setting_or_says_how_the_run_starts() -> None:
     for command, settings in (("extract", ExtractSettings), ("ask", AskSettings)):
         names = {parameter.name for parameter in LEAVES[command].params} - {"help"}
-        known = {*settings.__dataclass_fields__, *SCENE_OPTIONS, "out_folder", "dry_run", "force"}
+        parsed = inspect.signature(settings.from_options).parameters  # of recordings, such as --episodes
+        known = {*settings.__dataclass_fields__, *parsed, *SCENE_OPTIONS, "out_folder", "dry_run", "force"}
         assert names <= known
 
 

@@ -140,7 +140,8 @@ def test_a_command_is_accepted_as_it_is_typed(
 
 
 LOOKED_FOR = {
-    "extract": "accepted so far",
+    "extract": "accepted so far|kitchen is no LeRobotDataset",
+    "show": "kitchen is no LeRobotDataset",
     "ask": "accepted so far",
     "view": "Make one with",
     "labels": "Make one with",
@@ -266,6 +267,7 @@ NOT_TYPED = {
     r"--model (pi0|magma|openvla|spatialvla|xiaomi-r0|internvla-m1)( |$)": "needs released weights (8 to 18 GB)",
     r"suite convert vl-think --root BlindVLA|train runs/pi0 --untrained|retention runs/pi0 runs/pi0-random":
         "of files that this repository may not pass on, and of runs on them (docs/paper.md)",
+    r"kitchen|runs/own": "needs a LeRobotDataset; tests/extract/recordings writes some",
     r"suite convert act2answer --root": "of files that this repository may not pass on",
 }  # fmt: skip
 """Patterns of lines that are not typed, after the stand-ins, and why."""

@@ -1,0 +1,132 @@
+"""Make the table of `docs/own-data.md`: `python scripts/own_data_page.py FOLDER` (some minutes on two cores).
+
+FOLDER gets a run of `pi0-tiny` in scenes, the same frames as a LeRobotDataset that lerobot writes, a run on it,
+and a table with a binary, a class and a continuous label, which are the state of the simulation.
+"""
+
+import argparse
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+import probe_kit as pk
+from probe_kit.extract.rollout.controllers import PolicyController, Turn
+from probe_kit.hooks import Observation
+from probe_kit.hooks.contract.sites import label_of
+from probe_kit.train import LabelResults
+from probe_kit.train.labels.builtin_columns import label_frame
+
+PAGE = Path(__file__).parents[1] / "docs" / "own-data.md"
+CAMERA, FPS, ITEMS, PERMUTATIONS = "observation.images.top", 1, 20, 200
+LABELS = {"held": "sim.held", "phase": "sim.phase", "distance": "sim.distance_correct"}
+"""Columns of the table, and what they are in the simulation."""
+_BLOCK = re.compile(r"(<!-- from scripts/own_data_page.py -->\n).*?(<!-- end of it -->)", re.DOTALL)
+
+
+def main() -> None:
+    """Record, extract, label, train, and write the table into the page."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folder", type=Path)
+    folder = parser.parse_args().folder
+    scene, episodes = play(folder / "scene")
+    write_data_set(folder / "kitchen", episodes)
+    source = pk.LeRobotSource(str(folder / "kitchen"), cameras={"base": CAMERA})
+    run = pk.extract_run(pk.ExtractSettings("pi0-tiny", source=source), folder / "own")
+    table = own_table(run, scene)
+    table.to_csv(folder / "labels.csv", index=False)
+    results = [
+        pk.train_probes(
+            run, labels=pk.Labels.read(folder / "labels.csv", name, group_by="scene"), permutations=PERMUTATIONS
+        )
+        for name in LABELS
+    ]
+    filled = table_of(run, results)
+    page = _BLOCK.sub(lambda block: f"{block[1]}\n{filled}\n\n{block[2]}", PAGE.read_text(encoding="utf-8"))
+    PAGE.write_text(page, encoding="utf-8")
+
+
+def play(where: Path) -> tuple[pk.Run, list[list[Observation]]]:
+    """A run in scenes, and what the policy was shown at every inference of its episodes."""
+    shown: dict[int, list[Observation]] = {}
+    act = PolicyController.act
+
+    def watched(controller: PolicyController, turns: Any) -> Any:
+        for turn in turns:
+            assert isinstance(turn, Turn)
+            shown.setdefault(turn.seed, []).append(turn.seen)
+        return act(controller, turns)
+
+    PolicyController.act = watched  # type: ignore[method-assign]
+    try:
+        settings = pk.ExtractSettings(
+            "pi0-tiny", categories=("color",), items=ITEMS, captured_calls=15,
+            scene=pk.SceneSpec.preset("bridge", max_steps=60, picture_size=(320, 240)),
+        )  # fmt: skip
+        run = pk.extract_run(settings, where)
+    finally:
+        PolicyController.act = act  # type: ignore[method-assign]
+    return run, [shown[int(seed)] for seed in run.episodes["policy_seed"]]
+
+
+def write_data_set(folder: Path, episodes: list[list[Observation]]) -> None:
+    """The frames as a LeRobotDataset with pictures as PNG."""
+    first = episodes[0][0]
+    names = ["x", "y", "z", "roll", "pitch", "yaw", "none", "openness"]
+    features: dict[str, Any] = {
+        CAMERA: {"dtype": "image", "shape": first.image.shape, "names": ["height", "width", "channels"]},
+        "observation.state": {"dtype": "float32", "shape": (8,), "names": names},
+    }
+    data = LeRobotDataset.create("local/kitchen", FPS, features, root=folder, use_videos=False)
+    for episode in episodes:
+        for seen in episode:
+            data.add_frame({CAMERA: seen.image, "observation.state": seen.state, "task": seen.instruction})
+        data.save_episode()
+    data.finalize()
+
+
+def own_table(run: pk.Run, scene: pk.Run) -> pd.DataFrame:
+    """The table of `probe-kit labels`, with the simulation's state at the same frames and the item's group."""
+    keys = ["source_episode", "inference"]
+    there = label_frame(scene)
+    numbers = {name: number for number, name in enumerate(scene.episodes["episode_id"])}
+    there["source_episode"] = there["episode_id"].map(numbers)
+    there = there.rename(columns={column: name for name, column in LABELS.items()})
+    wanted = there[[*keys, *LABELS]].assign(scene=there["group_id"])
+    return label_frame(run).merge(wanted, on=keys, how="left")
+
+
+def table_of(run: pk.Run, results: list[LabelResults]) -> str:
+    """The best site of every stream and label, as Markdown."""
+    heads = ("label", "task", "stream", "best site", "score", "chance", "p", "exceeds every control")
+    rows = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for found in results:
+        scores = found.scores
+        excess = scores["score"] - scores["chance"]
+        for place in excess.groupby(scores["stream"], sort=False).idxmax():
+            row = scores.loc[place]
+            missed = [name for name in found.controls.names if not row[f"exceeds_{name}"]]
+            cells = [
+                f"`{found.settings.target}`",
+                found.settings.task,
+                label_of(row["stream"]),
+                f"`{row['site']}`",
+            ]
+            cells += [f"{row['score']:.2f}", f"{row['chance']:.2f}", f"{row['p_fwe']:.3f}"]
+            cells.append("yes" if not missed else "not " + ", ".join(f"`{name}`" for name in missed))
+            rows.append(f"| {' | '.join(cells)} |")
+    groups = int(results[0].scores["groups"].iloc[0])
+    assert run.inputs is not None
+    frames = int(np.isfinite(run.inputs.column("timestamp")).sum())
+    note = (
+        f"{len(run.episodes)} recorded episodes, {frames} frames, {groups} groups, {PERMUTATIONS} permutations. "
+        "The score is balanced accuracy, or R² for `distance`."
+    )
+    return "\n".join(rows) + f"\n\n{note}"
+
+
+if __name__ == "__main__":
+    main()
