@@ -6,7 +6,7 @@ Target = Literal["correct", "chosen", "shuffled"]
 Incomplete = Literal["keep", "drop"]
 Baseline = Literal["position", "instruction", "pixels", "random-features"]
 Task = Literal["binary", "classes", "continuous"]
-LabelControl = Literal["step", "state", "instruction", "pixels", "random-features"]
+LabelControl = Literal["step", "state", "action", "instruction", "pixels", "random-features"]
 
 TARGETS: dict[str, str] = {
     "correct": "side of the correct picture",
@@ -31,7 +31,8 @@ TASKS: dict[str, str] = {
 """Tasks of labels of one's own."""
 LABEL_CONTROLS: dict[str, str] = {
     "step": "the number of the captured inference alone; for labels that change within an episode",
-    "state": "the pose of the hand and the opening of the gripper; needs trajectories",
+    "state": "the pose of the hand and the opening of the gripper, or the recorded state; needs either",
+    "action": "the recorded action at the frame; needs recordings, and is not run by default",
     "instruction": "the words of the instruction",
     "pixels": "the two pictures at 32 × 32 pixels; needs the suite",
     "random-features": "random nonlinear features of pictures, words and state; needs the suite",

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from probe_kit.suite import Suite
 
 RANDOM: Name = "random-features"
+NOT_BY_DEFAULT: frozenset[Name] = frozenset({"action"})
+"""A policy's own action is no leak: whether a site exceeds it is another question."""
 PICTURED: frozenset[Name] = frozenset({"pixels", "random-features"})
 MOST_BINS = 50
 """Columns that the step has at most."""
@@ -57,6 +59,8 @@ class ControlInputs:
             if self.recorded is not None:
                 return self._recorded("state").astype(np.float32)
             return state_features(self.run, self.samples)
+        if name == "action":
+            return self._recorded("action")[:, 0].astype(np.float32)
         if name == "instruction":
             return word_counts(self.run)[self.samples.rows]
         return self._pixels(THUMBNAIL)
@@ -161,7 +165,8 @@ def prepare_controls(
     """
     if unknown := [name for name in names or () if name not in LABEL_CONTROLS]:
         raise UsageError(f"control {unknown[0]!r} of a label; expected some of {', '.join(LABEL_CONTROLS)}")
-    asked = [cast(Name, name) for name in LABEL_CONTROLS if names is None or name in names]
+    wanted = names if names is not None else [name for name in LABEL_CONTROLS if name not in NOT_BY_DEFAULT]
+    asked = [cast(Name, name) for name in LABEL_CONTROLS if name in wanted]
     impossible = _impossible(run, samples)
     if names is not None and (wrong := [name for name in asked if name in impossible]):
         raise UsageError(f"the control {wrong[0]!r} is not possible: {impossible[wrong[0]]}. Leave it out")
@@ -193,6 +198,8 @@ def _impossible(run: RunReader, samples: LabelledSamples) -> dict[str, str]:
     if (reason := why_no_state(run)) is not None:
         found["state"] = reason
     inputs = getattr(run, "inputs", None)
+    if inputs is None or "action" not in inputs.kinds:
+        found["action"] = "no actions were recorded"
     if inputs is not None and "pixels" not in inputs.kinds:
         found |= dict.fromkeys(PICTURED, "the run was extracted with --no-pixels")
     if "instruction" not in run.episodes:

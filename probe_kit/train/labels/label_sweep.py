@@ -53,6 +53,7 @@ def train_label_probes(
     """
     _check_run(run, categories, views, permutations)
     samples = labelled_samples(run, labels, categories, call, window)
+    labels, _ = labels.on(run)  # how many it does not show is counted among the samples
     settings = _settings(run, labels, samples, categories, views, permutations, call, seed)
     names, inputs, left_out = prepare_controls(run, samples, controls, suite)
     stored = load_label_results(run, settings.key) if is_stored(run.location, settings.key) else None

@@ -23,6 +23,8 @@ Kind = Literal["text", "boolean", "integer", "number"]
 
 EPISODE, INFERENCE = "episode_id", "inference"
 """Key columns of a table: one label per episode, or with both one per captured inference."""
+SOURCE, FRAME = "source_episode", "frame"
+"""The same of recordings, by the numbers of the data set; read where a table has no `episode_id`."""
 MOST_BYTES = 1 << 30
 EXACT = 2**53
 """Integers beyond it have no exact float64."""
@@ -164,13 +166,14 @@ def _records(file: Any, path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _places(names: Sequence[str], wanted: Sequence[str], source: str) -> dict[str, int]:
     """Position of every column to read. Raises UsageError without the key, and for a name used twice."""
-    if EPISODE not in names:
+    if EPISODE not in names and SOURCE not in names:
         shown = ", ".join(terminal_safe(name) for name in names[:12]) or "no column"
         raise UsageError(
             f"{source}, line 1 lacks the key column {EPISODE!r}; it has {shown}. `probe-kit labels RUN` "
             "writes a table with the keys of a run"
         )
-    read = [name for name in dict.fromkeys((EPISODE, INFERENCE, *wanted)) if name in names]
+    keys = (EPISODE, INFERENCE) if EPISODE in names else (SOURCE, FRAME)
+    read = [name for name in dict.fromkeys((*keys, *wanted)) if name in names]
     if twice := [name for name in read if names.count(name) > 1]:
         raise UsageError(f"{source}, line 1 has the column {terminal_safe(twice[0])!r} twice. Rename one of them")
     return {name: names.index(name) for name in read}

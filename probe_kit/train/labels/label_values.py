@@ -27,6 +27,15 @@ class LabelValues:
     classes: tuple[str, ...]
     values: NDArray[np.float64]
 
+    def of(self, at: Sequence[int]) -> "LabelValues":
+        """The values at some places, with the classes that occur there."""
+        values = self.values[list(at)]
+        if not self.classes:
+            return LabelValues(self.task, (), values)
+        there = np.unique(values[np.isfinite(values)])
+        place = np.where(np.isfinite(values), np.searchsorted(there, values), np.nan)
+        return LabelValues(self.task, tuple(self.classes[int(code)] for code in there), place)
+
 
 def code_labels(cells: Sequence[Cell], task: Task | None, target: str) -> LabelValues:
     """Code the cells of one kind of the column `target` for `task`, or for the only task that fits.

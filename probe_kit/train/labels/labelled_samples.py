@@ -68,6 +68,7 @@ def labelled_samples(
     the most that 90 % of the episodes reach. Episodes that end before are left out.
     Raises UsageError for keys that the run does not have, and for groups that split an episode or items.
     """
+    labels, unseen = labels.on(run)
     if labels.per_step and call:
         raise UsageError(
             f"call={call} with labels that have an inference each; expected labels of whole episodes. Use "
@@ -93,6 +94,7 @@ def labelled_samples(
         f"episodes that end before inference {calls[-1]}": int((chosen & ~whole).sum()),
         "episodes without a label": int((whole & ~labelled.any(axis=1)).sum()),
         "inferences without a label": int((~labelled)[labelled.any(axis=1)].sum()),
+        "labels of frames or episodes that the run does not show": unseen,
     }
     return LabelledSamples(
         rows,

@@ -1,7 +1,7 @@
 """`Labels`: one column of labels by episode or by captured inference."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +14,7 @@ from probe_kit.hashing import sha256_json
 from probe_kit.train.choices import Task
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.labels.builtin_columns import builtin_column
-from probe_kit.train.labels.label_table import EPISODE, INFERENCE, Cell, LabelTable, read_table
+from probe_kit.train.labels.label_table import EPISODE, FRAME, INFERENCE, SOURCE, Cell, LabelTable, read_table
 from probe_kit.train.labels.label_values import LabelValues, code_labels
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ class Labels:
     where a label is of a whole episode. group_by: column whose values folds, intervals and nulls keep together;
     None for the groups of the run. exchange_within: column within which label permutations exchange groups; None
     for everywhere. groups, strata: (n,) those columns, None where the run has them. table: where errors point to.
+    of_source: whether episodes and inferences are numbers of episodes and frames of a data set; see `on`.
     """
 
     target: str
@@ -42,6 +43,7 @@ class Labels:
     exchange_within: str | None = None
     groups: tuple[str, ...] | None = None
     strata: tuple[str, ...] | None = None
+    of_source: bool = False
 
     @classmethod
     def read(
@@ -55,19 +57,22 @@ class Labels:
         """The column `target` of a table: a CSV or Parquet file, or a DataFrame.
 
         Key columns are `episode_id` and, for labels that change within an episode, `inference`, counted from 0.
-        Empty cells are left out. task: binary, classes or continuous; None where the values leave no doubt.
+        Of recordings they may be `source_episode` and `frame`, by the numbers of the data set. Empty cells are
+        left out. task: binary, classes or continuous; None where the values leave no doubt.
         group_by, exchange_within: columns of the table or of the run's episodes.
         Raises UsageError, naming file and line, for a missing or mixed column, a key used twice, an integer beyond
         2^53, an infinite number, a control character, or a task that the values cannot have.
         """
         further = [name for name in (group_by, exchange_within) if name is not None]
         found = read_table(table, [target, *further])
-        if target not in found.columns or target in (EPISODE, INFERENCE):
-            known = ", ".join(terminal_safe(name) for name in found.names if name not in (EPISODE, INFERENCE))
+        of_source = EPISODE not in found.columns
+        episode_key, step_key = (SOURCE, FRAME) if of_source else (EPISODE, INFERENCE)
+        if target not in found.columns or target in (episode_key, step_key):
+            known = ", ".join(terminal_safe(name) for name in found.names if name not in (episode_key, step_key))
             raise UsageError(f"{found.source} has no column {target!r} to decode; it has: {known[:500] or 'none'}")
         if not found.lines:
             raise UsageError(f"{found.source} has no {found.unit} below its heading; expected one per label")
-        episodes, inferences = tuple(found.texts(EPISODE)), _inferences(found)
+        episodes, inferences = tuple(found.texts(episode_key)), _inferences(found, step_key)
         _check_keys(found, episodes, inferences)
         return cls(
             target,
@@ -79,7 +84,39 @@ class Labels:
             exchange_within,
             _names(found, group_by),
             _names(found, exchange_within),
+            of_source,
         )
+
+    def on(self, run: RunReader) -> "tuple[Labels, int]":
+        """These labels with the keys of a run, and how many frames or episodes the run does not show.
+
+        Labels that have its keys already are returned as they are. Raises UsageError for a run of scenes, and if
+        the run shows none of the frames.
+        """
+        if not self.of_source:
+            return self, 0
+        if not getattr(run, "recorded", False):
+            raise UsageError(
+                f"{self.table.source} has the key {SOURCE!r} of recordings, and {run.location} is of scenes; "
+                f"expected {EPISODE!r}. `probe-kit labels RUN` writes the ids"
+            )
+        shown = _shown(run, self.inferences is not None)
+        frames: Sequence[int] = self.inferences or (-1,) * len(self.episodes)
+        keys = [shown.get((episode, frame), ()) for episode, frame in zip(self.episodes, frames, strict=True)]
+        at = [number for number, found in enumerate(keys) for _ in found]
+        if not at:
+            raise UsageError(f"{self.table.source} has no label of a frame that {run.location} shows")
+        flat = [key for found in keys for key in found]
+        return replace(
+            self,
+            coded=self.coded.of(at),
+            episodes=tuple(episode for episode, _ in flat),
+            inferences=None if self.inferences is None else tuple(call for _, call in flat),
+            table=replace(self.table, lines=[self.table.lines[number] for number in at]),
+            groups=None if self.groups is None else tuple(self.groups[number] for number in at),
+            strata=None if self.strata is None else tuple(self.strata[number] for number in at),
+            of_source=False,
+        ), sum(not found for found in keys)
 
     @classmethod
     def of_run(
@@ -131,14 +168,26 @@ class Labels:
         return f"<Labels {self.target}: {self.task}, {present} {of}, from {self.table.source}>"
 
 
-def _inferences(table: LabelTable) -> tuple[int, ...] | None:
-    if INFERENCE not in table.columns:
+def _shown(run: RunReader, by_frame: bool) -> dict[tuple[str, int], list[tuple[str, int]]]:
+    """Episode ids and inferences of a run by source episode and frame; of whole episodes the frame is -1."""
+    found: dict[tuple[str, int], list[tuple[str, int]]] = {}
+    steps = run.control_steps  # type: ignore[attr-defined]
+    for row, (name, source) in enumerate(zip(run.episodes[EPISODE], run.episodes[SOURCE], strict=True)):
+        for call, frame in enumerate(steps[row].tolist() if by_frame else [-1]):
+            if frame >= 0 or not by_frame:
+                found.setdefault((str(source), frame), []).append((str(name), call))
+    return found
+
+
+def _inferences(table: LabelTable, column: str) -> tuple[int, ...] | None:
+    if column not in table.columns:
         return None
-    cells = table.columns[INFERENCE]
+    cells = table.columns[column]
     for row, cell in enumerate(cells):
         if isinstance(cell, bool | str | None) or not float(cell).is_integer() or cell < 0:
             raise UsageError(
-                f"{table.where(row, INFERENCE)} is {cell!r}; expected the number of a captured inference, from 0"
+                f"{table.where(row, column)} is {cell!r}; expected the number of "
+                f"{'a captured inference' if column == INFERENCE else 'a frame'}, from 0"
             )
     return tuple(int(cell) for cell in cells if cell is not None)
 

@@ -18,8 +18,7 @@ from tests.support.recorded_run import CALLS, EVERY, PLANTED, write_recorded_run
 @pytest.fixture(scope="module")
 def results(shown_run: Run) -> LabelResults:
     labels = Labels.of_run(shown_run, "dataset.state.x")
-    controls = ("step", "state", "instruction", "pixels", "random-features")
-    return train_probes(shown_run, labels=labels, permutations=99, controls=controls)
+    return train_probes(shown_run, labels=labels, permutations=39, controls=("state", "instruction"))
 
 
 def samples_of(run: Run, target: str = "dataset.state.x") -> LabelledSamples:
@@ -62,6 +61,9 @@ def test_the_controls_are_made_of_what_was_shown(shown_run: Run) -> None:
     np.testing.assert_allclose(
         inputs.features("pixels")[0], shown_run.inputs.read("pixels")[0, 0].ravel() / 255, rtol=1e-6
     )
+    actions = shown_run.inputs.read("action")[samples.rows, samples.inferences]
+    np.testing.assert_array_equal(inputs.features("action"), actions[:, 0])
+    assert prepare_controls(shown_run, samples, ("action",), None)[0] == ("action",), "offered, not run by default"
     step = inputs.features("step")
     np.testing.assert_array_equal(step.argmax(axis=1), samples.inferences)
     assert inputs.layer(6, 0).shape == (samples.rows.size, 6)
@@ -128,3 +130,43 @@ def test_groups_that_split_a_recorded_episode_are_refused(shown_run: Run) -> Non
     table["half"] = pd.Series(table["inference"] % 2).astype(str)
     with pytest.raises(UsageError, match="expected one value"):
         train_probes(shown_run, labels=Labels.read(table, "mine", task="continuous", group_by="half"))
+
+
+def source_table() -> pd.DataFrame:
+    """A table as a user has it of the data set: every frame of 14 episodes, of which the run shows 12."""
+    frames = [(episode, frame) for episode in range(14) for frame in range(20)]
+    table = pd.DataFrame(frames, columns=["source_episode", "frame"])
+    return table.assign(mine=np.random.default_rng(0).normal(size=len(table)), even=table["frame"] % 2 == 0)
+
+
+def test_labels_have_the_numbers_of_the_data_set_as_keys(shown_run: Run) -> None:
+    """Of 280 labelled frames the run shows 47; the others are left out and counted."""
+    table = source_table()
+    samples = labelled_samples(shown_run, Labels.read(table, "mine"), None, 0, None)
+    assert samples.left_out["labels of frames or episodes that the run does not show"] == 280 - 47
+    expected = {(row.source_episode, row.frame): row.mine for row in table.itertuples()}
+    steps = shown_run.control_steps[samples.rows, samples.inferences]
+    assert [expected[key] for key in zip(samples.rows, steps, strict=True)] == samples.values.tolist()
+
+
+def test_labels_of_whole_source_episodes_are_those_of_their_rows(shown_run: Run) -> None:
+    table = pd.DataFrame(
+        {"source_episode": range(14), "kind": [f"k{number % 3}" for number in range(12)] + ["x", "x"]}
+    )
+    labels = Labels.read(table, "kind")
+    assert labels.coded.classes == ("k0", "k1", "k2", "x")
+    samples = labelled_samples(shown_run, labels, None, 0, None)
+    np.testing.assert_array_equal(samples.values, np.arange(12) % 3)
+    assert labels.on(shown_run)[0].coded.classes == ("k0", "k1", "k2"), "no episode of the run is an x"
+
+
+def test_keys_of_recordings_are_refused_on_scenes_and_where_nothing_is_shown(
+    shown_run: Run, labelled_run: Path
+) -> None:
+    table = source_table()
+    with pytest.raises(UsageError, match=r"is of scenes; expected 'episode_id'"):
+        labelled_samples(open_run(labelled_run), Labels.read(table, "mine"), None, 0, None)
+    with pytest.raises(UsageError, match="no label of a frame that"):
+        labelled_samples(shown_run, Labels.read(table[table["frame"] == 3], "mine"), None, 0, None)
+    with pytest.raises(UsageError, match=r"column 'frame' is 0\.5; expected the number of a frame, from 0"):
+        Labels.read(table.assign(frame=0.5), "mine")
