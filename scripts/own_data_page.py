@@ -22,8 +22,10 @@ from probe_kit.train.labels.builtin_columns import label_frame
 
 PAGE = Path(__file__).parents[1] / "docs" / "own-data.md"
 CAMERA, FPS, ITEMS, PERMUTATIONS = "observation.images.top", 1, 20, 200
-LABELS = {"held": "sim.held", "phase": "sim.phase", "distance": "sim.distance_correct"}
-"""Columns of the table, and what they are in the simulation."""
+LABELS = ("left", "where", "distance")
+"""Columns of the table: whether the correct picture lies left, where the cube is, and how far from it."""
+BETWEEN = (-0.06, 0.03)
+"""World y in metres between which the cube is over neither picture."""
 _BLOCK = re.compile(r"(<!-- from scripts/own_data_page.py -->\n).*?(<!-- end of it -->)", re.DOTALL)
 
 
@@ -62,10 +64,9 @@ def play(where: Path) -> tuple[pk.Run, list[list[Observation]]]:
 
     PolicyController.act = watched  # type: ignore[method-assign]
     try:
-        settings = pk.ExtractSettings(
-            "pi0-tiny", categories=("color",), items=ITEMS, captured_calls=15,
-            scene=pk.SceneSpec.preset("bridge", max_steps=60, picture_size=(320, 240)),
-        )  # fmt: skip
+        settings = pk.ExtractSettings.from_options(
+            model="pi0-tiny", categories=("color",), items=ITEMS, captured_calls="all", picture_size=(320, 240)
+        )
         run = pk.extract_run(settings, where)
     finally:
         PolicyController.act = act  # type: ignore[method-assign]
@@ -94,8 +95,12 @@ def own_table(run: pk.Run, scene: pk.Run) -> pd.DataFrame:
     there = label_frame(scene)
     numbers = {name: number for number, name in enumerate(scene.episodes["episode_id"])}
     there["source_episode"] = there["episode_id"].map(numbers)
-    there = there.rename(columns={column: name for name, column in LABELS.items()})
-    wanted = there[[*keys, *LABELS]].assign(scene=there["group_id"])
+    there["left"] = there["item.left"] == there["item.named"]
+    cube = there["sim.cube_y"]
+    there["where"] = np.select([cube > BETWEEN[1], cube < BETWEEN[0]], ["left", "right"], "middle")
+    wanted = there[[*keys, "left", "where"]].assign(
+        distance=there["sim.distance_correct"], scene=there["group_id"]
+    )
     return label_frame(run).merge(wanted, on=keys, how="left")
 
 
