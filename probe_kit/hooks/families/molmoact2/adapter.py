@@ -67,6 +67,10 @@ class ClampedUnits:
         """(D,) of `restore`, where it does not clip."""
         return np.where(self.mask, self.units.slope(numbers), 1).astype(np.float32)
 
+    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(..., D): as without the clamp; numbers that stay as they are have no statistics."""
+        return np.asarray(self.units.unusual(values) & self.mask)
+
 
 class ExpertStack(Stack):
     """The expert: what a block adds is read behind its gates, and its end in front of the last modulation."""
@@ -201,8 +205,8 @@ class MolmoAct2(LerobotPolicy):
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """From the packing itself."""
-        zeros = np.zeros((len(seen), self._state_numbers), np.float32)
-        rows = self._rows(seen, zeros if self.zero_filled_inputs() else self.state(seen))
+        state = self.read_state(seen)
+        rows = self._rows(seen, np.zeros((len(seen), self._state_numbers), np.float32) if state is None else state)
         suffix = Roles.from_labels(self.suffix_labels())
         return {
             "backbone": [Roles.from_labels(labels) for labels in padded_labels(rows)],

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError
+from probe_kit.hooks.families.shared.lerobot.normaliser import outside
 
 SHIPPED = ("bridge",)
 """Statistics that come with the package, by name."""
@@ -49,6 +50,10 @@ class Bounds:
         found = np.asarray((self.high - self.low) / 2, np.float32) * np.ones(numbers, np.float32)
         found[-1] = 0
         return found
+
+    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(..., D): outside the bounds, where `normalise` clips."""
+        return outside(values, self.low, self.high)
 
 
 @dataclass(frozen=True)

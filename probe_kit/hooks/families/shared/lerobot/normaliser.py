@@ -17,6 +17,10 @@ from probe_kit.models.bounds import check_bounds, check_deviations
 from probe_kit.models.lerobot.pi0_keys import STATISTICS
 
 _EPS = 1e-8
+USUAL_DEVIATIONS = 5.0
+"""From the mean; values further away are unusual."""
+_ROUNDING = 1e-3
+"""Share of the range by which a value may lie outside of its bounds."""
 _STEPS = (
     "normalizer_processor",
     "unnormalizer_processor",
@@ -46,6 +50,9 @@ class Units(Protocol):
 
     def slope(self, numbers: int) -> NDArray[np.float32]:
         """(D,) by how much `restore` changes per unit of the network's output; 0 for a number that jumps."""
+
+    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(..., D) which physical values lie far from those of the statistics, also where `normalise` clips."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +99,20 @@ class Normaliser:
         ends = (np.full((1, numbers), value, np.float32) for value in (0, 1))
         low, high = (self.restore(values)[0] for values in ends)
         return np.asarray(high - low, np.float32)
+
+    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(..., D): more than five deviations from the mean, or outside the bounds."""
+        if self.mode == "IDENTITY":
+            return np.zeros(values.shape, bool)
+        if self.mode == "MEAN_STD":
+            return np.asarray(np.abs(values - self.low) > USUAL_DEVIATIONS * (self.high + self.eps))
+        return outside(values, self.low, self.high)
+
+
+def outside(values: NDArray[np.float32], low: NDArray[np.float32], high: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(..., D) which values lie outside their bounds (D,), but for rounding."""
+    slack = _ROUNDING * (high - low) + _EPS
+    return np.asarray((values < low - slack) | (values > high + slack))
 
 
 def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Normaliser:

@@ -39,9 +39,6 @@ from probe_kit.models.initialisation import initialise
 
 IMAGES, STATE = "observation.images.", "observation.state"
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
-USUAL_DEVIATIONS = 5.0
-"""From the mean of the statistics; a recorded state further away is unusual."""
-_ROUNDING = 1e-3
 _DIMENSIONS = 7
 """Of the arm's actions."""
 
@@ -270,10 +267,7 @@ class LerobotPolicy(Policy):
 
     def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
-        units, read = self.state_units, np.abs(self.state_units.normalise(states))
-        if units.mode == "IDENTITY":
-            return np.zeros(states.shape, bool)
-        return np.asarray(read > (USUAL_DEVIATIONS if units.mode == "MEAN_STD" else 1 + _ROUNDING))
+        return self.state_units.unusual(states)
 
     def embodiment_mismatch(self) -> str | None:
         """Other actions than an end-effector delta, another state, or no units for either."""
@@ -440,10 +434,17 @@ class LerobotPolicy(Policy):
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Prefix and suffix as the family packs them."""
+        return self.packed_roles(*self.tokenise([o.instruction for o in seen], self.read_state(seen)))
+
+    def read_state(self, seen: Sequence[Observation]) -> NDArray[np.float32] | None:
+        """(B, numbers) as the network reads them; None where it is given zeros in place of the arm's state.
+
+        A recorded state of the checkpoint's own width is read, whatever the arm has.
+        """
         recorded = {np.shape(one.state) for one in seen} == {(self._state_numbers,)}
-        unread = self.zero_filled_inputs() and not (recorded and _problem(lambda: self.state_units) is None)
-        state = None if unread else self.state(seen)
-        return self.packed_roles(*self.tokenise([o.instruction for o in seen], state))
+        if self.zero_filled_inputs() and not (recorded and _problem(lambda: self.state_units) is None):
+            return None
+        return self.state(seen)
 
     def packed_roles(self, tokens: Tensor, mask: Tensor) -> dict[str, list[Roles]]:
         """The roles for instructions as (B, tokenizer_max_length) ids and mask."""
