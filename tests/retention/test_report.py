@@ -7,17 +7,20 @@ import sys
 from base64 import b64decode
 from collections.abc import Callable
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
 import pytest
+from rich.console import Console
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
 from probe_kit.intervene.kinds.image_swap.verdict import Behaviour
+from probe_kit.intervene.store.settings import FORMAT
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.columns import all_columns
 from probe_kit.retention.columns.glossary import TERMS
@@ -33,6 +36,7 @@ from probe_kit.retention.report.summaries import _clear_words, read_run
 from probe_kit.train import ArrayRun, load_results
 from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.store import save_results
+from tests.intervene.answers import follower, outcomes_of, store_outcomes
 
 ProbedRun = Callable[..., ArrayRun]
 SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7], [0.5, 0.65]])
@@ -318,3 +322,37 @@ def test_the_page_holds_pictures_in_blocks_that_cards_point_to(tmp_path: Path, o
 def test_runs_without_frames_say_so(tmp_path: Path, outcome_table: Any) -> None:
     grid = episode_grid([plain_run(tmp_path, outcome_table(6, 4, 2))], ["run"])
     assert "keep no frames" in grid.note
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moves_first", [True, False])
+def test_page_terminal_markdown_and_json_say_the_same_sentence_of_both_readouts(
+    probed_run: ProbedRun, moves_first: bool
+) -> None:
+    """The answer decides over the whole episode, and in the first chunk or not."""
+    run = probed_run({"color": SIGNAL, "shape": SIGNAL})
+    still = np.full(48, 0.1), np.full(48, 0.1)
+    for readout, color in (("first-chunk", follower(48) if moves_first else still), ("per-step", follower(48))):
+        settings = {
+            "format": FORMAT, "kind": "image-swap", "run_settings": run.settings_sha256, "stamp": "",
+            "wording": None, "categories": ["color", "shape"], "readout": readout,
+        }  # fmt: skip
+        outcomes = outcomes_of({"color": color, "shape": follower(48)})
+        store_outcomes(run.location, run.suite, settings, outcomes)
+    table = retention_table([run])
+    (stored,) = (row for row in json.loads(table.to_json()) if row["category"] == "color")
+    sentence, verdict = stored["conclusion"], stored["verdict"]
+    if moves_first:
+        assert verdict == "used"
+        assert "is used in the first chunk and over the whole episode" in sentence
+    else:
+        assert verdict == "first chunk not used; episode used"
+        assert "is not used in the first chunk: " in sentence
+        assert "; it is used over the whole episode" in sentence
+    with (console := Console(width=400)).capture() as printed:
+        console.print(table.to_rich())
+    page = unescape(re.sub(r"<[^>]+>", " ", report_html([run])))
+    for shown in (printed.get(), table.to_markdown(), page):
+        text = " ".join(shown.replace("\u00a0", " ").split())
+        assert sentence in text
+        assert verdict in text
