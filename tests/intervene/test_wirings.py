@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from sklearn.linear_model import LogisticRegression
 
+from probe_kit import patching as pt
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site, capture
 from probe_kit.intervene import ConditionOutcomes, ImageSwapEffect, UseVerdict, classify_all
@@ -48,6 +49,9 @@ VERDICTS = {
     "trace": "not used",
     "late": "not used",
     "against": "against: used",
+    "once": "used",  # these three were written after the rules
+    "opposite": "used",
+    "half": "used",  # decides in half of the items, which is where *used* begins
 }
 Verdicts = Mapping[str, UseVerdict]
 
@@ -128,6 +132,7 @@ def patched(session: WiredSession, name: str, *patterns: str, role: str = "all")
         ("copied", ("backbone.01", "kv.01")),
         ("marks", ("kv.00",)),
         ("bypass", ()),  # was *passes at expert.01*
+        ("against", ("backbone.01", "kv.01")),  # was nowhere: p was of the direction that it does not take
         ("blocks", ("backbone.01",)),  # two of the three blocks that vote come behind it
     ],
 )
@@ -187,6 +192,18 @@ def test_what_bypasses_the_backbone_is_past_all_cells(wired: WiredSession) -> No
     assert describe_joint_places(list(rows.values())) == "past kv"
 
 
+@pytest.mark.slow
+def test_what_acts_against_the_answer_reads_it_where_all_others_do(wired: WiredSession) -> None:
+    """Joint places, screens and sweeps test the direction that the swap itself takes."""
+    rows = joint(wired, "against")
+    assert (rows["kv.01 language"].finding, rows["minimal"].finding) == ("read here", "read here")
+    pairs, cells = pt.find_pairs(wired, "against"), pt.find_cells(wired.policy, "kv.*|language")
+    swept = pt.sweep_cells(wired.policy, pairs, cells, wired.lateral_displacement)
+    assert swept.table["share"].round(2).tolist() == [0, 1, 0]
+    assert (swept.table["p_fwe"] < 0.01).tolist() == [False, True, False]
+    assert pt.attribute_cells(wired.policy, pairs, cells, wired.lateral_motion).finding == "anchored"
+
+
 def test_an_exchange_finds_the_place_that_a_backup_hides_from_erasing(wired: WiredSession) -> None:
     rows = joint(wired, "backup")
     assert rows["kv.01 language"].finding == "read here"
@@ -235,10 +252,12 @@ def tie_of(session: WiredSession, name: str, layer: int) -> str:
     """At the words of one layer of the backbone."""
     (place,) = resolve_sites(f"backbone.{layer:02d}", session.policy)
     direction = OneDirection(probed_direction(session, name, place.only_site))
-    conditions: list[Condition] = [PatchedFromSource(place, "language", place.sites)]
+    roles = ("language", "all", "image", "state")
+    conditions: list[Condition] = [PatchedFromSource(place, role, place.sites) for role in roles]
     conditions += patches_within("probe", direction, place, "language", place.sites)
-    whole, *along = patch_effects(outcomes_of(session, [name], conditions), SUITE)
-    return tie_at_site(whole, [row for row in along if not row.is_control])
+    rows = patch_effects(outcomes_of(session, [name], conditions), SUITE)
+    layer, along = rows[: len(roles)], rows[len(roles) :]
+    return tie_at_site(layer[0], [row for row in along if not row.is_control], layer)
 
 
 @pytest.mark.slow
@@ -250,6 +269,8 @@ def tie_of(session: WiredSession, name: str, layer: int) -> str:
         ("elsewhere", {1: "unread", 2: "unread"}),
         ("code", {1: "another code", 2: "unread"}),
         ("decoy", {1: "read"}),  # two copies that always agree are one direction to any patch
+        ("roles", {1: "in part", 2: "unread"}),  # was *unread*: the words are one of three parts that decide
+        ("opposite", {1: "read", 2: "read", 3: "unread"}),
     ],
 )
 def test_the_copy_that_probes_read_is_told_from_the_one_that_is_used(
@@ -266,6 +287,9 @@ def test_the_tie_of_all_sites_is_said_in_one_sentence() -> None:
     assert "another code in the same place (backbone.01 all)" in describe_tie(
         {read: "another code", unread: "unread"}
     )
-    for open_ in ("in part", "not tested"):
-        assert describe_tie({read: open_, unread: "unread"}) == ""  # type: ignore[dict-item]
+    open_ = "whether the readable copy is the one used remains open"
+    assert describe_tie({read: "in part", unread: "unread"}) == open_
+    assert describe_tie({unread: "unread"}, is_joint=True) == open_, "it can be one of several parts"
+    assert describe_tie({read: "read", unread: "unread"}, is_joint=True).startswith("the readable copy is read")
+    assert describe_tie({read: "not tested", unread: "unread"}) == ""
     assert describe_tie({}) == ""

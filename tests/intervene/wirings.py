@@ -1,8 +1,9 @@
 """Policies whose wiring is written down: what the action reads, where, and which copies nothing reads.
 
 One network of 24 channels: 8 image tokens, 4 words, 1 state token; 3 blocks whose values are the `kv` that an
-acting stream of one block and two iterations reads. A category of episodes selects a wiring. Hooks reach all of it
-but an action that bypasses the backbone. Pictures of 8 × 8 pixels show the correct side and a second property.
+acting stream of one block and two or more iterations reads. A category of episodes selects a wiring. Hooks reach
+all of it but an action that bypasses the backbone. Pictures of 8 × 8 pixels show the correct side and a second
+property.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -64,13 +65,16 @@ class Inference:
 class Wiring:
     """read: the action, 1 for the left tile. copies: channels of the words into which block 0 copies the marks,
     and factors. has_product: whether block 0 codes the answer as a product of two channels. is_everywhere: whether
-    all tokens begin with it. items: with this wiring.
+    all tokens begin with it. decoy: with what factor the image tokens begin with it, in the channel of the copy.
+    only_at: the one iteration that reads, or the last one; what it read stays. items: with this wiring.
     """
 
     read: Callable[[Inference], Tensor]
     copies: Mapping[int, float] = field(default_factory=dict)
     has_product: bool = False
     is_everywhere: bool = False
+    decoy: float = 0.0
+    only_at: int | None = None
     items: int = 12
 
 
@@ -102,6 +106,11 @@ def _with_repair(seen: Inference) -> Tensor:
     return seen.marks if (norm - ORDINARY).abs() > 0.5 else seen.words()
 
 
+def _where_the_other_lies_left(seen: Inference) -> Tensor:
+    """Block 1 if the picture with the second property lies left, else always left."""
+    return seen.words() if seen.values[0][IMAGE, OTHER].mean() > 0 else torch.ones(())
+
+
 ONE_COPY = {ANSWER: 1.0}
 WIRINGS: Mapping[str, Wiring] = {
     "copied": Wiring(lambda seen: seen.words(), ONE_COPY),
@@ -127,6 +136,9 @@ WIRINGS: Mapping[str, Wiring] = {
     "trace": Wiring(lambda seen: -0.6 + 0.033 * seen.words(), ONE_COPY),
     "late": Wiring(lambda seen: torch.zeros(()) if seen.is_first else seen.words(), ONE_COPY),
     "against": Wiring(lambda seen: -seen.words(), ONE_COPY),
+    "once": Wiring(lambda seen: seen.words(), ONE_COPY, only_at=7),
+    "opposite": Wiring(lambda seen: seen.words(block=2), ONE_COPY, decoy=-1.0),
+    "half": Wiring(_where_the_other_lies_left, ONE_COPY, items=24),
 }
 
 
@@ -139,8 +151,9 @@ class _Block(nn.Module):
 
 
 class _Network(nn.Module):
-    def __init__(self) -> None:
+    def __init__(self, iterations: int) -> None:
         super().__init__()
+        self.iterations = iterations
         self.blocks = nn.ModuleList(_Block() for _ in range(BLOCKS))
         self.norm, self.prompt_kv = nn.Identity(), PromptKV(BLOCKS)
         self.acting, self.acting_norm = _Block(), nn.Identity()
@@ -162,12 +175,16 @@ class _Network(nn.Module):
 
     def act(self, seen: Inference, wiring: Wiring) -> Tensor:
         """The action after the last iteration, 1 for the left tile."""
-        for _ in range(2):
+        last = self.iterations - 1
+        only_at = None if wiring.only_at is None else min(wiring.only_at, last)
+        tokens = torch.zeros(1, 2, WIDTH)
+        for iteration in range(self.iterations):
+            kept = tokens[0, 1, 0]
             tokens = torch.zeros(1, 2, WIDTH)
             tokens[0, 1, NOISE : NOISE + 7] = seen.noise[:7]
             tokens = self.acting.norm(tokens)
             change = torch.zeros_like(tokens)
-            change[0, 1, 0] = wiring.read(seen)
+            change[0, 1, 0] = wiring.read(seen) if only_at in (None, iteration) else kept
             tokens = tokens + self.acting.attention(change)
             tokens = self.acting_norm(tokens + self.acting.mlp(torch.zeros_like(tokens)))
         return tokens[0, 1, 0]
@@ -190,15 +207,15 @@ class WiredPolicy(Policy):
         "backbone": ("image.primary", "language", "state"), "expert": ("state", "action"),
     }  # fmt: skip
 
-    def __init__(self) -> None:
-        self.network = _Network().eval()
+    def __init__(self, iterations: int = 2) -> None:
+        self.network = _Network(iterations).eval()
         self.card = ModelCard(
             family="wired", checkpoint="built", weights_sha256="0" * 64, random_weights=False, parameters=0,
             dtype="float32", device="cpu", embodiment="7-DoF end-effector delta", cameras=("primary",),
             chunk=CHUNK, execute=CHUNK,
         )  # fmt: skip
         self.streams = {
-            "backbone": Stream("backbone", BLOCKS + 1, WIDTH), "expert": Stream("expert", 2, WIDTH, 2),
+            "backbone": Stream("backbone", BLOCKS + 1, WIDTH), "expert": Stream("expert", 2, WIDTH, iterations),
         }  # fmt: skip
         self.prompt_kv = kv_stream(BLOCKS, WIDTH)
 
@@ -231,7 +248,7 @@ class WiredPolicy(Policy):
         if stream is self.prompt_kv:
             return kv_tap(network.prompt_kv, site)
         of_backbone = stream.name == "backbone"
-        fires = 1 if of_backbone else 2
+        fires = 1 if of_backbone else network.iterations
         blocks, norm = (network.blocks, network.norm) if of_backbone else ([network.acting], network.acting_norm)
         if site.quantity == "final_norm" or site.layer == len(blocks):
             return Tap(norm, fires, "output" if site.quantity == "final_norm" else "input")
@@ -263,6 +280,7 @@ def _embedded(name: str, item: str, answer: float, other: float) -> Tensor:
     tokens[0, IMAGE, OTHER] = other
     if WIRINGS[name].has_product:
         tokens[0, WORDS, FACTOR] = draw.choice([-1.0, 1.0])
+    tokens[0, IMAGE, ANSWER] += WIRINGS[name].decoy * answer
     if WIRINGS[name].is_everywhere:
         tokens[0, :, EACH] = answer
     return torch.from_numpy(tokens)
@@ -274,8 +292,8 @@ def _embedded(name: str, item: str, answer: float, other: float) -> Tensor:
 class WiredSession(ReplaySession):
     """A replay session without a simulator: the tiles lie left and right of zero."""
 
-    def __init__(self) -> None:
-        self.policy, self.on_fit_progress = WiredPolicy(), None
+    def __init__(self, iterations: int = 2) -> None:
+        self.policy, self.on_fit_progress = WiredPolicy(iterations), None
         inputs = [one for name in WIRINGS for one in replay_inputs(name)]
         columns = {"category": [one.category for one in inputs], "item_id": [one.item_id for one in inputs]}
         self.run = SimpleNamespace(model="wired", episodes=pd.DataFrame(columns))  # type: ignore[assignment]

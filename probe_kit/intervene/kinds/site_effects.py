@@ -21,7 +21,7 @@ from probe_kit.intervene.kinds.base import (
     common_columns,
     test_against_controls,
 )
-from probe_kit.intervene.kinds.image_swap.effects import net_interval
+from probe_kit.intervene.kinds.image_swap.effects import net_interval, swap_sign
 from probe_kit.intervene.kinds.swap_shares import share_of_swap
 from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -41,7 +41,8 @@ class PatchEffect(EffectRow):
     swap does to where the action goes, with its 95 % interval by groups; None if that does nothing, so that a
     share would be a ratio of noise. mean_displacement, control_displacement: metres toward the target side, of the
     edit and of its matched controls. t, p, p_fwe: of the displacement beyond the controls', one-sided, by sign
-    flips of whole groups; p_fwe against the largest t of all edits of the category.
+    flips of whole groups, of an interchange in the direction of the swap itself; p_fwe against the largest t of
+    all edits of the category.
     """
 
     coefficient: str
@@ -121,7 +122,8 @@ def _of_category(
         return []
     names = [ConditionName.parse(outcomes.conditions[row]) for row in rows]
     displacements = push * (outcomes.displacement[rows] - clean)
-    tests = test_against_controls(displacements, names, outcomes, suite, (), ())
+    sign = swap_sign(outcomes) if target_side == IMAGE_SWAP else 1.0
+    tests = test_against_controls(sign * displacements, names, outcomes, suite, (), ())
     found = []
     for at, (row, name, test) in enumerate(zip(rows, names, tests, strict=True)):
         flips = _flips(push, clean, outcomes.displacement[row])

@@ -60,8 +60,15 @@ class Sweep:
 
     @cached_property
     def source_p(self) -> float:
-        """That the source moves the metric toward where it should: exact sign test, by items and by groups."""
-        return paired_greater_p(self.toward * self.whole, self.items, self.groups)
+        """That the source moves the metric, in the better of both directions: exact sign test, as of the swap."""
+        return min(self._source_p_values)
+
+    @cached_property
+    def _source_p_values(self) -> tuple[float, float]:
+        """Toward where the source should move the metric, and away from it."""
+        moved = self.toward * self.whole
+        toward, away = (paired_greater_p(sign * moved, self.items, self.groups) for sign in (1.0, -1.0))
+        return toward, away
 
     @cached_property
     def shares(self) -> tuple[SwapShare | None, ...]:
@@ -77,13 +84,14 @@ class Sweep:
         share, low, high: Σ moved · whole / Σ whole² over pairs, 1 for all that the source does, with its 95 %
         interval by groups; NaN where the source itself is not significant, as with four groups or fewer: it
         would be a ratio of noise. moved: mean of the metric toward `Pair.toward`, in its unit. p, p_fwe:
-        that it moves there, by sign flips of whole groups; p_fwe against all sets of the sweep (max-T).
+        that it moves where the source does, by sign flips of whole groups; p_fwe against all sets (max-T).
         """
         import pandas as pd
 
         moved = self.toward * (self.patched - self.clean)
         seed = derive_seed(DRAWS, "sign flips", *np.unique(self.groups).tolist())
-        _, p, p_fwe = max_t(moved, self.items, self.groups, seed)
+        sign = -1.0 if self._source_p_values[1] < SIGNIFICANCE else 1.0
+        _, p, p_fwe = max_t(sign * moved, self.items, self.groups, seed)
         shares = [(np.nan,) * 3 if own is None else tuple(own) for own in self.shares]
         return pd.DataFrame(
             {

@@ -55,10 +55,21 @@ def keys_in_use(run: RunReader) -> set[str]:
 def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
     """The places, each once, that carry half of the effect or more when their tokens are patched in full.
 
+    Those of `kv` with the role of the tokens (`kv.01 language`), unless only all of a block together carry it.
     Without those that carry it by construction.
     """
-    found = [row for row in rows if row.is_localised and not row.direction]
-    return tuple(dict.fromkeys(row.place for row in found if not row.is_by_construction))
+    found = [row for row in rows if row.is_localised and not row.direction and not row.is_by_construction]
+    by_role = {row.place for row in found if row.role != ALL and _is_read(row)}
+    names = [
+        row.name if row.place in by_role else row.place
+        for row in found
+        if row.place not in by_role or row.role != ALL
+    ]
+    return tuple(dict.fromkeys(names))
+
+
+def _is_read(row: PatchEffect) -> bool:
+    return PlaceName.parse(row.place).stream == KV_STREAM
 
 
 def is_backbone_layer(row: PatchEffect) -> bool:

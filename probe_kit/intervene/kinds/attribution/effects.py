@@ -11,6 +11,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.edits.sites import ALL, RESIDUAL, PlaceName
 from probe_kit.intervene.kinds.base import Measurement
+from probe_kit.intervene.kinds.image_swap.effects import swap_sign
 from probe_kit.intervene.kinds.site_effects import LOCALISATION_SHARE
 from probe_kit.intervene.kinds.swap_shares import SwapShare, share_of_swap
 from probe_kit.intervene.store.answers import CLEAN, ConditionOutcomes
@@ -93,7 +94,8 @@ class Anchored:
         """See `measured_attribution`."""
         names = [name.partition("|")[2] for name in self.outcomes.conditions if name.startswith(f"{ESTIMATE}|")]
         exact = [name for name in self.outcomes.conditions if name.startswith(f"{EXACT}|")]
-        toward = np.array([-self.outcomes.correct_sign * self._moved(name) for name in exact])
+        leads = -swap_sign(self.outcomes) * self.outcomes.correct_sign
+        toward = np.array([leads * self._moved(name) for name in exact])
         seed = derive_seed("sign flips", self.suite, self.category)
         p_fwe = dict(zip(exact, max_t(toward, self.outcomes.items, self.outcomes.groups, seed)[2], strict=True))
         return order_cells([self._row(name, p_fwe) for name in names])

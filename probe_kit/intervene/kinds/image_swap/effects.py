@@ -14,6 +14,7 @@ from probe_kit.intervene.store.selection import preferred_by_category
 from probe_kit.intervene.store.settings import FIRST_CHUNK
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_signs import paired_greater_p
+from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.student import unbounded_student_interval
 from probe_kit.train.data.run_reader import RunReader
 
@@ -146,6 +147,15 @@ def swap_p_values(outcomes: ConditionOutcomes, swapped: str = IMAGE_SWAP) -> tup
     displacement = outcomes.correct_sign * (outcomes.of(CLEAN) - outcomes.of(swapped))
     toward, away = (paired_greater_p(sign * displacement, outcomes.items, outcomes.groups) for sign in (1.0, -1.0))
     return toward, away
+
+
+def swap_sign(outcomes: ConditionOutcomes) -> float:
+    """1, or −1 in a category in which swapped images lead actions away from the correct picture, beyond chance.
+
+    What carries the effect of the swap moves actions where the swap does: p of patches are of that direction.
+    """
+    is_reversed = IMAGE_SWAP in outcomes.conditions and swap_p_values(outcomes)[1] < SIGNIFICANCE
+    return -1.0 if is_reversed else 1.0
 
 
 def _reached(

@@ -304,8 +304,9 @@ def _ends(limits: tuple[float, float]) -> str:
 class Places:
     """What was found inside the network, in one category.
 
-    located: places that carry half of the effect; None if an interchange did not search for them. carried: places
-    and the directions along which half of it passes there. jointly: what joint places found, in words.
+    located: places that carry half of the effect, see `localised_sites`; None if an interchange did not search for
+    them. carried: places and the directions along which half of it passes there. jointly: what joint places found,
+    in words; they tell the tokens apart where an interchange has those of a block together.
     """
 
     located: tuple[str, ...] | None = None
@@ -314,8 +315,13 @@ class Places:
 
     def __str__(self) -> str:
         located = self.located or ()
-        is_read = any(place.partition(".")[0] == KV_STREAM for place in located)
-        found = "; ".join(filter(None, (describe_sites(located, self.carried), "" if is_read else self.jointly)))
+        read = [place for place in located if place.partition(".")[0] == KV_STREAM]
+        jointly = self.jointly
+        if jointly and not any(" " in place for place in read):
+            located = [place for place in located if place not in read]
+        else:
+            jointly = "" if read else jointly
+        found = "; ".join(filter(None, (describe_sites(located, self.carried), jointly)))
         return found or NOT_LOCATED * (self.located is not None)
 
 

@@ -1,6 +1,6 @@
 """What sets of cells carry, alone and left out. Reads stored outcomes; needs no model."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.hashing import derive_seed
 from probe_kit.intervene.kinds.base import Measurement
+from probe_kit.intervene.kinds.image_swap.effects import swap_sign
 from probe_kit.intervene.kinds.swap_shares import SwapShare, share_of_swap
 from probe_kit.intervene.store.answers import CLEAN, ConditionOutcomes
 from probe_kit.intervene.store.selection import preferred_by_category
@@ -80,14 +81,19 @@ def joint_keys_in_use(run: RunReader) -> set[str]:
     return {result.stored.key for result in preferred_by_category(run, NAME).values()}
 
 
+def is_read_jointly(rows: "Sequence[JointEffect]") -> bool:
+    """Whether a smallest set of several cells was confirmed."""
+    return any(row.part == MINIMAL and row.finding == "read jointly" for row in rows)
+
+
 def describe_joint_places(rows: "list[JointEffect]") -> str:
     """Where it is read, in words for a verdict; empty where that remains open."""
     single = [row.cells for row in rows if row.part == "cell" and row.finding in ("read here", "enough alone")]
     if single:
         return f"read at {', '.join(single)}"
-    minimal = [row for row in rows if row.part == MINIMAL and row.finding == "read jointly"]
-    if minimal:
-        return f"no single place: read jointly at {minimal[0].cells}"
+    if is_read_jointly(rows):
+        (minimal,) = (row for row in rows if row.part == MINIMAL)
+        return f"no single place: read jointly at {minimal.cells}"
     (every,) = (row for row in rows if row.part == EVERY)
     return f"past {every.cells}" if every.finding == "past it" else ""
 
@@ -167,7 +173,7 @@ class _Category:
 
     def _toward(self, condition: str) -> NDArray[np.float64]:
         """Metres toward the side that the image swap leads to."""
-        return -self.outcomes.correct_sign * self._moved(condition)
+        return -swap_sign(self.outcomes) * self.outcomes.correct_sign * self._moved(condition)
 
     def _share(self, outcomes: ConditionOutcomes, moved: NDArray[np.float64]) -> SwapShare | None:
         return share_of_swap(outcomes, moved, self.suite)
