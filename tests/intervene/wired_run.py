@@ -1,0 +1,71 @@
+"""A run of policies whose wiring is written down, with probes and every intervention, as a user has them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from probe_kit.hooks import Site, capture
+from probe_kit.intervene import ImageSwap, Interchange, JointPlaces, UseVerdict
+from probe_kit.intervene.edits.sites import ALL
+from probe_kit.intervene.replay.conditions import Intervention
+from probe_kit.intervene.results.results import verdicts_of
+from probe_kit.intervene.store.settings import FORMAT
+from probe_kit.train import ArrayRun, train_probes
+from tests.intervene.answers import store_outcomes
+from tests.intervene.wirings import BLOCKS, IMAGE, WORDS, WiredSession, outcomes_of, replay_inputs
+
+SUITE = "suite@1#0123456789ab"
+VIEWS = {"mean": slice(None), "mean:image": IMAGE, "mean:language": WORDS}
+ROLES = (ALL, "image", "language", "state")
+
+
+def wired_run(session: WiredSession, names: Sequence[str], folder: Path) -> ArrayRun:
+    """Activations of the clean inferences of these wirings, each a category."""
+    inputs = [one for name in names for one in replay_inputs(name)]
+    sites = [Site("backbone", layer) for layer in range(BLOCKS + 1)]
+    features: dict[tuple[Site, str], list[np.ndarray]] = {(site, view): [] for site in sites for view in VIEWS}
+    for one in inputs:
+        with capture(session.policy, sites) as cache:
+            session.act(one.seen, one.seed)
+        for site, view in features:
+            features[site, view].append(cache[site][0, VIEWS[view]].mean(0).numpy())
+    columns = ("episode_id", "item_id", "group_id", "category", "side_correct", "layout")
+    episodes = pd.DataFrame({name: [getattr(one, name) for one in inputs] for name in columns})
+    episodes["outcome"], episodes["side_placed"] = "correct", episodes["side_correct"]
+    run = ArrayRun(folder, "wired", SUITE, episodes, {key: np.array(rows) for key, rows in features.items()})
+    session.run = run  # type: ignore[assignment]
+    return run
+
+
+def intervene(session: WiredSession, run: ArrayRun, asked: Intervention) -> None:
+    """Store what `run_intervention` would."""
+    names = list(dict.fromkeys(run.episodes["category"]))
+    conditions = asked.conditions(session)
+    outcomes = outcomes_of(session, names, conditions[2:])
+    entries = asked.certificate_entries(conditions, None)  # type: ignore[arg-type]
+    settings = {
+        "format": FORMAT, "kind": asked.kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
+        "categories": names, "readout": asked.readout, **asked.parameters(),
+    }  # fmt: skip
+    check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
+    store_outcomes(run.location, run.suite, settings, outcomes, {"replay": check, **entries})
+
+
+def concluded(
+    session: WiredSession, names: Sequence[str], folder: Path, view: str = "mean:language"
+) -> dict[str, UseVerdict]:
+    """By wiring the verdict with place and tie, from probes of one view and all interventions."""
+    run = wired_run(session, names, folder)
+    train_probes(run, views=(view,), permutations=199, controls=())
+    role = view.partition(":")[2] or ALL
+    sites = tuple(f"backbone.{layer:02d}" for layer in range(1, BLOCKS + 1))
+    for asked in (
+        ImageSwap(),
+        Interchange(sites=("backbone.*", "kv.*"), roles=ROLES),
+        Interchange(sites=sites, roles=(role,), direction="mean-difference", controls=1),
+        JointPlaces(roles=ROLES[1:]),
+    ):
+        intervene(session, run, asked)
+    return verdicts_of(run)
