@@ -118,3 +118,4 @@ def test_the_place_is_said_beside_the_behaviour_and_does_not_change_it() -> None
     assert str(Places(("backbone.01",), jointly=jointly)) == f"passes at backbone.01; {jointly}"
     assert str(Places(("kv.01",), jointly=jointly)) == jointly, "all tokens of a block do not say which are read"
     assert str(Places(("kv.01 image",), jointly="read at kv.01 image")) == "read at kv.01 image"
+    assert str(Places(("kv.01",), jointly="past kv")) == "read at kv.01"

@@ -314,13 +314,11 @@ class Places:
     jointly: str = ""
 
     def __str__(self) -> str:
-        located = self.located or ()
-        read = [place for place in located if place.partition(".")[0] == KV_STREAM]
-        jointly = self.jointly
-        if jointly and not any(" " in place for place in read):
-            located = [place for place in located if place not in read]
-        else:
-            jointly = "" if read else jointly
+        read = [place for place in self.located or () if place.partition(".")[0] == KV_STREAM]
+        names_tokens = any(" " in place for place in read)
+        is_finer = bool(read) and not names_tokens and "read" in self.jointly
+        located = [place for place in self.located or () if not (is_finer and place in read)]
+        jointly = self.jointly if is_finer or not read else ""
         found = "; ".join(filter(None, (describe_sites(located, self.carried), jointly)))
         return found or NOT_LOCATED * (self.located is not None)
 
