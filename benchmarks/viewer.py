@@ -73,7 +73,7 @@ def served(run: str) -> Iterator[str]:
     """The address that `probe-kit view` prints."""
     command = [sys.executable, "-m", "probe_kit", "view", run, "--no-browser"]
     began = time.perf_counter()
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, encoding="utf-8") as process:
         try:
             assert process.stdout is not None
             address = process.stdout.readline().strip()

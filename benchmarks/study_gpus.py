@@ -1,0 +1,130 @@
+"""How long GPUs wait without a model while a study is played on a Ray cluster.
+
+    OMP_NUM_THREADS=1 python benchmarks/study_gpus.py [--gpus 2] [--models 8] [--items 8]
+
+Needs Ray (extra `ray`), and no GPU: the cluster is told that this machine has `--gpus` of them, and the models run
+on its cores. Half of the models have twice as many episodes as the others. A GPU waits where Ray has given it to no
+model although models are left; what a model needs to start counts as its own time.
+"""
+
+import argparse
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from probe_kit.study import load_study, plan_study
+from probe_kit.study.planning.plan import StudyPlan
+from probe_kit.study.running.model_task import Failure, Made, ModelTask, RunTask
+from probe_kit.study.running.ray import play_on_ray
+
+STUDY = """
+schema = 1
+name = "gpus"
+out = "{out}"
+
+[suite]
+categories = ["Color", "State"]
+items = {items}
+
+{models}
+[conditions.still]
+no_act = true
+
+[[runs]]
+name = "long"
+models = {long}
+conditions = ["still"]
+
+[[runs]]
+name = "short"
+models = {short}
+conditions = ["still"]
+categories = ["Color"]
+"""
+MODEL = '[models.m{seed}]\nfamily = "pi0-tiny"\nrandom_weights = true\nweights_seed = {seed}\n\n'
+EVERY_S = 0.1
+
+
+def tasks_of(plan: StudyPlan) -> list[ModelTask]:
+    """A task per model, which takes one GPU of the cluster and computes on the CPU."""
+    found = []
+    for one in plan.cells:
+        settings = replace(one.cell.settings_to_play, device="cpu")
+        location = one.cell.location(plan.study.study.folder)
+        found.append(ModelTask(one.cell.model, (RunTask(one.cell.name, settings, location, 0),), 1, one.missing))
+    return found
+
+
+class Waiting:
+    """Samples how many GPUs no model has, while models are left and until the last has ended."""
+
+    def __init__(self, gpus: int, models: int) -> None:
+        self.gpus, self.models = gpus, models
+        self.while_left: list[float] = []
+        self.whole: list[float] = []
+        self.ended = 0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._sample, daemon=True)
+
+    def __enter__(self) -> "Waiting":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _sample(self) -> None:
+        import ray
+
+        started = False
+        while not self._stop.wait(EVERY_S):
+            free = ray.available_resources().get("GPU", 0.0)
+            started = started or free < self.gpus
+            if not started:
+                continue
+            self.whole.append(free / self.gpus)
+            if self.models - self.ended >= self.gpus:
+                self.while_left.append(free / self.gpus)
+
+
+def main() -> None:
+    """Play once and print the shares."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--gpus", type=int, default=2)
+    parser.add_argument("--models", type=int, default=8)
+    parser.add_argument("--items", type=int, default=8)
+    chosen = parser.parse_args()
+    import ray
+
+    names = [f"m{seed}" for seed in range(chosen.models)]
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "study.toml"
+        models = "".join(MODEL.format(seed=seed) for seed in range(chosen.models))
+        text = STUDY.format(
+            out=f"{folder}/out", items=chosen.items, models=models, long=names[::2], short=names[1::2]
+        )
+        file.write_text(text.replace("'", '"'), encoding="utf-8")
+        tasks = tasks_of(plan_study(load_study(file)))
+        ray.init(num_cpus=chosen.gpus, num_gpus=chosen.gpus, include_dashboard=False, log_to_driver=False)
+        began = time.monotonic()
+        with Waiting(chosen.gpus, len(tasks)) as waiting:
+            failures: list[Failure] = []
+
+            def note(event: object) -> None:
+                waiting.ended += isinstance(event, Made | Failure)
+                failures.extend([event] if isinstance(event, Failure) else [])
+
+            play_on_ray(tasks, "auto", note)
+        seconds = time.monotonic() - began
+        ray.shutdown()
+    assert not failures, failures
+    left, whole = (100 * sum(shares) / len(shares) for shares in (waiting.while_left, waiting.whole))
+    print(f"{len(tasks)} models on {chosen.gpus} GPUs in {seconds:.0f} s")
+    print(f"GPUs without a model: {left:.1f} % while models are left, {whole:.1f} % from first start to last end")
+
+
+if __name__ == "__main__":
+    main()
