@@ -16,7 +16,7 @@ from probe_kit.version import __version__ as __version__
 if TYPE_CHECKING:
     from probe_kit.env import Act2AnswerEnv, SceneSpec
     from probe_kit.errors import ProbeKitError
-    from probe_kit.extract import ExtractSettings, LeRobotSource, Run, extract_run, open_run
+    from probe_kit.extract import EnvSource, ExtractSettings, LeRobotSource, Run, extract_run, open_run
     from probe_kit.hooks import Site, capture, load_policy
     from probe_kit.intervene import (
         AttentionReadout,
@@ -51,6 +51,7 @@ __all__ = [
     "AttributionPatching",
     "ClosedLoop",
     "ConceptErasure",
+    "EnvSource",
     "ExtractSettings",
     "FinalPositionsDisplay",
     "ImageSwap",
@@ -98,6 +99,7 @@ __getattr__, __dir__ = lazy_names(
         "AttentionReadout": "intervene",
         "ClosedLoop": "intervene",
         "Act2AnswerEnv": "env",
+        "EnvSource": "extract",
         "ExtractSettings": "extract",
         "FinalPositionsDisplay": "retention.displays",
         "ImageSwap": "intervene",

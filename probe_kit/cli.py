@@ -22,10 +22,12 @@ from probe_kit.check_adapter.command import check_adapter
 from probe_kit.demo.commands import demo
 from probe_kit.doctor_command import doctor
 from probe_kit.extract.ask_commands import ask
-from probe_kit.extract.commands import dataset_app, extract
+from probe_kit.extract.commands import extract
 from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
 from probe_kit.extract.run_commands import export
+from probe_kit.extract.source_commands.dataset_commands import app as dataset_app
+from probe_kit.extract.source_commands.environment_commands import check_environment
 from probe_kit.hooks.commands import new_adapter, verify, words
 from probe_kit.intervene.commands import KindHelp, intervene
 from probe_kit.intervene.show_command import show
@@ -43,7 +45,8 @@ if TYPE_CHECKING:
 
 ORDER = (
     "demo", "doctor", "models", "suite", "extract", "ask", "dataset", "run", "labels", "train", "power",
-    "intervene", "retention", "stages", "view", "study", "export", "new-adapter", "check-adapter", "verify",
+    "intervene", "retention", "stages", "view", "study", "export", "new-adapter", "check-adapter",
+    "check-environment", "verify",
 )  # fmt: skip
 """The order in which a study needs the commands, and help lists them; others follow by name."""
 
@@ -169,6 +172,7 @@ for command in (
     verify,
     new_adapter,
     check_adapter,
+    check_environment,
     labels,
     train,
     power,

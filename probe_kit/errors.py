@@ -85,6 +85,12 @@ class RecordingError(ProbeKitError):
     exit_code = 3
 
 
+class OwnEnvironmentError(ProbeKitError):
+    """An environment of the user's own breaks its contract, raised an error, or does not fit the model."""
+
+    exit_code = 3
+
+
 class ActionError(ProbeKitError, ValueError):
     """An action has the wrong shape or is not finite; the environment did not move."""
 

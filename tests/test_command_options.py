@@ -163,7 +163,15 @@ def test_every_option_of_extract_and_ask_is_a_setting_or_says_how_the_run_starts
     for command, settings in (("extract", ExtractSettings), ("ask", AskSettings)):
         names = {parameter.name for parameter in LEAVES[command].params} - {"help"}
         parsed = inspect.signature(settings.from_options).parameters  # of recordings, such as --episodes
-        known = {*settings.__dataclass_fields__, *parsed, *SCENE_OPTIONS, "out_folder", "dry_run", "force"}
+        known = {
+            *settings.__dataclass_fields__,
+            *parsed,
+            *SCENE_OPTIONS,
+            "out_folder",
+            "dry_run",
+            "force",
+            "large",
+        }
         assert names <= known
 
 

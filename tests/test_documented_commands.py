@@ -267,7 +267,9 @@ NOT_TYPED = {
     r"--model (pi0|magma|openvla|spatialvla|xiaomi-r0|internvla-m1)( |$)": "needs released weights (8 to 18 GB)",
     r"suite convert vl-think --root BlindVLA|train runs/pi0 --untrained|retention runs/pi0 runs/pi0-random":
         "of files that this repository may not pass on, and of runs on them (docs/paper.md)",
-    r"kitchen|runs/own": "needs a LeRobotDataset; tests/extract/recordings writes some",
+    r"kitchen|runs/own": "needs a LeRobotDataset or an environment; tests/extract/recordings and "
+        "tests/extract/own_environments have some",
+    r"lerobot:libero": "needs a simulator",
     r"suite convert act2answer --root": "of files that this repository may not pass on",
 }  # fmt: skip
 """Patterns of lines that are not typed, after the stand-ins, and why."""

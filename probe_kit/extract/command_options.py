@@ -20,7 +20,7 @@ from probe_kit.suite.ladder import WORDINGS
 _scene_option = partial(typer.Option, rich_help_panel="Scene")
 _storage_option = partial(typer.Option, rich_help_panel="Stored data")
 _control_option = partial(typer.Option, rich_help_panel="Controls")
-_STARTING = ("out_folder", "dry_run", "force")
+_STARTING = ("out_folder", "dry_run", "force", "large")
 
 
 def settings_of(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -271,6 +271,10 @@ AskedObject = Annotated[
         help="target: ask for the object of the instruction. distractor: ask for the object of the other picture. "
         "absent: ask for an object in neither picture (requires --prompt seen; no is correct).",
     ),
+]
+
+Large = Annotated[
+    bool, _storage_option("--yes", help="Begin a run that would take more than 64 GB before compression.")
 ]
 
 # -- speed --------------------------------------------------------------------------------------------------

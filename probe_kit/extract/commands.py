@@ -2,19 +2,19 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, out, progress, say
 from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.extract import command_options as own
+from probe_kit.extract.own_environments import options as played
 from probe_kit.extract.recordings import options as recorded
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
     from probe_kit.extract import Extraction, Run
+    from probe_kit.extract.own_environments.environment_plan import EnvironmentPlan
     from probe_kit.extract.recordings.recorded_plan import RecordedPlan
     from probe_kit.extract.store.locations.location import Location
     from probe_kit.suite.ladder import Wording
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 OUTER_FOLDS = 5
 """Groups that probes need at least."""
-dataset_app = typer.Typer(help="Inspect data sets of recordings.", no_args_is_help=True)
+LARGE = 64 * 10**9
+"""Bytes above which a run is begun with --yes only."""
 
 
 def extract(
@@ -57,6 +58,8 @@ def extract(
     instruction: recorded.Instruction = None,
     no_pixels: recorded.NoPixels = False,
     accept_units: recorded.AcceptUnits = False,
+    env: played.Env = None,
+    env_options: played.EnvOptions = None,
     max_steps: own.MaxSteps = None,
     tile_side: own.TileSide = None,
     light_level: own.LightLevel = None,
@@ -78,6 +81,7 @@ def extract(
     dry_run: common.DryRun = False,
     allow_mixed: common.AllowMixed = False,
     force: common.Force = False,
+    large: own.Large = False,
 ) -> None:
     """Run a model in every episode and store its activations.
 
@@ -88,19 +92,21 @@ def extract(
     probe-kit extract --model pi0-tiny --items 12 --out runs/mine
     probe-kit extract --model pi0 --categories color,shape --dry-run
     probe-kit extract --model pi0 --checkpoint DIR --dataset FOLDER --episodes 0:5 --select every:5
+    probe-kit extract --model pi0 --checkpoint DIR --env kitchen:Kitchen --captured-calls 8
     """
     chosen = own.settings_of(locals())
     from probe_kit.extract import ExtractSettings, prepare
     from probe_kit.extract.store.locations.locate import locate
 
     settings = ExtractSettings.from_options(**chosen)
-    with err.status("loading suite and model" if dataset is None else "loading recordings and model"):
+    with err.status(f"loading {'recordings' if dataset else 'environment' if env else 'suite'} and model"):
         extraction = prepare(settings, out_folder, fetch=not dry_run)
     location = locate(out_folder or Path("runs") / extraction.default_name())
     print_plan(extraction, location)
     print_sufficiency(extraction)
     if dry_run:
         return
+    check_size(extraction, location, large)
     with progress() as bar:
         run = extraction.run(location, force=force, progress=counter(bar, "episodes"))
     _print_outcomes(run)
@@ -140,14 +146,32 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     err.print(table)
 
 
+def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> None:
+    """Raise DiskSpaceError for more than 64 GB, unless that was agreed to."""
+    from probe_kit.errors import DiskSpaceError
+    from probe_kit.extract.needs import space_needed
+    from probe_kit.extract.store.locations.disk import in_units
+
+    needed = sum(space_needed(extraction.further_plan(location), extraction.settings).values())
+    if needed > LARGE and not agreed:
+        raise DiskSpaceError(
+            f"{location} would take up to {in_units(needed)}; more than {in_units(LARGE)} is written with --yes "
+            "only. Choose fewer episodes, inferences (--captured-calls) or frames (--select every:N), leave "
+            "--tokens all out, or add --yes"
+        )
+
+
 def _rows_of_plan(extraction: "Extraction") -> dict[str, str]:
     """What is shown to the model."""
+    from probe_kit.extract.own_environments.environment_plan import EnvironmentPlan
     from probe_kit.extract.plan import Plan
     from probe_kit.extract.recordings.recorded_plan import RecordedPlan
 
     plan = extraction.plan
     if isinstance(plan, RecordedPlan):
         return recorded_facts(plan)
+    if isinstance(plan, EnvironmentPlan):
+        return played_facts(plan)
     assert isinstance(plan, Plan)
     return {
         "suite": plan.suite.identity,
@@ -174,6 +198,23 @@ def recorded_facts(plan: "RecordedPlan") -> dict[str, str]:
     }
 
 
+def played_facts(plan: "EnvironmentPlan") -> dict[str, str]:
+    """Environment, cameras, facts and episodes of a plan, in words."""
+    own, groups = plan.environment, {one.to_json()["group_id"] for one in plan.episodes}
+    if not own:
+        return {
+            "environment": terminal_safe(plan.name),
+            "episodes": f"{len(plan.episodes)} in {len(groups)} groups",
+        }
+    return {
+        "environment": terminal_safe(f"{plan.name} ({own['revision']})"),
+        "cameras": terminal_safe(", ".join(own["cameras"])),
+        "actions": terminal_safe(", ".join(own["names"]["action"])),
+        "facts": terminal_safe(", ".join(own["columns"])) or "none",
+        "episodes": f"{len(plan.episodes)} in {len(groups)} groups, at most {own['max_steps']} actions each",
+    }
+
+
 def _acts_row(identity: Mapping[str, Any]) -> dict[str, str]:
     if not identity.get("capture_only"):
         return {}
@@ -186,13 +227,15 @@ def print_sufficiency(extraction: "Extraction") -> None:
     from rich.table import Table
 
     from probe_kit.extract.plan import Plan
+    from probe_kit.extract.recordings.recorded_plan import RecordedPlan
     from probe_kit.suite.validation.sufficiency import Smallest, sufficiencies
 
     plan, scored = extraction.plan, not getattr(extraction.settings, "capture_only", False)
     if not isinstance(plan, Plan):
-        episodes = len({row.to_json()["group_id"] for row in plan.episodes})
-        if episodes < OUTER_FOLDS:
-            say(marked("[yellow]{} recorded episodes; probes need {} or more[/]", episodes, OUTER_FOLDS))
+        groups = len({row.to_json()["group_id"] for row in plan.episodes})
+        if groups < OUTER_FOLDS:
+            kind = "recorded episodes" if isinstance(plan, RecordedPlan) else "groups of episodes"
+            say(marked("[yellow]{} {}; probes need {} or more[/]", groups, kind, OUTER_FOLDS))
         return
     table = Table(show_header=False, title=f"enough for ({Smallest.of(plan.suite).words})", box=None)
     table.add_column(style="dim", no_wrap=True)
@@ -240,57 +283,6 @@ def _print_outcomes(run: "Run") -> None:
     counts = run.episodes["outcome"].value_counts()
     text = ", ".join(f"{name} {count}" for name, count in counts.items())
     say(f"{len(run.episodes)} episodes: {text}")
-    step = "retention" if not run.streams else "labels" if run.recorded else "train"
+    step = "retention" if not run.streams else "labels" if run.inputs is not None else "train"
     say(marked("next: [bold]probe-kit {} {}[/]", step, run.location))
     out.print(str(run.location), soft_wrap=True)
-
-
-@dataset_app.command("show")
-def show_dataset(
-    folder: Annotated[
-        str, typer.Argument(metavar="FOLDER", help="A LeRobotDataset, or USER/NAME@COMMIT of the hub.")
-    ],
-    model: Annotated[str | None, typer.Option("--model", help="Compare with the inputs of this model.")] = None,
-    checkpoint: common.Checkpoint = None,
-    options: common.ModelOptions = None,
-    episodes: recorded.Episodes = None,
-    select: recorded.Select = None,
-    cameras: recorded.Cameras = None,
-    rotations: recorded.Rotations = None,
-    instruction: recorded.Instruction = None,
-) -> None:
-    """Show what a data set holds and how a model would be shown it. Writes nothing.
-
-    With a model, the state of every chosen frame is compared with the statistics of the checkpoint.
-
-    \b
-    probe-kit dataset show FOLDER
-    probe-kit dataset show FOLDER --model pi0 --checkpoint DIR --camera base=observation.images.top
-    """
-    from rich.table import Table
-
-    from probe_kit.extract.prepared import load_acting_policy, open_recording
-    from probe_kit.extract.rollout.recorded.described import describe_fit, describe_recording
-    from probe_kit.extract.rollout.recorded.recorded_controller import fit
-    from probe_kit.extract.settings import ExtractSettings
-
-    settings = ExtractSettings.from_options(
-        model=model or "pi0-tiny", checkpoint=checkpoint, options=options, dataset=folder, episodes=episodes,
-        select=select, cameras=cameras, rotations=rotations, instruction=instruction,
-    )  # fmt: skip
-    assert settings.source is not None
-    with err.status("reading the data set"):
-        recording = open_recording(settings.source)
-        facts, warnings = describe_recording(recording), list[str]()
-    if model is not None:
-        with err.status("loading the model"):
-            fitted, warnings = describe_fit(fit(recording, load_acting_policy(settings)))
-        facts |= fitted
-    table = Table(show_header=False, box=None)
-    table.add_column(style="dim", no_wrap=True)
-    table.add_column(overflow="fold")
-    for name, value in facts.items():
-        table.add_row(name, marked("{}", terminal_safe(value)))
-    out.print(table)
-    for warning in warnings:
-        say(marked("[yellow]{}[/]", terminal_safe(warning)))

@@ -8,6 +8,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.calibration import Calibration, calibrated
 from probe_kit.extract.early import asked_objects, check_model, check_place, check_words, check_writable
 from probe_kit.extract.needs import declared_streams
+from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.plan import Plan, RowPlan, instructions_of, make_plan, plan_episodes, skipped_items
 from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.recordings.lerobot_folder import fetched, open_lerobot
@@ -16,6 +17,12 @@ from probe_kit.extract.recordings.recorded_plan import RecordedPlan, Recording
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
 from probe_kit.extract.rollout.examples import check_unfit, example_observations
+from probe_kit.extract.rollout.own_environments.environment_controller import (
+    OpenedEnvironment,
+    environment_controller,
+    environment_plan,
+    fit_environment,
+)
 from probe_kit.extract.rollout.preflight import run_preflight
 from probe_kit.extract.rollout.recorded.recorded_controller import check_units, fit, recorded_controller
 from probe_kit.extract.rollout.recorded.recorded_stage import example_of
@@ -107,7 +114,7 @@ def load(
     """
     settings = as_protocol(settings)
     if isinstance(settings, ExtractSettings) and settings.source is not None:
-        return _load_recorded(settings, settings.source, location, policy, fetch)
+        return _load_source(settings, settings.source, location, policy, fetch)
     suite = check_run(settings, location, loaded=not (answer_model is None and policy is None), fetch=fetch)
     if not rehearsed:
         run_preflight(settings.scene, plan_episodes(suite, settings.seed))
@@ -146,6 +153,9 @@ def as_protocol(settings: RunSettings) -> RunSettings:
     """The settings with what their protocol or recording decides; see `ExtractSettings.followed`."""
     if not isinstance(settings, ExtractSettings):
         return settings
+    if isinstance(settings.source, EnvSource):
+        check_meaningless(settings)
+        return settings
     return settings.followed() if settings.source is None else _with_recording(settings, settings.source)
 
 
@@ -162,34 +172,56 @@ def _with_recording(settings: ExtractSettings, source: LeRobotSource) -> Extract
     return replace(settings, source=source, captured_calls=calls, capture_only=True, frames="none")
 
 
-def _load_recorded(
+def _load_source(
     settings: ExtractSettings,
-    source: LeRobotSource,
+    source: LeRobotSource | EnvSource,
     location: Location | None,
     loaded: "Policy | None",
     fetch: bool,
 ) -> Prepared:
-    """As `load`, of recordings."""
+    """As `load`, of recordings or of an environment of the user's own."""
     if loaded is None:
         check_model(settings, tuple(SCRIPTED), fetch)
     if location is not None:
         check_writable(location)
-    recording = open_recording(source)
-    instructions = recording.instructions()
+    opened = OpenedEnvironment.of(source) if isinstance(source, EnvSource) else open_recording(source)
+    instructions = opened.instructions
     if loaded is None:
         check_words(settings, instructions, tuple(SCRIPTED))
         _check_instructions(settings, instructions, fetch)
     if not fetch and (streams := declared_streams(settings)) is not None:
-        planned = recorded_plan(recording, streams, settings, (0, 0))
+        if isinstance(opened, OpenedEnvironment):
+            settings = settings.with_every_call(settings.execute or 1)
+            planned: RowPlan = environment_plan(opened, None, streams, settings, settings.execute or 1)
+        else:
+            planned = recorded_plan(opened, streams, settings, (0, 0))
         return Prepared(settings, planned, _declared_card(settings), None, declared=True)
     if loaded is not None:
         _check_loaded(settings, loaded)
-    fitted = fit(recording, load_acting_policy(settings) if loaded is None else loaded)
+    policy = load_acting_policy(settings) if loaded is None else loaded
+    if isinstance(opened, OpenedEnvironment):
+        return _prepared_environment(settings, opened, policy)
+    return _prepared_recording(settings, opened, policy)
+
+
+def _prepared_environment(settings: ExtractSettings, opened: OpenedEnvironment, policy: "Policy") -> Prepared:
+    fitted = fit_environment(opened, policy)
+    controller = environment_controller(fitted, settings)
+    settings = settings.with_every_call(controller.execute)
+    check_unfit(fitted.policy.card, settings.batch, fitted.example)
+    check_unreachable(settings, fitted.policy.card)
+    planned = environment_plan(opened, fitted, controller.streams, settings, controller.execute)
+    return Prepared(settings, planned, controller.identity, controller)
+
+
+def _prepared_recording(settings: ExtractSettings, recording: Recording, policy: "Policy") -> Prepared:
+    fitted = fit(recording, policy)
     check_units(fitted)
     settings = replace(settings, source=fitted.recording.source)
     controller = recorded_controller(fitted, settings)
-    check_unfit(fitted.policy.card, settings.batch, example_of(fitted.recording, instructions[0]))
+    check_unfit(fitted.policy.card, settings.batch, example_of(fitted.recording, recording.instructions[0]))
     planned = recorded_plan(fitted.recording, controller.streams, settings, fitted.prediction)
+    planned = replace(planned, other_actions=fitted.other_actions)
     return Prepared(settings, planned, controller.identity, controller)
 
 

@@ -75,6 +75,17 @@ CAPTURE_ONLY = "capture_only"
 DATASET = "dataset"
 """The part of a run's settings that says which recordings it was made of; scene runs have `suite` and `scene`."""
 
+ENVIRONMENT = "environment"
+"""The same of a run in an environment of the user's own."""
+OTHER_ACTIONS = "other_actions"
+"""Of a selection of recordings: why predicted and recorded actions are not compared; None where they are."""
+
+
+def stored_inputs_of(settings: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What settings say of recordings or environment, with shapes and names of `inputs`; empty for scenes."""
+    found: Mapping[str, Any] = settings.get(DATASET) or settings.get(ENVIRONMENT) or {}
+    return found
+
 
 def _is_count(value: Any) -> bool:
     return type(value) is int and value > 0

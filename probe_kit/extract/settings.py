@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal, Self, get_args
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
+from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.protocols import has_network, protocol_identity, protocol_row, scene_of
 from probe_kit.extract.recordings.lerobot_source import LeRobotSource
 from probe_kit.extract.run_layout import (
@@ -258,7 +259,8 @@ class ExtractSettings(RunSettings):
     capture_only: capture the first inference of every episode and do not act; for checkpoints of other arms.
     edits: what is changed in the streams at every inference; vectors: their directions and sources, by hash.
     video: GIF of the first episode, of all, or none; changes no stored number.
-    source: recordings to show in place of suite and scene; the model then does not act.
+    source: in place of suite and scene, recordings to show, and the model does not act; or an environment of the
+    user's own, in which it acts.
     """
 
     wordings: tuple[Wording, ...] | None = None
@@ -271,7 +273,7 @@ class ExtractSettings(RunSettings):
     edits: tuple[Edit, ...] = ()
     vectors: Vectors = field(default_factory=dict)
     video: str = "none"
-    source: LeRobotSource | None = None
+    source: LeRobotSource | EnvSource | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -301,32 +303,35 @@ class ExtractSettings(RunSettings):
     def from_options(
         cls, *, model: str, dataset: str | None = None, episodes: str | None = None, select: str | None = None,
         cameras: Sequence[str] | None = None, rotations: Sequence[str] | None = None,
-        instruction: str | None = None, no_pixels: bool = False, accept_units: bool = False, **given: Any,
+        instruction: str | None = None, no_pixels: bool = False, accept_units: bool = False,
+        env: str | None = None, env_options: Sequence[str] | None = None, **given: Any,
     ) -> Self:  # fmt: skip
-        """As of every run. dataset: of recordings, which the options behind it choose; see `LeRobotSource`."""
+        """As of every run. dataset: of recordings, env: an environment; the options behind them choose of them.
+
+        See `LeRobotSource` and `EnvSource`. Raises UsageError for options of other sources.
+        """
         of_recordings = {
-            "--episodes": episodes, "--select": select, "--camera": cameras, "--rotate": rotations,
-            "--instruction": instruction, "--no-pixels": no_pixels, "--accept-units": accept_units,
+            "--select": select, "--camera": cameras, "--rotate": rotations, "--instruction": instruction,
+            "--accept-units": accept_units,
         }  # fmt: skip
+        of_either = {"--episodes": episodes, "--no-pixels": no_pixels}
+        if dataset is not None and env is not None:
+            raise UsageError("--dataset and --env are two sources; give one")
         if dataset is None:
-            if wrong := [option for option, value in of_recordings.items() if value]:
-                raise UsageError(
-                    f"{', '.join(wrong)} is for recordings; give --dataset FOLDER too, or leave it out"
-                )
-            return super().from_options(model=model, **given)
-        changed = [name for name in ("scene", *SCENE_OPTIONS) if given.get(name) not in (None, False)]
-        changed += ["captured_calls"] * (given.get("captured_calls", 1) != 1)
-        if changed:
-            options = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
-            raise UsageError(
-                f"{options} does not apply with --dataset, which has no scene and captures every chosen frame; "
-                "remove it"
-            )
-        source = LeRobotSource.from_options(
-            dataset, episodes, select or "every:1", cameras or (), rotations or (),
-            instruction=instruction, pixels=not no_pixels, accept_units=accept_units,
-        )  # fmt: skip
-        return super().from_options(model=model, source=source, **given)
+            _check_not_given({**of_recordings, **({} if env else of_either)}, "recordings", "--dataset FOLDER")
+        if env is None:
+            _check_not_given({"--env-option": env_options}, "environments", "--env MODULE:CLASS")
+        if dataset is not None:
+            _check_no_scene(given, "--dataset, which has no scene and captures every chosen frame")
+            given["source"] = LeRobotSource.from_options(
+                dataset, episodes, select or "every:1", cameras or (), rotations or (),
+                instruction=instruction, pixels=not no_pixels, accept_units=accept_units,
+            )  # fmt: skip
+        elif env is not None:
+            steps = given.pop("max_steps", None)
+            _check_no_scene({**given, "captured_calls": 1}, "--env, which has a scene of its own")
+            given["source"] = EnvSource.from_options(env, list(env_options or ()), episodes, steps, not no_pixels)
+        return super().from_options(model=model, **given)
 
     @classmethod
     def _calibrates_by_default(cls, model: str, given: Mapping[str, Any]) -> bool:
@@ -344,7 +349,12 @@ class ExtractSettings(RunSettings):
 
     def most_inferences(self, execute: int) -> int:
         """Inferences that an episode can have with `execute` actions per inference."""
-        return -(-self.scene.max_steps // max(1, execute))
+        return -(-self.episode_steps // max(1, execute))
+
+    @property
+    def episode_steps(self) -> int:
+        """Actions that an episode can have."""
+        return self.source.max_steps if isinstance(self.source, EnvSource) else self.scene.max_steps
 
     def with_every_call(self, execute: int) -> Self:
         """The settings with a number in place of `captured_calls` `all`."""
@@ -492,6 +502,21 @@ class AskSettings(RunSettings):
         ]
 
 
+def _check_not_given(options: Mapping[str, Any], subject: str, wanted: str) -> None:
+    """Raise UsageError for options of a source that was not given."""
+    if wrong := [option for option, value in options.items() if value]:
+        raise UsageError(f"{', '.join(wrong)} is for {subject}; give {wanted} too, or leave it out")
+
+
+def _check_no_scene(given: Mapping[str, Any], source: str) -> None:
+    """Raise UsageError for options of scenes."""
+    changed = [name for name in ("scene", *SCENE_OPTIONS) if given.get(name) not in (None, False)]
+    changed += ["captured_calls"] * (given.get("captured_calls", 1) != 1)
+    if changed:
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in changed)
+        raise UsageError(f"{options} does not apply with {source}; remove it")
+
+
 def check_label(label: str) -> None:
     """Raise UsageError unless tables can call a run so."""
     if not (label.isprintable() and 0 < len(label) <= LONGEST_LABEL):
@@ -512,7 +537,7 @@ def run_label(settings: RunSettings) -> str:
         parts += [settings.protocol, *variant, *differing]
     else:
         parts += [] if settings.checkpoint is None else [Path(settings.checkpoint).name]
-        parts += [] if source is None else [f"on {source.name}"]
+        parts += [] if source is None else [f"{'in' if isinstance(source, EnvSource) else 'on'} {source.name}"]
         parts += [f"{name}={value}" for name, value in sorted(settings.options.items())]
     if settings.random_weights and settings.weights_seed:
         parts.append(f"twin {settings.weights_seed}")

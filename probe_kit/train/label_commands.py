@@ -49,7 +49,7 @@ def labels(
         highlight=False,
         soft_wrap=True,
     )
-    if not opened.recorded and (reason := why_no_sim(opened)):
+    if opened.inputs is None and (reason := why_no_sim(opened)):
         say(marked("[yellow]no sim.* columns:[/] {}", reason))
     say(marked("next: add a column, then [bold]probe-kit train {} --labels {} --target COLUMN[/]", run, out_file))
 
@@ -75,7 +75,7 @@ class ColumnOptions:
         window: int | None,
     ) -> "ColumnOptions | None":
         """The options; None where `target` is a side. Raises UsageError for a target that nothing names."""
-        from probe_kit.train.labels.builtin_columns import ITEM, RECORDED, SIM, builtin_names
+        from probe_kit.train.labels.builtin_columns import ITEM, PLAYED, RECORDED, SIM, builtin_names
 
         if file is None and target in TARGETS:
             further = {"--task": task, "--group-by": group_by, "--exchange-within": exchange_within}
@@ -85,7 +85,7 @@ class ColumnOptions:
                     f"{given[0]} is for labels of your own; give --labels FILE and --target COLUMN too"
                 )
             return None
-        if file is None and not target.startswith((SIM, ITEM, RECORDED)):
+        if file is None and not target.startswith((SIM, ITEM, RECORDED, PLAYED)):
             sides = ", ".join(map(repr, TARGETS))
             raise UsageError(
                 f"--target {target!r} is not one of {sides}, nor a built-in column ({', '.join(builtin_names())})."

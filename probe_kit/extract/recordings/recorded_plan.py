@@ -9,6 +9,7 @@ from probe_kit.errors import RecordingError
 from probe_kit.extract.plan import RowPlan
 from probe_kit.extract.recordings.lerobot_folder import MOST_FRAMES, LeRobotFolder, LeRobotFrames
 from probe_kit.extract.recordings.lerobot_source import ACTION, IMAGES, STATE, LeRobotSource, Pairs
+from probe_kit.extract.run_layout import OTHER_ACTIONS
 from probe_kit.hashing import derive_seed
 
 CATEGORY = "all"
@@ -90,11 +91,15 @@ class PlannedStretch:
 
 @dataclass(frozen=True)
 class RecordedPlan(RowPlan):
-    """All stretches of a run. dataset: what its identity says of the data set. name: what tables call it."""
+    """All stretches of a run. dataset: what its identity says of the data set. name: what tables call it.
+
+    other_actions: why the recorded actions of these episodes are not what the policy predicts; None if they are.
+    """
 
     episodes: tuple[PlannedStretch, ...]
     dataset: Mapping[str, Any]
     name: str
+    other_actions: str | None = None
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -108,9 +113,9 @@ class RecordedPlan(RowPlan):
 
     @property
     def selection(self) -> dict[str, Any]:
-        """Which episodes were chosen."""
+        """Which episodes were chosen, and whether their actions are those that the policy predicts."""
         chosen = sorted({one.source_episode for one in self.episodes})
-        return {"recording": {"name": self.name, "episodes": chosen}}
+        return {"recording": {"name": self.name, "episodes": chosen, OTHER_ACTIONS: self.other_actions}}
 
     def to_json(self) -> dict[str, Any]:
         """As stored in `plan/`."""
@@ -158,6 +163,7 @@ class Recording:
             )
         return replace(self, source=replace(self.source, cameras=pairs))
 
+    @property
     def instructions(self) -> tuple[str, ...]:
         """Every instruction once, in the order of their letters."""
         return tuple(sorted({text for episode in self.episodes for text in self._texts(episode)}))

@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.extract.recordings.lerobot_source import LeRobotSource
 from probe_kit.extract.rollout.controllers import SCRIPTED
 from probe_kit.extract.settings import ExtractSettings, RunSettings
 from probe_kit.hooks.checkpoints.third_party import with_origin
@@ -22,7 +23,7 @@ def check_meaningless(settings: RunSettings) -> None:
     if not isinstance(settings, ExtractSettings):
         return
     if settings.source is not None:
-        _check_recorded(settings)
+        _check_source(settings)
         return
     if settings.capture_only:
         _check_acting(settings)
@@ -47,26 +48,31 @@ def check_meaningless(settings: RunSettings) -> None:
         )
 
 
-def _check_recorded(settings: ExtractSettings) -> None:
-    """Raise UsageError for what only scenes have; `with_recording` decides captured_calls by itself."""
+def _check_source(settings: ExtractSettings) -> None:
+    """Raise UsageError for what only scenes have."""
+    recorded = isinstance(settings.source, LeRobotSource)
     given = {
         "--suite": settings.suite is not None,
         "--categories": settings.categories is not None,
         "--items": settings.items is not None,
         "--wordings": settings.wordings is not None,
         "--protocol": settings.protocol is not None,
-        "--execute": settings.execute is not None,
         "--rotation": settings.rotation is not None,
         "--video": settings.video != "none",
-        "--later-views": settings.later_views != "all",
         "--batch auto": settings.calibrate,
-        "edits": bool(settings.edits),
     }
+    if recorded:
+        why = "--dataset, which shows recorded frames and executes no action"
+        given |= {
+            "--execute": settings.execute is not None,
+            "--later-views": settings.later_views != "all",
+            "edits": bool(settings.edits),
+        }
+    else:
+        why = "--env, in which the model acts in its own units"
+        given |= {"--no-act": settings.capture_only, "--frames all": settings.frames == "all"}
     if meaningless := [option for option, is_given in given.items() if is_given]:
-        raise UsageError(
-            f"{', '.join(meaningless)} does not apply with --dataset, which shows recorded frames and executes no "
-            "action; remove it"
-        )
+        raise UsageError(f"{', '.join(meaningless)} does not apply with {why}; remove it")
     if settings.model in SCRIPTED:
         raise UsageError(f"{settings.model} is scripted and looks at nothing; choose a model with weights")
 
@@ -104,7 +110,7 @@ def check_unreachable(settings: ExtractSettings, card: ModelCard) -> None:
             f"--execute {settings.execute}: {settings.model} gives {card.chunk} actions per inference; execute "
             f"1 to {card.chunk} of them"
         )
-    execute, steps = settings.execute or card.execute, settings.scene.max_steps
+    execute, steps = settings.execute or card.execute, settings.episode_steps
     if card.ensemble is not None and execute != 1:
         raise UsageError(
             f"--execute {execute}: {settings.model} averages the plans of overlapping chunks, which needs an "

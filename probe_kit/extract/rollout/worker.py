@@ -13,17 +13,19 @@ import numpy as np
 from PIL import Image
 
 from probe_kit.env import save_gif
+from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.plan import PlannedEpisode, PlannedRow
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import ActingController
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import EpisodeLoop, Failure, Rollout
 from probe_kit.extract.rollout.events import Done, Event, Failed
+from probe_kit.extract.rollout.own_environments.environment_stage import EnvironmentStage, PlayedEnvironment
 from probe_kit.extract.rollout.question_loop import Asking
 from probe_kit.extract.rollout.recorded.recorded_stage import RecordedStage
 from probe_kit.extract.rollout.stage import AskableStage, LocalStage
 from probe_kit.extract.rollout.stage_process import ProcessStage
-from probe_kit.extract.run_layout import VIDEOS
+from probe_kit.extract.run_layout import VIDEOS, stored_inputs_of
 from probe_kit.extract.settings import RunSettings
 from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.extract.store.writer import RunWriter
@@ -72,12 +74,16 @@ class Worker:
         if wanted is None:
             wanted = 2 * self._settings.batch if self._episodes >= WORTH_PROCESSES else 0
         kind = ProcessStage if position < wanted else LocalStage
-        recorded = getattr(self._settings, "source", None)
-        stage: AskableStage = (
-            kind(self._settings.scene, self._controller.script, self._settings.frames)
-            if recorded is None
-            else kind(recorded, None, kind=RecordedStage)
-        )
+        settings, source = self._settings, getattr(self._settings, "source", None)
+        stage: AskableStage
+        if source is None:
+            stage = kind(settings.scene, self._controller.script, settings.frames)
+        elif isinstance(source, EnvSource):
+            facts = tuple(stored_inputs_of(self._writer.settings)["columns"])
+            played = PlayedEnvironment(source, facts, settings.stored_calls)
+            stage = kind(played, None, settings.frames, kind=EnvironmentStage)
+        else:
+            stage = kind(source, None, kind=RecordedStage)
         stack.callback(stage.close)
         return stage
 

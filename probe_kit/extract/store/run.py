@@ -23,6 +23,7 @@ from probe_kit.errors import (
 from probe_kit.extract.run_layout import (
     DATA,
     DATASET,
+    ENVIRONMENT,
     INPUTS,
     MEAN_VIEW,
     PROVENANCE,
@@ -30,6 +31,7 @@ from probe_kit.extract.run_layout import (
     ArrayKind,
     StoredStream,
     VectorKind,
+    stored_inputs_of,
 )
 from probe_kit.extract.store.certificates import read_certificate
 from probe_kit.extract.store.format.arrays import decode_bfloat16, open_array
@@ -187,23 +189,34 @@ class Run:
         return DATASET in self.settings
 
     @property
+    def in_own_environment(self) -> bool:
+        """Whether its episodes were played in an environment of the user's own: there are no sides."""
+        return ENVIRONMENT in self.settings
+
+    @property
     def suite(self) -> str:
-        """Identity of the suite that was run, `name@version#hash`; of recordings the data set's `name#hash`."""
+        """Identity of the suite that was run, `name@version#hash`.
+
+        Of recordings it is the data set's `name#hash`, of an environment of the user's own its `name@revision`.
+        """
         if self.recorded:
             return f"{self.settings['recording']['name']}#{self.settings[DATASET]['meta_blake2b'][:12]}"
+        if self.in_own_environment:
+            return f"{self.settings['played']['name']}@{self.settings[ENVIRONMENT]['revision']}"
         return str(self.settings["suite"]["identity"])
 
     @cached_property
     def inputs(self) -> StoredInputs | None:
-        """State, actions and small pictures of every recorded frame; None for a run that is not of recordings.
+        """State, actions and small pictures of every shown frame; None for a run of scenes.
 
         Raises ActivationsLeftOutError in a copy without activations.
         """
-        if not self.recorded:
+        source = stored_inputs_of(self.settings)
+        if not source:
             return None
         if any(name.startswith(f"{INPUTS}/") for name in self.root.left_out):
             self.root.refuse_left_out("there are no inputs")
-        return StoredInputs(self.data, self._numbers, self.settings[DATASET])
+        return StoredInputs(self.data, self._numbers, source)
 
     @property
     def suite_parent(self) -> str | None:

@@ -17,7 +17,16 @@ from zarr.storage import MemoryStore
 
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract.plan import PlannedRow, RowPlan
-from probe_kit.extract.run_layout import COMMITS, DATA, DATASET, FAILED, LABEL_FILE, PLANS, RUN_FILE, StoredStream
+from probe_kit.extract.run_layout import (
+    COMMITS,
+    DATA,
+    FAILED,
+    LABEL_FILE,
+    PLANS,
+    RUN_FILE,
+    StoredStream,
+    stored_inputs_of,
+)
 from probe_kit.extract.settings import check_other_settings
 from probe_kit.extract.store.certificates import write_certificate
 from probe_kit.extract.store.format.arrays import at_extent, create_arrays
@@ -126,9 +135,8 @@ class RunWriter:
         if "scene" in self.settings and not still:  # who is asked or captured does not move
             frames = self.settings["scene"]["max_steps"] + 1
             create_trajectories(store, 0, frames, self.settings["codec"])
-        if DATASET in self.settings:
-            shapes = self.settings[DATASET]["inputs"]
-            create_inputs(store, self.settings["captured_calls"], shapes, self.settings["codec"])
+        if source := stored_inputs_of(self.settings):
+            create_inputs(store, self.settings["captured_calls"], source["inputs"], self.settings["codec"])
         objects = {f"{DATA}/{key}": at_extent(value.to_bytes(), 0) for key, value in arrays.items()}
         root = new_root(self.settings, [self._without_length(one) for one in self.plan.streams], objects)
         return {**objects, LABEL_FILE: label_record(record_hash(root), self._label), RUN_FILE: root}

@@ -289,6 +289,15 @@ class Policy(Model):
         """
         return np.zeros(states.shape, bool)
 
+    def unusual_actions(self, actions: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(n, D) which numbers of recorded actions (n, D) lie far outside the checkpoint's own statistics."""
+        return np.zeros(actions.shape, bool)
+
+    @property
+    def predicts_relative(self) -> bool:
+        """Whether `predict` gives changes relative to the state, where a data set has the actions themselves."""
+        return False
+
     def predict(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per recorded observation, in the checkpoint's own units and width.
 

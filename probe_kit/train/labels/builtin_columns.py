@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.extract.store.recorded.action_errors import compare_actions, why_not_compared
 from probe_kit.train.choices import Task
 from probe_kit.train.data.captured_call import captured_calls
 from probe_kit.train.data.run_reader import RunReader
@@ -16,7 +17,11 @@ from probe_kit.train.labels.label_table import EPISODE, INFERENCE, Cell
 if TYPE_CHECKING:
     import pandas as pd
 
-SIM, ITEM, RECORDED = "sim.", "item.", "dataset."
+SIM, ITEM, RECORDED, PLAYED = "sim.", "item.", "dataset.", "env."
+ACTION_ERROR = "action_error"
+"""Of a shown frame: root mean square of predicted minus recorded first action, in recorded deviations."""
+OUTCOME = "env.outcome"
+"""Whether an episode in an environment of one's own succeeded, once per episode."""
 PHASES = ("before grasp", "holding", "after release")
 
 
@@ -113,27 +118,44 @@ def builtin_column(run: RunReader, name: str) -> BuiltinColumn:
     if name.startswith(ITEM) and name.removeprefix(ITEM) in ITEM_COLUMNS:
         ids = tuple(run.episodes[EPISODE].astype(str))
         return BuiltinColumn("classes", ids, None, tuple(_of_item(run, name.removeprefix(ITEM))))
-    if name.startswith(RECORDED):
-        return _of_recording(run, name.removeprefix(RECORDED))
+    if name == OUTCOME and OUTCOME in outcome_column(run):
+        outcomes = tuple(run.episodes["outcome"].astype(str))
+        return BuiltinColumn("binary", tuple(run.episodes[EPISODE].astype(str)), None, outcomes)
+    if name.startswith((RECORDED, PLAYED)):
+        return _of_source(run, name)
     raise UsageError(f"there is no built-in column {name!r}; there are: {', '.join(builtin_names())}")
 
 
-def _of_recording(run: RunReader, name: str) -> BuiltinColumn:
-    """A column of the data set for every shown frame: a feature of one number, `state.NAME` or `action.NAME`."""
-    columns = recorded_columns(run)
-    if name not in columns:
-        there = ", ".join(RECORDED + one for one in columns) or "none, because the run is not of recordings"
-        raise UsageError(f"{run.location} has no column {RECORDED}{name}; there are: {there}")
+def _of_source(run: RunReader, name: str) -> BuiltinColumn:
+    """A column of the data set or environment for every shown frame, such as `dataset.state.x` or `env.held`."""
+    prefix, columns = prefix_of(run), recorded_columns(run)
+    wanted = name.removeprefix(prefix)
+    if not name.startswith(prefix) or wanted not in columns:
+        asked = "recordings" if name.startswith(RECORDED) else "an environment of your own"
+        there = ", ".join(prefix + one for one in columns) or f"none, because the run is not of {asked}"
+        raise UsageError(f"{run.location} has no column {name}; there are: {there}")
     found = list(_inferences(run))
     rows = _rows(run, [episode for episode, _ in found])
     calls = [call for _, call in found]
-    cells = tuple(_finite(float(value)) for value in columns[name][rows, calls])
+    cells = tuple(_finite(float(value)) for value in columns[wanted][rows, calls])
     episodes, inferences = zip(*found, strict=True)
     return BuiltinColumn(None, episodes, inferences, cells)
 
 
+def prefix_of(run: RunReader) -> str:
+    """In front of the columns of a run's own source."""
+    return PLAYED if getattr(run, "in_own_environment", False) else RECORDED
+
+
+def outcome_column(run: RunReader) -> dict[str, list[str]]:
+    """The column `env.outcome`, a text per episode; empty for a run in which all episodes end alike."""
+    if not getattr(run, "in_own_environment", False) or run.episodes["outcome"].nunique() < 2:
+        return {}
+    return {OUTCOME: run.episodes["outcome"].astype(str).tolist()}
+
+
 def recorded_columns(run: RunReader) -> dict[str, NDArray[np.float64]]:
-    """(E, C) values of the data set by name, of every shown frame; none for a run that is not of recordings."""
+    """(E, C) values of data set or environment by name, of every shown frame; none for a run of scenes."""
     inputs = getattr(run, "inputs", None)
     if inputs is None:
         return {}
@@ -143,6 +165,8 @@ def recorded_columns(run: RunReader) -> dict[str, NDArray[np.float64]]:
             values = inputs.read(kind)
             now = values if kind == "state" else values[:, :, 0]
             found |= {f"{kind}.{name}": now[..., place].astype(np.float64) for place, name in enumerate(names)}
+    if getattr(run, "recorded", False) and why_not_compared(run) is None:  # type: ignore[arg-type]  # only runs have inputs
+        found[ACTION_ERROR] = compare_actions(run).of_frames[0]  # type: ignore[arg-type]
     return found
 
 
@@ -156,7 +180,8 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
 
     Besides the keys `episode_id` and `inference` there are `control_step`, `group_id`, `category` and the built-in
     columns that the run has; one without trajectories or control steps has no `sim.*`, see `why_no_sim`. Of
-    recordings there are `source_episode`, `frame`, `instruction` and the columns `dataset.*` instead.
+    recordings there are `source_episode`, `frame`, `instruction` and the columns `dataset.*` instead, of an
+    environment of one's own `instruction` and `env.*`.
     """
     import pandas as pd
 
@@ -172,12 +197,16 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
         steps = run.control_steps  # type: ignore[attr-defined]
         table["source_episode"] = run.episodes["source_episode"].iloc[rows].tolist()
         table["frame"] = steps[rows, list(inferences)].tolist()
+    if getattr(run, "in_own_environment", False):
+        table["control_step"] = run.control_steps[rows, list(inferences)].tolist()  # type: ignore[attr-defined]
+    if getattr(run, "inputs", None) is not None:
         table["instruction"] = run.episodes["instruction"].iloc[rows].tolist()
-        sim = {RECORDED + name: own[rows, list(inferences)] for name, own in recorded_columns(run).items()}
+        sim = {prefix_of(run) + name: own[rows, list(inferences)] for name, own in recorded_columns(run).items()}
+        sim |= {name: [cells[row] for row in rows] for name, cells in outcome_column(run).items()}
     for name in ("group_id", "category"):
         table[name] = run.episodes[name].iloc[rows].tolist()
     table |= sim
-    for name in () if getattr(run, "recorded", False) else ITEM_COLUMNS:
+    for name in ITEM_COLUMNS if getattr(run, "inputs", None) is None else ():
         if set(_needed(name)) <= set(run.episodes):
             cells = list(_of_item(run, name))
             table[ITEM + name] = [cells[row] for row in rows]

@@ -173,7 +173,7 @@ def prepare_controls(
     left_out: dict[str, str] = {name: impossible[name] for name in asked if name in impossible}
     chosen = [name for name in asked if name not in impossible]
     suite = None
-    if PICTURED.intersection(chosen) and not getattr(run, "recorded", False):
+    if PICTURED.intersection(chosen) and getattr(run, "inputs", None) is None:
         try:
             suite = suite_of(run, folder)
         except SuiteNotFoundError as error:

@@ -11,8 +11,16 @@ import pytest
 from PIL import Image
 
 from probe_kit.env import SceneSpec
-from probe_kit.errors import RecordingError, SettingsMismatchError
-from probe_kit.extract import ExtractSettings, LeRobotSource, Run, extract_run, prepare, verify_run
+from probe_kit.errors import RecordingError, SettingsMismatchError, UsageError
+from probe_kit.extract import (
+    ExtractSettings,
+    LeRobotSource,
+    Run,
+    compare_actions,
+    extract_run,
+    prepare,
+    verify_run,
+)
 from probe_kit.extract.plan import Plan
 from probe_kit.extract.recordings.lerobot_folder import LeRobotFrames, as_bytes, open_lerobot
 from probe_kit.extract.recordings.recorded_plan import SIDE, RecordedPlan
@@ -113,6 +121,31 @@ def test_predictions_are_what_the_policy_acts_in_a_scene(run: Run, pi0_tiny: Pi0
         [observations()[0][0]], [Turn(observations()[0][0], seed, 0, None).derived_seed("inference")]
     )  # type: ignore[arg-type]
     np.testing.assert_array_equal(run.inputs.read("prediction")[0, 0], own[0])
+
+
+def test_predicted_actions_are_compared_with_recorded_ones_in_their_units(run: Run) -> None:
+    """Recorded actions are 10 × episode + frame, far outside what the policy was trained on."""
+    assert run.settings["recording"]["other_actions"].startswith("recorded actions lie outside the statistics")
+    with pytest.raises(UsageError, match="not compared: recorded actions lie outside"):
+        compare_actions(run)
+
+
+def test_actions_within_the_statistics_are_compared(pi0_tiny: Pi0, tmp_path: Path) -> None:
+    folder = write_recording(tmp_path / "rec", observations(1, 4))
+    action = np.array([0.001, 0.002, 0.003, 0, 0, 0, 1], np.float32)
+    rewrite(folder, lambda table: table.assign(action=[action] * len(table)))
+    found = shown(folder, tmp_path / "run", pi0_tiny)
+    errors = compare_actions(found)
+    assert found.inputs is not None
+    predicted = found.inputs.read("prediction")[0, :, 0]
+    np.testing.assert_allclose(errors.errors[0, :4, 0], predicted[:4] - action, atol=1e-6)
+    assert np.isnan(errors.by_number["first"]).all(), "constant numbers have no deviation to count in"
+
+
+def test_actions_of_another_count_are_not_compared(pi0_tiny: Pi0, tmp_path: Path) -> None:
+    folder = write_recording(tmp_path / "rec", observations(1, 2), actions=6)
+    with pytest.raises(UsageError, match="the policy predicts 7 numbers, the data set has 6"):
+        compare_actions(shown(folder, tmp_path / "run", pi0_tiny))
 
 
 def test_pictures_leave_lerobot_as_the_bytes_that_were_written(recording: Path) -> None:

@@ -17,7 +17,7 @@ def describe_recording(recording: Recording) -> dict[str, str]:
     folder, lengths = recording.folder, [recording.folder.lengths[one] for one in recording.episodes]
     every = recording.source.every
     chosen = sum(-(-length // every) for length in lengths)
-    texts = recording.instructions()
+    texts = recording.instructions
     more = f" and {len(texts) - _LONGEST} more" if len(texts) > _LONGEST else ""
     return {
         "data set": recording.source.name + (f"@{folder.revision}" if folder.revision else ""),
@@ -45,6 +45,9 @@ def describe_fit(fitted: Fitted) -> tuple[dict[str, str], list[str]]:
         "shown": "; ".join(cameras) + (f"; without a picture: {', '.join(masked)}" if masked else ""),
         "predicts": f"{chunk} actions of {width} numbers; the data set has {recorded or 'no actions'}"
         + (f" of {recorded} numbers" if recorded and recorded != width else ""),
+        "actions": "not compared: " + fitted.other_actions
+        if fitted.other_actions
+        else "compared with the recorded ones, see `probe-kit dataset errors`",
         "state": _shares(fitted),
     }
     names = recording.folder.names(STATE) if fitted.unusual.size else []

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import ObservationError, PolicyFailedError, RecordingError
 from probe_kit.extract.recordings.lerobot_folder import fetched
-from probe_kit.extract.recordings.lerobot_source import STATE
+from probe_kit.extract.recordings.lerobot_source import ACTION, STATE
 from probe_kit.extract.recordings.recorded_plan import Recording
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
 from probe_kit.extract.rollout.recorded.recorded_stage import example_of
@@ -33,7 +33,7 @@ class RecordedController(PolicyController):
 
     def _chunks(self, turns: Sequence[Turn], seeds: Sequence[int]) -> NDArray[np.float32]:
         chunks = self.policy.predict(copied([turn.seen for turn in turns]), list(seeds))
-        _check_predictions(chunks, len(turns))
+        check_predictions(chunks, len(turns))
         return np.array(chunks)
 
     def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -50,13 +50,15 @@ class Fitted:
     """A recording with its cameras mapped, and a policy that was found to take it.
 
     prediction: (chunk, D). unusual: (D,) share of the chosen frames whose number of the state is unusual; empty
-    where the policy normalises none.
+    where the policy normalises none. other_actions: why recorded actions are not what it predicts; None if they
+    are.
     """
 
     recording: Recording
     policy: "Policy"
     prediction: tuple[int, int]
     unusual: NDArray[np.float64]
+    other_actions: str | None = None
 
 
 def fit(recording: Recording, policy: "Policy") -> Fitted:
@@ -72,18 +74,21 @@ def fit(recording: Recording, policy: "Policy") -> Fitted:
         policy = policy.with_cameras([camera for camera, _ in recording.source.cameras])
     except ObservationError as error:
         raise RecordingError(f"{error}. Map the model's first cameras with --camera") from error
-    unusual = _unusual(recording, policy)
-    example = example_of(recording, recording.instructions()[0])
+    _check_state(recording, policy)
+    numbers = _chosen_numbers(recording)
+    unusual = _unusual(recording, policy, numbers.get(STATE))
+    example = example_of(recording, recording.instructions[0])
     with while_acting(policy.card.family, policy.card.checkpoint):
         chunk = policy.predict(copied([example]), [0])
-        _check_predictions(chunk, 1)
-    return Fitted(recording, policy, (chunk.shape[1], chunk.shape[2]), unusual)
+        check_predictions(chunk, 1)
+    other_actions = _other_actions(recording, policy, chunk.shape[2], numbers.get(ACTION))
+    return Fitted(recording, policy, (chunk.shape[1], chunk.shape[2]), unusual, other_actions)
 
 
 def recorded_controller(fitted: Fitted, settings: ExtractSettings) -> RecordedController:
     """The controller of a run on a recording."""
     recording = fitted.recording
-    examples = [example_of(recording, text) for text in recording.instructions()]
+    examples = [example_of(recording, text) for text in recording.instructions]
     controller = RecordedController(
         fitted.policy, settings.model, examples, None, settings.stored_calls, settings.tokens == "all",
         limit=settings.inference_limit,
@@ -92,23 +97,52 @@ def recorded_controller(fitted: Fitted, settings: ExtractSettings) -> RecordedCo
     return controller
 
 
-def _unusual(recording: Recording, policy: "Policy") -> NDArray[np.float64]:
+def _check_state(recording: Recording, policy: "Policy") -> None:
+    """Raise RecordingError unless the recorded state has as many numbers as the policy reads."""
     folder, expected = recording.folder, policy.state_numbers
     width = folder.width(STATE)
-    if expected is None:
-        return np.zeros(0)
-    if width != expected:
+    if expected is not None and width != expected:
         seen = "no " + STATE if width is None else f"{width} numbers as {STATE}"
         raise RecordingError(
             f"{folder.path.name} has {seen}; {policy.card.checkpoint} reads {expected}. Take the data set's own "
             "checkpoint, or a data set of this robot"
         )
-    rows = [recording.reader.numbers(one, [STATE])[STATE][:: recording.source.every] for one in recording.episodes]
-    states = np.concatenate(rows).astype(np.float32)
+
+
+def _chosen_numbers(recording: Recording) -> dict[str, NDArray[np.float32]]:
+    """(n, D) state and action of every chosen frame, as far as they are recorded."""
+    wanted = [name for name in (STATE, ACTION) if recording.folder.width(name) is not None]
+    found = [recording.reader.numbers(one, wanted) for one in recording.episodes]
+    every = recording.source.every
+    return {name: np.concatenate([one[name][::every] for one in found]).astype(np.float32) for name in wanted}
+
+
+def _unusual(recording: Recording, policy: "Policy", states: NDArray[np.float32] | None) -> NDArray[np.float64]:
+    if states is None or policy.state_numbers is None:
+        return np.zeros(0)
     if not np.isfinite(states).all():
-        raise RecordingError(f"{folder.path.name}: {STATE} holds NaN or infinity; leave such episodes out")
+        name = recording.folder.path.name
+        raise RecordingError(f"{name}: {STATE} holds NaN or infinity; leave such episodes out")
     shares: NDArray[np.float64] = policy.unusual_states(states).mean(axis=0)
     return shares
+
+
+def _other_actions(
+    recording: Recording, policy: "Policy", predicted: int, actions: NDArray[np.float32] | None
+) -> str | None:
+    """Why the recorded actions are not what a policy predicts; None if they are, as far as anything says."""
+    if actions is None:
+        return "the data set has no actions"
+    if actions.shape[1] != predicted:
+        return f"the policy predicts {predicted} numbers, the data set has {actions.shape[1]}"
+    if policy.predicts_relative:
+        return "the policy predicts changes relative to the state (use_relative_actions)"
+    shares = policy.unusual_actions(actions).mean(axis=0)
+    if not (shares > MOST_UNUSUAL).any():
+        return None
+    names = recording.folder.names(ACTION)
+    far = ", ".join(f"{names[one]} {shares[one]:.0%}" for one in np.flatnonzero(shares > MOST_UNUSUAL))
+    return f"recorded actions lie outside the statistics of the checkpoint ({far}), so the units differ"
 
 
 def check_units(fitted: Fitted) -> None:
@@ -125,7 +159,7 @@ def check_units(fitted: Fitted) -> None:
     )
 
 
-def _check_predictions(chunks: Any, count: int) -> None:
+def check_predictions(chunks: Any, count: int) -> None:
     """Raise PolicyFailedError unless these are (count, chunk, D) float32."""
     if not (
         isinstance(chunks, np.ndarray) and chunks.ndim == 3 and len(chunks) == count and chunks.dtype == np.float32

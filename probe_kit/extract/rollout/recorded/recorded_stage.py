@@ -74,7 +74,7 @@ class RecordedStage(TimedStage):
             self._keep("state", state)
         self._keep("columns", np.array([self._numbers[name][frame, 0] for name in recording.folder.columns]))
         if recording.source.pixels:
-            self._keep("pixels", np.stack([_small(picture) for picture in pictures.values()]))
+            self._keep("pixels", np.stack([small_picture(picture) for picture in pictures.values()]))
         return observation_of(pictures, state, self._planned.instruction)
 
     def _keep(self, name: str, values: NDArray[Any]) -> None:
@@ -118,6 +118,6 @@ def _ahead(actions: NDArray[np.float64], frame: int, count: int) -> NDArray[np.f
     return found
 
 
-def _small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def small_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """(SIDE, SIDE, 3): each pixel the mean of its part of the picture."""
     return np.asarray(Image.fromarray(picture).resize((SIDE, SIDE), Image.Resampling.BOX))

@@ -130,10 +130,11 @@ def read_plans(location: Location, run: str, check_row: Callable[[Row, str], Non
 def _check_selection(record: Mapping[str, Any], name: str) -> None:
     """Raise RunDamagedError unless a record says what was selected of which suite or recording."""
     selection, where = record["selection"], f"{name}: the selection"
-    if "recording" in selection:
-        expect(selection, {"recording": dict}, where, RESTORE)
-        expect(selection["recording"], {"name": str, "episodes": list}, where, RESTORE)
-        return
+    for source in ("recording", "played"):
+        if source in selection:
+            expect(selection, {source: dict}, where, RESTORE)
+            expect(selection[source], {"name": str, "episodes": list}, where, RESTORE)
+            return
     expect(selection, _SELECTION, where, RESTORE)
     expect(selection["suite"], {"identity": str, "content_sha256": str}, where, RESTORE)
     if "wordings" in selection:

@@ -19,6 +19,7 @@ from probe_kit.errors import (
 from probe_kit.extract.run_layout import (
     DATA,
     DATASET,
+    ENVIRONMENT,
     FORMER_PLAN_FILE,
     INPUTS,
     MEAN_VIEW,
@@ -29,6 +30,7 @@ from probe_kit.extract.run_layout import (
     LaterViews,
     StoredStream,
     VectorKind,
+    stored_inputs_of,
 )
 from probe_kit.extract.store.format.arrays import at_extent, extent_of
 from probe_kit.extract.store.format.hashes import (
@@ -62,7 +64,14 @@ _STRETCH = {
     **dict.fromkeys(("episode", "source_episode", "first_frame", "frame_step", "frames"), int),
 }
 """The same of a run on recordings."""
-_RECORDED = {"meta_blake2b": str, "inputs": dict, "columns": list, "names": dict}
+_PLAYED = {
+    **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "instruction"), str),
+    **dict.fromkeys(("episode", "env_episode", "env_seed"), int),
+}
+"""The same of a run in an environment of the user's own."""
+_INPUTS = {"inputs": dict, "columns": list, "names": dict}
+_OF_SOURCES = {DATASET: {"meta_blake2b": str, **_INPUTS}, ENVIRONMENT: {"revision": str, **_INPUTS}}
+"""What settings say of recordings, or of an environment."""
 _WITH_ITEM_HASHES = 4
 """The first schema whose plan holds item hashes and the suite's parent."""
 _WITH_PLANS = 5
@@ -270,6 +279,8 @@ class Root:
     def _episode_parts(self) -> dict[str, type]:
         if DATASET in self.own_settings:
             return _STRETCH
+        if ENVIRONMENT in self.own_settings:
+            return _PLAYED
         return _EPISODE if self.schema < _WITH_ITEM_HASHES else {**_EPISODE, "item_content_sha256": str}
 
     @cached_property
@@ -285,7 +296,7 @@ class Root:
         arrays = {
             name: axes for one in streams for name, axes in one.arrays(with_tokens, self.later_views).items()
         }
-        shapes = self.own_settings.get(DATASET, {}).get("inputs", {})
+        shapes = stored_inputs_of(self.own_settings).get("inputs", {})
         return {**arrays, **{f"{INPUTS}/{name}": 2 + len(shape) for name, shape in shapes.items()}}
 
     @property
@@ -340,9 +351,10 @@ def find_root(location: Location) -> Root | None:
     settings = in_current_words(card["settings"], "settings")
     there = {part: kind for part, kind in _FURTHER.items() if part in settings}
     expect(settings, {**_SETTINGS, **there}, f"{name}: the settings", RESTORE)
-    if DATASET in settings:
-        expect(settings, {DATASET: dict}, f"{name}: the settings", RESTORE)
-        expect(settings[DATASET], _RECORDED, f"{name}: the data set", RESTORE)
+    for source, parts in _OF_SOURCES.items():
+        if source in settings:
+            expect(settings, {source: dict}, f"{name}: the settings", RESTORE)
+            expect(settings[source], parts, f"{name}: the {source}", RESTORE)
     check_sums(card["objects"], name, RESTORE)
     streams = _read_streams(card["streams"], name)
     root = Root(location, card, settings, card[HASH], streams, read_sums(card["objects"]))

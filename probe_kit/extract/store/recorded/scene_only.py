@@ -1,14 +1,21 @@
-"""Refusal of what only runs of scenes have: sides, outcomes, and a scene that can be played again."""
+"""Refusal of what only runs of scenes have: sides, outcomes by rule, and a scene that can be played again."""
 
 from probe_kit.errors import UsageError
 
 
 def check_scene_run(run: object, wanted: str) -> None:
-    """Raise UsageError for a run on recordings. wanted: what is not possible with it, in a word."""
+    """Raise UsageError for a run on recordings or in an environment of the user's own.
+
+    wanted: what is not possible with it, in a word.
+    """
     if getattr(run, "recorded", False):
-        where, shown = getattr(run, "location", run), getattr(run, "suite", "")
-        raise UsageError(
-            f"{where} shows recordings ({shown}), and its model did not act. There are no sides and no success "
-            f"rate, so {wanted} is not possible. Decode labels of your own: `probe-kit train RUN --labels FILE "
-            "--target COLUMN`"
-        )
+        reason = "shows recordings ({}), and its model did not act. There are no sides and no success rate"
+    elif getattr(run, "in_own_environment", False):
+        reason = "plays an environment of your own ({}). There are no sides and no scene of the protocol"
+    else:
+        return
+    where, shown = getattr(run, "location", run), getattr(run, "suite", "")
+    raise UsageError(
+        f"{where} {reason.format(shown)}, so {wanted} is not possible. Decode labels of your own: "
+        "`probe-kit train RUN --labels FILE --target COLUMN`"
+    )

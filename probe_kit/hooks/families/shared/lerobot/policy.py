@@ -194,6 +194,11 @@ class LerobotPolicy(Policy):
             raise CheckpointError(
                 f"{folder} holds a {config.type!r} policy; expected {cls.config_type}. Pass the right --model"
             )
+        if (frames := int(getattr(config, "n_obs_steps", 1))) != 1:
+            raise CheckpointError(
+                f"{folder} reads the last {frames} observations (n_obs_steps); every inference here is given one. "
+                "Take a checkpoint with n_obs_steps 1"
+            )
         # Compiled graphs drop hooks, and real-time chunking mixes in actions of the chunk before.
         config.compile_model = False
         config.rtc_config = None
@@ -268,6 +273,15 @@ class LerobotPolicy(Policy):
     def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
         return self.state_units.unusual(states)
+
+    def unusual_actions(self, actions: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
+        return self.action_units.unusual(actions)
+
+    @property
+    def predicts_relative(self) -> bool:
+        """As the configuration says: lerobot adds the state behind the policy, which is not done here."""
+        return bool(getattr(self.config, "use_relative_actions", False))
 
     def embodiment_mismatch(self) -> str | None:
         """Other actions than an end-effector delta, another state, or no units for either."""

@@ -1,0 +1,183 @@
+"""`--env lerobot:TYPE`: the environments that lerobot configures, with lerobot's own processors.
+
+The simulators are packages of their own; without one, its name is said and nothing is played.
+"""
+
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stdout
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._system.optional_dependencies import require
+from probe_kit.errors import MissingExtraError, OwnEnvironmentError, UsageError
+from probe_kit.extract.own_environments.contract import SUCCESS, EnvEpisode, Step
+from probe_kit.hooks.contract.observation import Observation
+
+IMAGE, IMAGES, STATE = "observation.image", "observation.images.", "observation.state"
+PER_TASK = 20
+"""Episodes per task where none are named."""
+
+
+class LeRobotEnvironment:
+    """The environments of one `EnvConfig` of lerobot: every task, with a number of seeds each.
+
+    kind: lerobot's name, such as `libero`, `pusht`, `aloha` or `metaworld`. per_task: episodes of a task.
+    instruction: what the model reads where the environment has no text. options: fields of the configuration, as
+    text or values. Raises UsageError for an unknown name or field, and for one whose code is fetched from the hub;
+    MissingExtraError without the simulator.
+    """
+
+    def __init__(
+        self, kind: str, per_task: int | str = PER_TASK, instruction: str | None = None, **options: Any
+    ) -> None:
+        self._kind, self._per_task, self._instruction = kind, int(per_task), instruction
+        self._config = _configuration(kind, {name: _value(value) for name, value in options.items()})
+        self._before, self._after = self._config.get_env_processors()
+        self._tasks = self._created()
+        self._environment: Any = None
+        first = next(iter(self._tasks.values()))
+        self.action_names = tuple(str(place) for place in range(int(first.action_space.shape[-1])))
+        self.revision = f"lerobot {version('lerobot')}, {kind} {self._config.task or ''}".strip() + _simulator(
+            kind
+        )
+
+    def _created(self) -> dict[str, Any]:
+        """By task, its only environment, not vectorised."""
+        with _naming_simulator(self._kind):
+            made = self._config.create_envs(n_envs=1, use_async_envs=False)
+        return {
+            f"{suite}-{number}": vector.envs[0]
+            for suite, tasks in made.items()
+            for number, vector in tasks.items()
+        }
+
+    def episodes(self) -> Iterator[EnvEpisode]:
+        """Every task with the seeds 0, 1, 2 …; a task is a group."""
+        for task, environment in self._tasks.items():
+            text = self._instruction or _text(environment)
+            if not text:
+                raise OwnEnvironmentError(
+                    f"lerobot:{self._kind} has no instruction for {task}; give one with "
+                    "--env-option instruction=TEXT"
+                )
+            for seed in range(self._per_task):
+                yield EnvEpisode(f"{task}/{seed:04d}", seed, text, task)
+
+    def reset(self, episode: EnvEpisode) -> Step:
+        """Set a task up from the episode's seed; where a task has stored beginnings, seed n is the n-th."""
+        self._episode = episode
+        self._environment = self._tasks[str(episode.group)]
+        inner = self._environment.unwrapped
+        if hasattr(inner, "init_state_id"):
+            inner.init_state_id = episode.seed
+        with _naming_simulator(self._kind):  # some are imported at the first reset
+            seen, _ = self._environment.reset(seed=episode.seed)
+        return Step(self._observed(seen))
+
+    def step(self, action: NDArray[np.float32]) -> Step:
+        """Execute an action behind lerobot's processor of actions."""
+        import torch
+
+        passed = self._after({"action": torch.from_numpy(action)[None]})["action"]
+        seen, reward, terminated, truncated, info = self._environment.step(np.asarray(passed[0], np.float32))
+        facts = {"reward": float(reward), SUCCESS: bool(info.get("is_success", False))}
+        return Step(self._observed(seen), bool(terminated or truncated), facts)
+
+    def close(self) -> None:
+        """Close every task."""
+        for environment in self._tasks.values():
+            environment.close()
+
+    def _observed(self, seen: Mapping[str, Any]) -> Observation:
+        """What lerobot shows its policies: its names, its order of states, its turned pictures."""
+        from lerobot.envs.utils import preprocess_observation
+
+        found = self._before(preprocess_observation(_batched(seen)))
+        pictures = {name: _picture(found[name]) for name in found if name == IMAGE or name.startswith(IMAGES)}
+        if not pictures or STATE not in found:
+            raise OwnEnvironmentError(
+                f"lerobot:{self._kind} shows {', '.join(sorted(found))}; expected pictures and {STATE}"
+            )
+        first, *others = pictures
+        further = {name.removeprefix(IMAGES): pictures[name] for name in others}
+        state = np.asarray(found[STATE][0], np.float32)
+        return Observation(pictures[first], state, self._episode.instruction, None, further)
+
+
+@contextmanager
+def _naming_simulator(kind: str) -> Iterator[None]:
+    """What lerobot prints goes to stderr. Raises MissingExtraError naming a simulator that is not installed."""
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    except ImportError as error:
+        raise MissingExtraError(
+            f"lerobot:{kind} needs a simulator that is not installed: {str(error).rstrip('.')}. Install it as "
+            f"lerobot's page on {kind} says, such as `pip install 'lerobot[{kind}]'`"
+        ) from error
+
+
+def _configuration(kind: str, options: Mapping[str, Any]) -> Any:
+    require("lerobot", "lerobot")
+    from lerobot.envs.configs import EnvConfig, HubEnvConfig
+
+    known = EnvConfig.get_known_choices()
+    if kind not in known:
+        raise UsageError(
+            f"--env lerobot:{kind}: lerobot has no such environment; it has {', '.join(sorted(known))}"
+        )
+    chosen = known[kind]
+    if issubclass(chosen, HubEnvConfig):
+        raise UsageError(
+            f"--env lerobot:{kind} would run code from the hub; write an environment of your own for it"
+        )
+    if not hasattr(chosen, "create_envs") or kind == "gym_manipulator":
+        raise UsageError(f"--env lerobot:{kind} is no simulation; choose one of {', '.join(sorted(known))}")
+    try:
+        return chosen(**options)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"--env lerobot:{kind} cannot be configured so: {error}. Change --env-option") from error
+
+
+def _value(text: Any) -> Any:
+    """A number, list or truth value that a text spells, else the text."""
+    if not isinstance(text, str):
+        return text
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def _simulator(kind: str) -> str:
+    """The version of the package that simulates, where it has the usual name."""
+    for name in (f"gym-{kind}", kind, f"hf-{kind}"):
+        try:
+            return f", {name} {version(name)}"
+        except PackageNotFoundError:
+            continue
+    return ""
+
+
+def _text(environment: Any) -> str | None:
+    inner = environment.unwrapped
+    found = getattr(inner, "task_description", None) or getattr(inner, "task", None)
+    return str(found) if found else None
+
+
+def _batched(seen: Any) -> Any:
+    """The arrays of an observation with a first axis of one, as lerobot's processors expect."""
+    if isinstance(seen, Mapping):
+        return {name: _batched(value) for name, value in seen.items()}
+    return np.asarray(seen)[None]
+
+
+def _picture(floats: Any) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 of lerobot's (1, 3, H, W) floats in [0, 1]."""
+    values = np.asarray(floats[0], np.float32).transpose(1, 2, 0)
+    return np.ascontiguousarray(np.rint(255 * values).astype(np.uint8))

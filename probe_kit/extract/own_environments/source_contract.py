@@ -1,0 +1,219 @@
+"""The check of an environment of the user's own: what the rest of probe_kit relies on, promise by promise."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from probe_kit.errors import ProbeKitError
+from probe_kit.extract.own_environments.contract import EnvEpisode, OwnEnvironment, Step
+from probe_kit.extract.own_environments.env_source import EnvSource
+from probe_kit.extract.own_environments.opening import (
+    begun,
+    checked_step,
+    fact_values,
+    listed_episodes,
+    naming_environment,
+    open_environment,
+)
+
+STEPS = 5
+"""Actions per episode that the check executes."""
+EPISODES = 2
+_SIZE = 0.01
+"""Standard deviation of their numbers: small in metres, in radians and in normalised units."""
+
+
+@dataclass(frozen=True)
+class EnvironmentCheck:
+    """One promise of the contract. problem: what was seen and expected; empty where the promise holds."""
+
+    name: str
+    sentence: str
+    problem: str = ""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the promise holds."""
+        return not self.problem
+
+
+class _Trial:
+    """An environment under check, and what its first episodes showed."""
+
+    def __init__(self, source: EnvSource) -> None:
+        self.source = source
+        self.environment: OwnEnvironment | None = None
+        self.episodes: list[EnvEpisode] = []
+        self.shown: list[list[Step]] = []
+
+    def open(self) -> None:
+        self.environment = open_environment(self.source)
+
+    def list_episodes(self) -> None:
+        environment = self._opened
+        first, second = (listed_episodes(environment, self.source) for _ in range(2))
+        if first != second:
+            raise _BrokenError(
+                "episodes() gave another list the second time; expected the same, in the same order"
+            )
+        self.episodes = [episode for _, episode in first[:EPISODES]]
+
+    def play(self) -> None:
+        self.shown = [self._play(self._opened, episode) for episode in self._chosen]
+
+    def facts_are_constant(self) -> None:
+        after = [step for steps in self._played for step in steps[1:]]
+        names = sorted(after[0].facts) if after else []
+        for steps in self._played:
+            for number, step in enumerate(steps):
+                if number or step.facts:
+                    fact_values(step.facts, names, f"{self.source.name}, step() {number}")
+
+    def repeats(self) -> None:
+        """The first episode again, behind the other one."""
+        again = self._play(self._opened, self._chosen[0])
+        _check_equal(self._played[0], again, "the same episode, played again behind another one")
+
+    def repeats_elsewhere(self) -> None:
+        """In a new environment, as each process opens its own."""
+        other = open_environment(self.source)
+        try:
+            again = self._play(other, self._chosen[0])
+        finally:
+            self._close(other)
+        _check_equal(self._played[0], again, "the same episode in a second environment")
+
+    def is_not_written_to(self) -> None:
+        """Pictures that were shown must not change at later steps."""
+        environment, episode = self._opened, self._chosen[0]
+        first = self._begin(environment, episode).observation
+        picture, state = first.image.copy(), first.state.copy()
+        self._step(environment, episode, 1)
+        if not (np.array_equal(picture, first.image) and np.array_equal(state, first.state)):
+            raise _BrokenError("step() changed a picture or state that was shown before; expected copies")
+
+    def close(self) -> None:
+        if self.environment is not None:
+            self._close(self.environment)
+
+    def _close(self, environment: OwnEnvironment) -> None:
+        with naming_environment(self.source.name, "close()"):
+            environment.close()
+
+    @property
+    def _opened(self) -> OwnEnvironment:
+        if self.environment is None:
+            raise _BrokenError("the environment is not open, see above")
+        return self.environment
+
+    @property
+    def _chosen(self) -> list[EnvEpisode]:
+        if not self.episodes:
+            raise _BrokenError("there are no episodes, see above")
+        return self.episodes
+
+    @property
+    def _played(self) -> list[list[Step]]:
+        if not self.shown:
+            raise _BrokenError("no episode was played, see above")
+        return self.shown
+
+    def _play(self, environment: OwnEnvironment, episode: EnvEpisode) -> list[Step]:
+        steps = [_copied(self._begin(environment, episode))]
+        while len(steps) <= STEPS and not steps[-1].done:
+            steps.append(_copied(self._step(environment, episode, len(steps))))
+        return steps
+
+    def _begin(self, environment: OwnEnvironment, episode: EnvEpisode) -> Step:
+        with naming_environment(self.source.name, "reset()"):
+            answer = environment.reset(episode)
+        return begun(answer, episode, self.source.name)
+
+    def _step(self, environment: OwnEnvironment, episode: EnvEpisode, number: int) -> Step:
+        draw = np.random.default_rng([episode.seed, number])
+        action = (_SIZE * draw.normal(size=len(environment.action_names))).astype(np.float32)
+        with naming_environment(self.source.name, "step()"):
+            answer = environment.step(action)
+        return checked_step(answer, episode, f"{self.source.name}, step() {number}")
+
+
+class _BrokenError(ProbeKitError):
+    """A promise is broken."""
+
+
+_CHECKS: Sequence[tuple[str, str, Callable[[_Trial], None]]] = (
+    (
+        "it_opens",
+        "It opens, with a revision, names of its actions, and the methods episodes, reset, step and close.",
+        _Trial.open,
+    ),
+    ("episodes_are_listed", "Its episodes have different ids, and are the same every time.", _Trial.list_episodes),
+    (
+        "steps_are_whole",
+        "Pictures are uint8 (H, W, 3), the state float32, facts finite, and actions have the promised width.",
+        _Trial.play,
+    ),
+    ("facts_are_constant", "Every step of every episode has facts of the same names.", _Trial.facts_are_constant),
+    ("equal_seeds_give_equal_frames", "An episode repeats, frame for frame, behind another one.", _Trial.repeats),
+    (
+        "a_second_environment_is_equal",
+        "A second environment shows the same frames, because each process opens its own.",
+        _Trial.repeats_elsewhere,
+    ),
+    ("what_was_shown_stays", "Pictures and states that were shown do not change later.", _Trial.is_not_written_to),
+    ("it_closes", "It closes.", _Trial.close),
+)
+
+
+def check_environment(source: EnvSource | str) -> Iterator[EnvironmentCheck]:
+    """The promises of the contract, each tried on the first two episodes; an error is a failure.
+
+    source: an `EnvSource`, or MODULE:CLASS. Raises UsageError if there is no such class.
+    """
+    trial = _Trial(EnvSource(source) if isinstance(source, str) else source)
+    for name, sentence, check in _CHECKS:
+        try:
+            check(trial)
+        except ProbeKitError as error:
+            yield EnvironmentCheck(name, sentence, str(error))
+        else:
+            yield EnvironmentCheck(name, sentence)
+
+
+def _copied(step: Step) -> Step:
+    """As it was when it was shown."""
+    seen = step.observation
+    cameras = {name: picture.copy() for name, picture in seen.cameras.items()}
+    copy = type(seen)(seen.image.copy(), seen.state.copy(), seen.instruction, seen.intrinsics, cameras)
+    return Step(copy, step.done, dict(step.facts))
+
+
+def _check_equal(first: list[Step], again: list[Step], which: str) -> None:
+    if len(first) != len(again):
+        raise _BrokenError(f"{which} ended after {len(again) - 1} actions, before after {len(first) - 1}")
+    for number, (was, now) in enumerate(zip(first, again, strict=True)):
+        one, two = was.observation, now.observation
+        different = [
+            name
+            for name, equal in (
+                ("the picture", np.array_equal(one.image, two.image)),
+                ("the state", np.array_equal(one.state, two.state)),
+                ("a further camera", _equal_pictures(one.cameras, two.cameras)),
+                ("a fact", dict(was.facts) == dict(now.facts)),
+                ("done", was.done == now.done),
+            )
+            if not equal
+        ]
+        if different:
+            raise _BrokenError(
+                f"{which} differs after {number} actions: {', '.join(different)}. Take all randomness from the "
+                "episode's seed, and set everything up in reset()"
+            )
+
+
+def _equal_pictures(one: object, two: object) -> bool:
+    assert hasattr(one, "items")
+    assert hasattr(two, "items")
+    first, second = dict(one.items()), dict(two.items())
+    return first.keys() == second.keys() and all(np.array_equal(first[name], second[name]) for name in first)

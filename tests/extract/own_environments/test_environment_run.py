@@ -1,0 +1,146 @@
+"""A Gymnasium environment from `extract --env` to a decoded label, with the embedded policy."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from probe_kit.errors import DiskSpaceError, OwnEnvironmentError, SettingsMismatchError, UsageError
+from probe_kit.extract import EnvSource, ExtractSettings, Run, open_run, prepare, verify_run
+from probe_kit.extract.commands import check_size
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.retention import retention_table
+from probe_kit.train import Labels, train_probes
+from probe_kit.train.labels.builtin_columns import label_frame
+from tests.support.made_once import made_once
+
+HOME = "reach_env:"
+
+
+def settings(name: str = "ReachEnv", **given: Any) -> ExtractSettings:
+    source = {"max_steps": 6, **{key: given.pop(key) for key in ("episodes", "max_steps") if key in given}}
+    own = {"captured_calls": 2, "execute": 3, "env_workers": 0, "batch": 6, **given}
+    return ExtractSettings("pi0-tiny", source=EnvSource(HOME + name, **source), **own)
+
+
+@pytest.fixture(scope="session")
+def played(pi0_tiny: Pi0, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Twelve episodes in six groups, two inferences each."""
+
+    def make(folder: Path) -> None:
+        prepare(settings(), policy=pi0_tiny).run(folder / "run")
+
+    return open_run(made_once(tmp_path_factory, "played", make) / "run")
+
+
+def test_a_run_holds_outcomes_states_actions_and_facts_of_the_environment(played: Run) -> None:
+    assert verify_run(played.path, deep=True).ok
+    assert played.suite == f"{HOME}ReachEnv@reach 1"
+    assert set(played.episodes["outcome"]) <= {"success", "failure"}
+    assert played.episodes["group_id"].nunique() == 6
+    assert played.inputs is not None
+    assert played.inputs.columns == ("block", "left", "success")
+    assert played.inputs.read("action").shape == (12, 2, 3, 7)
+    assert list(played.control_steps[0]) == [0, 3]
+    states = played.inputs.read("state")
+    moved = np.abs(states[:, 1, :3] - states[:, 0, :3])
+    executed = played.inputs.read("action")[:, 0, :, :3]
+    np.testing.assert_allclose(moved, np.abs(np.clip(executed, -0.02, 0.02).sum(axis=1)), atol=1e-5)
+    assert played.certificate["hooks_on_equals_hooks_off"]
+
+
+def test_facts_are_labels_and_a_run_without_sides_refuses_them(played: Run, tmp_path: Path) -> None:
+    table = label_frame(played)
+    assert {"control_step", "instruction", "env.block", "env.left", "env.state.0", "env.action.dx"} <= set(table)
+    assert not [name for name in table if str(name).startswith(("sim.", "item.", "dataset."))]
+    file = tmp_path / "labels.csv"
+    table.assign(away=table["env.block"] - table["env.state.1"]).to_csv(file, index=False)
+    labels = Labels.read(file, "away")
+    results = train_probes(played, labels=labels, permutations=9, controls=("state", "instruction"))
+    assert results.settings.task == "continuous"
+    assert len(set(results.groups)) == 6
+    assert np.isfinite(results.scores["score"]).all()
+    assert Labels.of_run(played, "env.block").task == "continuous"
+    with pytest.raises(UsageError, match=r"plays an environment of your own .* a retention table is not possible"):
+        retention_table([played])
+    with pytest.raises(UsageError, match=r"no column env\.absent; there are: env\.block"):
+        Labels.of_run(played, "env.absent")
+
+
+def check_equal(some: Run, played: Run, rows: list[int]) -> None:
+    """Batches of another size differ by rounding."""
+    for name in some.streams:
+        for ours, row in enumerate(rows):
+            np.testing.assert_allclose(some.rows(name)[ours], played.rows(name)[row], atol=1e-4)
+
+
+def test_the_activations_of_an_episode_do_not_depend_on_which_others_are_played(
+    played: Run, pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    """Alone, and as the beginning of a run that grows."""
+    some = prepare(settings(episodes=(3,), batch=1), policy=pi0_tiny).run(tmp_path / "run")
+    check_equal(some, played, [3])
+    grown = prepare(settings(episodes=(1, 3), batch=1), policy=pi0_tiny).run(tmp_path / "run")
+    assert list(grown.episodes["episode_id"]) == ["reach-01", "reach-03"]
+    shorter = settings(episodes=(1,), max_steps=5)
+    with pytest.raises(SettingsMismatchError, match=r"environment\.max_steps"):
+        prepare(shorter, policy=pi0_tiny).run(tmp_path / "run")
+
+
+@pytest.mark.slow
+def test_an_environment_is_played_in_child_processes_with_the_same_numbers(
+    played: Run, pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    some = prepare(settings(episodes=(3, 1), batch=1, env_workers=2), policy=pi0_tiny).run(tmp_path / "run")
+    check_equal(some, played, [1, 3])
+
+
+def test_what_does_not_fit_the_model_is_refused_before_anything_is_written(pi0_tiny: Pi0) -> None:
+    with pytest.raises(OwnEnvironmentError, match=r"takes 8 numbers as an action .* embedded predicts 7"):
+        prepare(settings("Wide"), policy=pi0_tiny)
+    with pytest.raises(UsageError, match="--execute 17: pi0-tiny gives 16 actions"):
+        prepare(settings(execute=17), policy=pi0_tiny)
+    with pytest.raises(UsageError, match="--no-act does not apply with --env"):
+        prepare(settings(capture_only=True), policy=pi0_tiny)
+    with pytest.raises(UsageError, match="expert is scripted"):
+        prepare(replace(settings(), model="expert"))
+
+
+def test_an_environment_that_fails_costs_its_episode_and_says_where(pi0_tiny: Pi0, tmp_path: Path) -> None:
+    from probe_kit.errors import EpisodesFailedError
+
+    with pytest.raises(EpisodesFailedError) as failed:
+        prepare(settings("Broken", episodes=(0, 1)), policy=pi0_tiny).run(tmp_path / "run")
+    assert "ZeroDivisionError: the simulator exploded" in failed.value.__notes__[0]
+
+
+def test_options_of_scenes_and_recordings_are_refused_with_an_environment() -> None:
+    given = {"model": "pi0-tiny", "env": HOME + "ReachEnv"}
+    with pytest.raises(UsageError, match="--light-level does not apply with --env"):
+        ExtractSettings.from_options(**given, light_level=0.7)
+    with pytest.raises(UsageError, match="--select is for recordings; give --dataset"):
+        ExtractSettings.from_options(**given, select="every:2")
+    with pytest.raises(UsageError, match="two sources"):
+        ExtractSettings.from_options(**given, dataset="kitchen")
+    with pytest.raises(UsageError, match="--env-option is for environments; give --env"):
+        ExtractSettings.from_options(model="pi0-tiny", env_options=["a=1"])
+    typed = ExtractSettings.from_options(
+        **given, episodes="0:2", max_steps=9, no_pixels=True, captured_calls="all"
+    )
+    assert typed.source == EnvSource(HOME + "ReachEnv", (), (0, 1), 9, False)
+    assert typed.most_inferences(4) == 3
+
+
+def test_a_run_of_more_than_64_gb_begins_with_yes_only(tmp_path: Path) -> None:
+    """30,000 episodes of the released pi0, planned without its weights."""
+    source = EnvSource(HOME + "ReachEnv", {"count": "30000"})  # type: ignore[arg-type]
+    planned = prepare(ExtractSettings("pi0", source=source, captured_calls=8), fetch=False)
+    location = locate(tmp_path / "run")
+    with pytest.raises(DiskSpaceError, match=r"would take up to .* TB; more than 64\.0 GB is written with --yes"):
+        check_size(planned, location, agreed=False)
+    check_size(planned, location, agreed=True)
+    few = EnvSource(HOME + "ReachEnv", {"count": "12"})  # type: ignore[arg-type]
+    check_size(prepare(ExtractSettings("pi0", source=few), fetch=False), location, agreed=False)

@@ -1,0 +1,134 @@
+"""A small Gymnasium environment, and its 30 lines behind the contract of `extract --env`."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from probe_kit.extract import EnvEpisode, Step
+from probe_kit.hooks import Observation
+
+SIDE = 48
+
+
+class Reach(gym.Env[dict[str, Any], np.ndarray]):
+    """A hand on a table moves by the action to a block, which lies left or right."""
+
+    action_space = gym.spaces.Box(-1, 1, (7,), np.float32)
+    observation_space = gym.spaces.Dict(
+        pixels=gym.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8), agent_pos=gym.spaces.Box(-1, 2, (8,), np.float32)
+    )
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Place hand and block by the seed."""
+        super().reset(seed=seed, options=options)
+        self.hand = np.array([0.29, 0.0, 0.16]) + 0.002 * self.np_random.normal(size=3)
+        self.block = (-1) ** (seed or 0) * 0.09 + 0.002 * self.np_random.normal()
+        self.steps = 0
+        return self._seen(), {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Move the hand; eight steps at most."""
+        self.hand = np.clip(self.hand + np.clip(action[:3], -0.02, 0.02), [0.2, -0.1, 0.1], [0.4, 0.1, 0.3])
+        self.steps += 1
+        away = abs(self.hand[1] - self.block)
+        return self._seen(), -away, away < 0.02, self.steps == 8, {"away": away, "is_success": away < 0.02}
+
+    def _seen(self) -> dict[str, Any]:
+        picture = np.full((SIDE, SIDE, 3), 200, np.uint8)
+        for place, colour in ((self.block, (200, 30, 30)), (self.hand[1], (40, 40, 40))):
+            column = int(SIDE * (0.5 + 4 * place))
+            picture[20:28, max(0, column - 4) : max(0, column + 4)] = colour
+        state = np.array([*self.hand, 0, 0, 0, 0, 1], np.float32)
+        return {"pixels": picture, "agent_pos": state}
+
+
+class ReachEnv:
+    """`Reach` behind the contract."""
+
+    revision = "reach 1"
+    action_names = ("dx", "dy", "dz", "roll", "pitch", "yaw", "grip")
+
+    def __init__(self, count: int | str = 12) -> None:
+        self._count, self._env = int(count), Reach()
+
+    def episodes(self) -> Iterator[EnvEpisode]:
+        """Seeds in pairs of a group."""
+        for seed in range(self._count):
+            colour = ("red", "blue")[seed % 2]
+            yield EnvEpisode(f"reach-{seed:02d}", seed, f"Put the cube on the {colour} shape", f"pair-{seed // 2}")
+
+    def reset(self, episode: EnvEpisode) -> Step:
+        """The beginning, with its facts."""
+        self._episode = episode
+        return self._as_step(self._env.reset(seed=episode.seed)[0])
+
+    def step(self, action: np.ndarray) -> Step:
+        """One action of the checkpoint, in metres."""
+        seen, _, done, late, info = self._env.step(action)
+        return self._as_step(seen, done or late, bool(info["is_success"]))
+
+    def close(self) -> None:
+        """Nothing is open."""
+        self._env.close()
+
+    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        observation = Observation(seen["pixels"], seen["agent_pos"], self._episode.instruction)
+        facts = {"block": self._env.block, "left": self._env.block < 0, "success": success}
+        return Step(observation, done, facts)
+
+
+class Drifting(ReachEnv):
+    """Its frames depend on what was played before."""
+
+    def reset(self, episode: EnvEpisode) -> Step:
+        """Seeded once only."""
+        self._episode = episode
+        self._first = getattr(self, "_first", episode.seed)
+        return self._as_step(self._env.reset(seed=None if hasattr(self._env, "block") else self._first)[0])
+
+
+class Reusing(ReachEnv):
+    """Every picture is the same buffer."""
+
+    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        found = super()._as_step(seen, done, success)
+        if not hasattr(self, "_buffer"):
+            self._buffer = np.empty((SIDE, SIDE, 3), np.uint8)
+        self._buffer[:] = found.observation.image
+        self._buffer[0, 0] = self._env.steps
+        return Step(
+            Observation(self._buffer, found.observation.state, self._episode.instruction), done, found.facts
+        )
+
+
+class Forgetful(ReachEnv):
+    """Says a fact at some steps only."""
+
+    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        found = super()._as_step(seen, done, success)
+        further = {"late": True} if self._env.steps > 2 else {}
+        return Step(found.observation, done, {**found.facts, **further})
+
+
+class Broken(ReachEnv):
+    """Raises at the third step."""
+
+    def step(self, action: np.ndarray) -> Step:
+        """An error of its own."""
+        if self._env.steps == 2:
+            raise ZeroDivisionError("the simulator exploded")
+        return super().step(action)
+
+
+class Nameless(ReachEnv):
+    """Has no revision."""
+
+    revision = ""
+
+
+class Wide(ReachEnv):
+    """Takes eight numbers."""
+
+    action_names = (*ReachEnv.action_names, "torque")
