@@ -2,6 +2,7 @@
 
 import json
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 import nbformat
@@ -9,15 +10,19 @@ import pytest
 from nbformat import NotebookNode
 
 from notebooks.execute import FOLDER, executed, kernel, notebooks
-from probe_kit.extract import open_run
+from probe_kit.extract import compare_actions, open_run
 from probe_kit.intervene import stored_site_effects
 from probe_kit.retention import retention_table
-from probe_kit.train import load_results
+from probe_kit.train import load_label_results, load_results
 
 NAMES = (
     "01-first-run", "02-layer-curves", "03-compare-models", "04-your-own-model", "05-your-own-questions",
-    "06-vlm-against-vla", "07-from-readable-to-used",
+    "06-vlm-against-vla", "07-from-readable-to-used", "08-your-own-labels", "09-your-own-recordings",
 )  # fmt: skip
+WHOLE_ONLY = NAMES[7:]
+"""They run in the slow suite only: other tests play the same way in the default one."""
+EXTRAS = {"09-your-own-recordings": ("datasets", "av")}
+"""Modules of extras that a notebook needs."""
 MACHINE = re.compile(r"/(?:home|root|tmp|Users|usr|opt|work|private|var)/|site-packages|[A-Z]:\\\\")
 
 PICTURE = re.compile(r"(?:\.plot\(\)|^pk\.layer_curve\(.*\)|^Image\.open\(.*\)|^color|^sheet);?$", re.MULTILINE)
@@ -60,13 +65,22 @@ def made(
         nbformat.write(notebook, path)
         return path
 
+    chosen = [name for name in NAMES if (request.param == "whole" or name not in WHOLE_ONLY) and not absent(name)]
     with kernel(folder) as manager:
-        return folder, {name: executed(source(name), folder, manager) for name in NAMES}
+        return folder, {name: executed(source(name), folder, manager) for name in chosen}
+
+
+def absent(name: str) -> list[str]:
+    """Modules that a notebook needs and that are not installed."""
+    return [module for module in EXTRAS.get(name, ()) if find_spec(module) is None]
 
 
 def test_the_short_notebooks_are_shorter() -> None:
     sources = [
-        cell.source for name in NAMES for cell in nbformat.read(FOLDER / f"{name}.ipynb", as_version=4).cells
+        cell.source
+        for name in NAMES
+        if name not in WHOLE_ONLY
+        for cell in nbformat.read(FOLDER / f"{name}.ipynb", as_version=4).cells
     ]
     assert [sum(long in source for source in sources) for long in SHORT] == [6, 1, 8, 1, 1]
 
@@ -93,6 +107,10 @@ def test_these_are_all_notebooks() -> None:
 def test_a_notebook_runs_and_its_committed_outputs_are_those_of_its_cells(
     name: str, made: tuple[Path, dict[str, NotebookNode]]
 ) -> None:
+    if missing := absent(name):
+        pytest.skip(f"{', '.join(missing)} of the extra `datasets` is not installed")
+    if name not in made[1]:
+        pytest.skip("runs in the slow suite")
     committed = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     assert any(outputs for outputs in kinds(committed))
     assert kinds(made[1][name]) == kinds(committed)
@@ -156,6 +174,19 @@ def test_the_last_layer_of_the_seventh_notebook_is_read_by_nothing(
     assert last.relative_change > 0
 
 
+@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
+def test_the_recordings_of_the_ninth_notebook_are_shown_and_their_side_is_decoded(
+    made: tuple[Path, dict[str, NotebookNode]],
+) -> None:
+    if missing := absent("09-your-own-recordings"):
+        pytest.skip(f"{', '.join(missing)} of the extra `datasets` is not installed")
+    run = open_run(made[0] / "work" / "runs" / "recorded")
+    assert run.recorded
+    assert compare_actions(run).by_number.set_index("number").loc[["x", "y"], "first"].max() < 0.6
+    (stored,) = (path.name for path in (run.path / "probes").iterdir())
+    assert load_label_results(run, stored).scores["score"].max() > 0.9
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_cell_that_ends_in_a_figure_shows_a_picture(name: str) -> None:
     """In the committed outputs, which are of the same kinds as fresh ones."""
@@ -181,4 +212,4 @@ def test_committed_outputs_hold_no_path_of_a_machine_and_no_error(name: str) -> 
 
 
 def test_all_notebooks_together_are_small() -> None:
-    assert sum(path.stat().st_size for path in notebooks()) < 1_500_000
+    assert sum(path.stat().st_size for path in notebooks()) < 1_700_000

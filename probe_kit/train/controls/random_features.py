@@ -51,10 +51,15 @@ class RandomFeatureInputs:
 
 
 def random_layer(parts: Sequence[Features], width: int, seed: int) -> Features:
-    """(N, width) outputs of a random tanh layer, to which every part (N, D) gives an equal share."""
+    """(N, width) outputs of a random tanh layer, to which every part (N, D) gives an equal share.
+
+    A part that is the same for all samples, such as the state at the first frame, gives nothing.
+    """
     generator = np.random.default_rng(seed)
     varying = [_standardised(part) for part in parts]
-    mixed = [part @ generator.standard_normal((part.shape[1], width)) / part.shape[1] ** 0.5 for part in varying]
+    mixed = [
+        part @ generator.standard_normal((part.shape[1], width)) / max(1, part.shape[1]) ** 0.5 for part in varying
+    ]
     outputs: Features = np.tanh(sum(mixed)).astype(np.float32)
     return outputs
 

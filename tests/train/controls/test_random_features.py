@@ -9,7 +9,7 @@ import pytest
 from probe_kit.hooks import Stream
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import ArrayRun, ProbeResults, train_probes
-from probe_kit.train.controls.random_features import RandomFeatureInputs
+from probe_kit.train.controls.random_features import RandomFeatureInputs, random_layer
 
 ITEMS, WIDTH = 100, 24
 
@@ -59,6 +59,14 @@ def test_a_network_that_knows_the_answer_exceeds_random_features(suite: Suite, t
     control = results.controls.of_category("color")["random-features"]
     assert control.ci[0] < control.accuracy < control.ci[1]
     assert not control.above_chance  # what it has for free is no leak
+
+
+def test_a_part_that_never_varies_gives_a_random_layer_nothing() -> None:
+    """The state at the first frame of every recording is often one."""
+    words = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
+    constant = np.ones((6, 2), np.float32)
+    np.testing.assert_array_equal(random_layer([words, constant], 5, 0), random_layer([words], 5, 0))
+    assert not random_layer([constant], 5, 0).any()
 
 
 def test_random_layers_repeat_and_differ_by_seed(suite: Suite, tmp_path: Path) -> None:
