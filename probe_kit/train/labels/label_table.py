@@ -174,6 +174,11 @@ def _places(names: Sequence[str], wanted: Sequence[str], source: str) -> dict[st
         )
     keys = (EPISODE, INFERENCE) if EPISODE in names else (SOURCE, FRAME)
     read = [name for name in dict.fromkeys((*keys, *wanted)) if name in names]
+    if unsafe := [found for name in read if (found := UNSAFE.search(name))]:
+        raise UsageError(
+            f"{source}, line 1: the name of a column holds the control or direction character "
+            f"U+{ord(unsafe[0][0]):04X}; expected plain text. Rename the column"
+        )
     if twice := [name for name in read if names.count(name) > 1]:
         raise UsageError(f"{source}, line 1 has the column {terminal_safe(twice[0])!r} twice. Rename one of them")
     return {name: names.index(name) for name in read}

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+_COUNTED = {INFERENCE: "a captured inference", FRAME: "a frame", SOURCE: "an episode"}
+
+
 @dataclass(frozen=True)
 class Labels:
     """One label per episode, or per captured inference of an episode, for `train_probes(run, labels=labels)`.
@@ -72,7 +75,11 @@ class Labels:
             raise UsageError(f"{found.source} has no column {target!r} to decode; it has: {known[:500] or 'none'}")
         if not found.lines:
             raise UsageError(f"{found.source} has no {found.unit} below its heading; expected one per label")
-        episodes, inferences = tuple(found.texts(episode_key)), _inferences(found, step_key)
+        inferences = _numbers(found, step_key)
+        if of_source:  # numbers as a spreadsheet or a merge may leave them, such as 3.0
+            episodes = tuple(map(str, _numbers(found, episode_key) or ()))
+        else:
+            episodes = tuple(found.texts(episode_key))
         _check_keys(found, episodes, inferences)
         return cls(
             target,
@@ -179,15 +186,15 @@ def _shown(run: RunReader, by_frame: bool) -> dict[tuple[str, int], list[tuple[s
     return found
 
 
-def _inferences(table: LabelTable, column: str) -> tuple[int, ...] | None:
+def _numbers(table: LabelTable, column: str) -> tuple[int, ...] | None:
+    """A key column of whole numbers; None where the table lacks it. Raises UsageError for other cells."""
     if column not in table.columns:
         return None
     cells = table.columns[column]
     for row, cell in enumerate(cells):
         if isinstance(cell, bool | str | None) or not float(cell).is_integer() or cell < 0:
             raise UsageError(
-                f"{table.where(row, column)} is {cell!r}; expected the number of "
-                f"{'a captured inference' if column == INFERENCE else 'a frame'}, from 0"
+                f"{table.where(row, column)} is {cell!r}; expected the number of {_COUNTED[column]}, from 0"
             )
     return tuple(int(cell) for cell in cells if cell is not None)
 

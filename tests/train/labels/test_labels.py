@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import UsageError
 from probe_kit.train import Labels
 
@@ -122,8 +123,58 @@ def test_files_that_are_no_tables_are_refused_by_name(tmp_path: Path) -> None:
         Labels.read(tmp_path / "no.parquet", "y")
 
 
-def test_a_heading_of_many_thousand_columns_is_read_for_the_few_that_are_asked_for(tmp_path: Path) -> None:
-    heading = "episode_id,y," + ",".join(f"x{number}" for number in range(200_000))
-    rows = "".join(f"\ne{number},{number / 3}" + "," * 200_000 for number in range(3))
+def test_a_heading_of_a_million_columns_is_read_for_the_few_that_are_asked_for(tmp_path: Path) -> None:
+    heading = "episode_id,y," + ",".join(f"x{number}" for number in range(10**6))
+    rows = "".join(f"\ne{number},{number / 3}" + "," * 10**6 for number in range(3))
     labels = Labels.read(written(tmp_path, heading + rows), "y")
     assert labels.coded.values.tolist() == [0, 1 / 3, 2 / 3]
+
+
+def test_a_heading_of_a_million_columns_without_a_key_is_refused_in_a_line(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="line 1 lacks the key column") as refused:
+        Labels.read(written(tmp_path, ",".join(f"x{number}" for number in range(10**6))), "x1")
+    assert len(str(refused.value)) < 500
+
+
+@pytest.mark.parametrize("formula", ["=1+1", "=cmd|' /C calc'!A0", "+1+1", "@SUM(A1)", "-2+3"])
+def test_a_formula_is_a_text_and_leaves_as_one(tmp_path: Path, formula: str) -> None:
+    """It names a class; what is written for a spreadsheet has a quotation mark in front."""
+    labels = Labels.read(written(tmp_path, f"episode_id,y\na,{formula}\nb,x\nc,x\n"), "y")
+    assert formula in labels.coded.classes
+    assert f"'{formula}" in csv_of_frame(pd.DataFrame({"class": labels.coded.classes}))
+
+
+@pytest.mark.parametrize(
+    ("text", "target", "expected"),
+    [
+        ("episode_id,y\u202e\na,1.5\nb,2.5\n", "y\u202e", "name of a column holds the control or direction"),
+        ("episode_id,y\na\u202e,1.5\nb,2.5\n", "y", "line 2, column 'episode_id' holds the control or direction"),
+        ("episode_id,y\na,r\x1b[31med\nb,blue\n", "y", "character U+001B"),
+        ("episode_id,y\na,r\x00ed\nb,blue\n", "y", "character U+0000"),
+        ("episode_id,y\na," + "9" * 5000 + "\nb,2.5\n", "y", "line 2, column 'y' is infinite"),
+        ("episode_id,y\na,1e999\nb,2.5\n", "y", "line 2, column 'y' is infinite"),
+        ("episode_id,y\na," + "x" * 200_000 + "\nb,y\n", "y", "line 2 is no CSV: field larger than field limit"),
+        ("episode_id,y\na,1.5\nb,N/A\n", "y", "line 3, column 'y': 'N/A' is text, and line 2 has a number"),
+        ("source_episode,frame,y\n0,nan,1.5\n1,0,2.5\n", "y", "column 'frame' is None; expected the number of a"),
+        (
+            "source_episode,frame,y\n0.5,0,1.5\n1,0,2.5\n",
+            "y",
+            "'source_episode' is 0.5; expected the number of an",
+        ),
+        ("source_episode,y\n-1,1.5\n1,2.5\n", "y", "column 'source_episode' is -1; expected the number of an"),
+        ("source_episode,y\nx,1.5\n1,2.5\n", "y", "column 'source_episode' is 'x'; expected the number of an"),
+    ],
+)
+def test_hostile_tables_are_refused_with_their_place(
+    tmp_path: Path, text: str, target: str, expected: str
+) -> None:
+    with pytest.raises(UsageError) as refused:
+        Labels.read(written(tmp_path, text), target)
+    assert expected in str(refused.value)
+
+
+def test_numbers_of_episodes_as_a_merge_leaves_them_are_the_same_keys() -> None:
+    """A column of integers with an empty cell somewhere becomes one of decimals."""
+    whole = pd.DataFrame({"source_episode": [0, 1], "frame": [3, 4], "y": [1.5, 2.5]})
+    decimal = whole.astype({"source_episode": float, "frame": float})
+    assert Labels.read(decimal, "y").episodes == Labels.read(whole, "y").episodes == ("0", "1")
