@@ -2,8 +2,8 @@
 
     OMP_NUM_THREADS=1 python benchmarks/study_gpus.py [--gpus 2] [--models 8] [--items 8]
 
-Needs Ray (extra `ray`), and no GPU: the cluster is told that this machine has `--gpus` of them, and the models run
-on its cores. Half of the models have twice as many episodes as the others. A GPU waits where Ray has given it to no
+Needs Ray (extra `ray`), and no GPU: the cluster is started with `--gpus` of them by name, and the models run on
+its cores. Half of the models have twice as many episodes as the others. A GPU waits where Ray has given it to no
 model although models are left; what a model needs to start counts as its own time.
 """
 

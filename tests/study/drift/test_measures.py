@@ -124,7 +124,7 @@ def test_the_table_leads_with_transfer_and_says_what_each_verdict_means(found: d
     assert made.text.title == "Drift: training"
     rows = {cells[1].lower(): dict(zip(made.text.columns, cells, strict=True)) for cells in made.text.cells}
     assert list(rows["kept"].values())[:3] == ["before → after", "Kept", "kept"]
-    assert rows["forgotten"]["cosine"] == "–", "no cosine without signal on both sides"
+    assert rows["forgotten"]["cosine (ceiling)"] == "–", "no cosine without signal on both sides"
     assert "forgotten: signal in the first alone" in made.text.note
     assert "it is no measure of loss" in made.text.note
     assert len(made.numbers) == len(TRUTH) * 3, "one of the category, one of each layer"
