@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from probe_kit.extract.run_layout import AskTokens
+from probe_kit.extract.run_layout import AskTokens, LaterViews
 from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.hooks.contract.protocol import ProtocolName
 from probe_kit.hooks.family import Dtype
@@ -86,7 +86,8 @@ class ConditionTable(_Table):
     early_stop: bool = False
     wordings: Names | None = None
     no_act: bool = False
-    captured_calls: Count = 1
+    captured_calls: Count | Literal["all"] = 1
+    later_views: LaterViews = "all"
 
 
 class AskTable(_Table):

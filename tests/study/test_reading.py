@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit.errors import UsageError
+from probe_kit.extract import ExtractSettings
 from probe_kit.study import LoadedStudy, StudyFileError, load_study, plan_study
 from probe_kit.study.expansion import control_of
 from probe_kit.study.places import line_of
@@ -144,6 +145,15 @@ def test_a_byte_of_a_checkpoint_makes_other_runs_of_its_model(tmp_path: Path) ->
     weights.write_bytes(b"other")
     after = keys(load_study(written(tmp_path, text)))
     assert {name for name in before if after[name] != before[name]} == {"base/plain", "base/dark"}
+
+
+def test_a_condition_captures_a_number_of_inferences_or_all(tmp_path: Path) -> None:
+    dark = "light_level = 0.7"
+    for said, kept in (("3", 3), ('"all"', "all")):
+        text = changed((dark, f'{dark}\ncaptured_calls = {said}\nlater_views = "mean"'))
+        (cell,) = (one for one in load_study(written(tmp_path, text)).cells if one.name == "base/dark")
+        assert isinstance(cell.settings, ExtractSettings)
+        assert (cell.settings.captured_calls, cell.settings.later_views) == (kept, "mean")
 
 
 CAPTURED = """

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from probe_kit.extract.needs import declared_streams, space_of
 from probe_kit.extract.run_layout import StoredStream
-from probe_kit.extract.settings import RunSettings
+from probe_kit.extract.settings import ExtractSettings, RunSettings
 from probe_kit.hooks.registry import family_names
 from probe_kit.study.cells import Cell
 from probe_kit.study.ledger import Ledger, Speed
@@ -122,7 +122,12 @@ def _bytes(one: Work, stored: Sequence[StoredStream] | None, speeds: Mapping[str
 
 
 def bytes_per_episode(streams: Sequence[StoredStream], settings: RunSettings) -> int:
-    """Uncompressed bytes of an episode with columns and probes, without a report."""
+    """Uncompressed bytes of an episode with columns and probes, without a report.
+
+    Those of an episode with the most inferences, where every one is captured.
+    """
+    if isinstance(settings, ExtractSettings):
+        settings = settings.with_every_call(settings.execute or 1)
     space = space_of(streams, 1, settings)
     return sum(space.values()) - space["report"]
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
+from typing import Literal
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract import open_run
@@ -60,7 +61,7 @@ def _measured(one: PlannedCell, env_workers: int | None) -> Speed | Failure:
         streams = list(open_run(place).root.streams.values())
     return Speed(
         seconds=round(watch.pace(settings.batch) / units(replace(cell, settings=settings)), 6),
-        bytes=bytes_per_episode(streams, settings),
+        bytes=bytes_per_episode(streams, cell.settings),
         batch=settings.batch,
         device=settings.device,
         tokens=settings.tokens,
@@ -70,7 +71,7 @@ def _measured(one: PlannedCell, env_workers: int | None) -> Speed | Failure:
 
 
 def _shortened(cell: Cell) -> RunSettings:
-    """The settings of a cell with few episodes, each of few inferences."""
+    """The settings of a cell with few episodes, each of few inferences, which are captured where several are."""
     settings = cell.settings_to_play
     name, count = max(cell.selection.counts(cell.suite).items(), key=lambda pair: pair[1])
     items = min(count, max(EPISODES // 2, 2 * settings.batch))
@@ -78,7 +79,8 @@ def _shortened(cell: Cell) -> RunSettings:
     if not isinstance(settings, ExtractSettings):
         return settings
     steps = min(settings.scene.max_steps, INFERENCES * (settings.execute or 1))
-    return replace(settings, scene=replace(settings.scene, max_steps=steps))
+    calls: int | Literal["all"] = 1 if settings.captured_calls == 1 else "all"
+    return replace(settings, scene=replace(settings.scene, max_steps=steps), captured_calls=calls)
 
 
 class _Watch:

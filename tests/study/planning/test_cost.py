@@ -70,6 +70,15 @@ def test_bytes_come_from_stored_streams_of_the_model_or_from_a_calibration(
     assert cost_of([Work(every, 0, 2)], ledger).unsized == ("base",)
 
 
+def test_every_inference_takes_bytes_at_most(cells: dict[str, Cell], ledger: Ledger) -> None:
+    plain = cells["base/plain"]
+    most, rest = plain.settings.scene.max_steps, 4 * 16 + EPISODE + THUMBNAILS
+    for later, bytes_of_later in (("all", 2 * 4 * 64 * 2 * 4), ("mean", 2 * 4 * 64 * 2)):
+        every = replace(plain, settings=replace(plain.settings, captured_calls="all", later_views=later))
+        expected = 2 * 4 * 64 * 2 * 4 + (most - 1) * bytes_of_later + rest
+        assert cost_of([Work(every, 10, 1, 1.0, STREAMS)], ledger).bytes == {"base": expected}
+
+
 def test_nothing_missing_takes_nothing(cells: dict[str, Cell], ledger: Ledger) -> None:
     cost = cost_of([Work(cells["base/plain"], 96, 0, 1.0, STREAMS)], ledger)
     assert cost.to_json() == {
