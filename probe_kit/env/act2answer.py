@@ -98,11 +98,15 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         return self._picture.copy()
 
     def render_small(self, height: int) -> Picture:
-        """The picture (height, w, 3) uint8 of the scene now, drawn at this height: for films, and no model.
+        """The picture (height, w, 3) uint8 of the scene now: for films, and no model.
 
-        Drawing takes a quarter of the time of `render` at half the height.
+        Shrunk from that of `render` where that was drawn since the last action. Else drawn at this height, which
+        takes a quarter of the time at half the height and gives less smooth edges.
         """
-        return self.scene.small_picture(height)
+        if self._frame is None:
+            return self.scene.small_picture(height)
+        size = (round(self.scene_spec.camera.width * height / self.scene_spec.camera.height), height)
+        return np.asarray(Image.fromarray(self.render()).resize(size, Image.Resampling.BOX))
 
     def close(self) -> None:
         """Free the simulator; a second call does nothing."""

@@ -11,8 +11,8 @@ EPISODE = 40_000
 """Bytes of an episode's commit, trajectory and files of the file system (measured: 12 to 30 kB)."""
 THUMBNAILS = 15_000
 """Bytes of the first and last frame of an episode."""
-FRAME = 7_000
-"""Bytes of a small frame where all are kept (measured: 5 to 6 kB)."""
+FRAME = 5_000
+"""Bytes of a small frame where all are kept (measured: 4 kB)."""
 FILM = 1_500_000
 """Bytes of a film of sixty actions."""
 DECISION = 16

@@ -174,12 +174,13 @@ class Stage(TimedStage):
 
     def _carry_out(self, actions: Iterable[NDArray[np.float32]]) -> Ending | None:
         for action in actions:
+            if self._kept == "all" and self._env.trial.steps == len(self._small_frames):
+                self._keep_small()  # before the action, when the picture of an inference exists
             _, terminated, truncated, _ = self._env.advance(action)
             self._recorder.note(action)
             self._shoot()
-            if terminated or truncated or self._kept == "all":
-                self._keep_small()
             if terminated or truncated:
+                self._keep_small()
                 trajectory = self._recorder.trajectory().frames
                 outcome = {**_record(self._env), **self._facts}
                 return Ending(outcome, self._frames, tuple(self._small_frames), trajectory)
@@ -188,8 +189,7 @@ class Stage(TimedStage):
     def _keep_small(self) -> None:
         if self._kept != "none":
             every = self._kept == "all"
-            frame = self._env.render_small(FILM_HEIGHT) if every else shrink(self._env.render())
-            self._small_frames.append(frame)
+            self._small_frames.append(self._env.render_small(FILM_HEIGHT) if every else shrink(self._env.render()))
 
     def _see(self) -> Observation:
         return self._observed(self._env.observe())
