@@ -29,6 +29,8 @@ from tests.support.little_run import (
 CALLS = 2
 FILMED, FILM_STEPS = 2, 9
 """An episode that keeps every frame, and its steps."""
+SHORTENED, LOST_WORDS = 5, 2
+"""An episode whose prompt was cut, and how many words at the end of its instruction were lost."""
 HOSTILE = "</script><img src=x onerror=alert(1)>"
 """A label that a page may not obey."""
 
@@ -85,6 +87,8 @@ def write_run(where: Path, suite: Suite, seed: int) -> Run:
     certify(writer)
     for number in writer.remaining():
         record = filmed(episode(plan, number, seed))
+        if number == SHORTENED:
+            record = replace(record, outcome={**record.outcome, "lost_words": LOST_WORDS})
         draw = np.random.default_rng([seed, number])
         pooled = {}
         for stream in STREAMS:

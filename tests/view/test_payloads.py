@@ -47,18 +47,22 @@ def test_log_odds_at_inference_0_are_the_stored_out_of_fold_decisions(catalogue:
         np.testing.assert_allclose(found.values, [expected], rtol=1e-6, atol=1e-6)
 
 
-def test_an_episode_says_how_the_sheet_of_its_frames_is_divided(small_suite: Suite, tmp_path: Path) -> None:
+def test_an_episode_says_how_its_sheet_is_divided_and_what_its_prompt_lost(
+    small_suite: Suite, tmp_path: Path
+) -> None:
     plan = little_plan(small_suite)
     writer = little_writer(locate(tmp_path / "run"), plan)
     frames = tuple(np.zeros((60, 80, 3), np.uint8) for _ in range(10))
     pictures = {thumbnail_key(0): as_thumbnail(frames, "all")}
     writer.write(replace(episode(plan, 0), pictures=pictures, frames=10))
-    writer.write(episode(plan, 1))
+    cut = episode(plan, 1)
+    writer.write(replace(cut, outcome={**cut.outcome, "lost_words": 2}))
     catalogue = Catalogue([open_run(tmp_path / "run", allow_partial=True)])
     size = {"width": 80, "height": 60}
     assert payload(catalogue, "run/e/00000")["frames"] == {"count": 10, "columns": 8, **size, "all": True}
     assert payload(catalogue, "run/e/00001")["frames"] == {"count": 2, "columns": 2, **size, "all": False}
     assert catalogue.picture("run", 0) == pictures[thumbnail_key(0)]
+    assert [payload(catalogue, f"run/e/0000{number}")["lost_words"] for number in (0, 1)] == [0, 2]
 
 
 def test_an_episode_says_how_its_action_responds_to_the_stored_image_swap(

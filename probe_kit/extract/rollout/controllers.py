@@ -1,6 +1,7 @@
 """Controllers of an episode: a captured policy, or a scripted one that needs no model."""
 
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.env.robot.controller import ACTION_SIZE
-from probe_kit.errors import PolicyFailedError
+from probe_kit.errors import PolicyFailedError, ProbeKitError
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
 from probe_kit.extract.rollout.executed_actions import executed_actions
 from probe_kit.extract.run_layout import StoredStream
@@ -29,6 +30,28 @@ SCRIPTED = {
     "expert-mirrored": "scripted: knows the answer and puts the cube on the other picture",
     "idle": "scripted: does nothing; what a rule gives it is owed to no answer",
 }
+
+
+def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: str) -> int:
+    """How many words at the end of an instruction do not reach the network, because its prompt is cut.
+
+    pack: the ids that the network is delivered, None if unknown. A word is lost if they stay the same without it.
+    """
+    whole, words = pack(instruction), instruction.split()
+    lost = 0
+    try:
+        while whole is not None and lost + 1 < len(words) and pack(" ".join(words[: -lost - 1])) == whole:
+            lost += 1
+    except ProbeKitError:  # a shorter text is no instruction of the model
+        return lost
+    if lost:
+        warnings.warn(
+            "the model's prompt is cut: the last words of an instruction do not reach its network; the column "
+            "lost_words of the run's episodes counts them. Use shorter instructions, or an adapter that refuses "
+            "long ones",
+            stacklevel=2,
+        )
+    return lost
 
 
 @dataclass(frozen=True)

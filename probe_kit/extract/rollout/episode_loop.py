@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import PlannedRow
-from probe_kit.extract.rollout.controllers import ActingController, Turn
+from probe_kit.extract.rollout.controllers import ActingController, Turn, count_lost_words
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.events import traceback_of
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, StageRequest
@@ -86,13 +86,14 @@ class EpisodeSlot:
         self.seconds = 0.0
         self.flagged: int | None = None
         self.instruction_ids: Sequence[int] | None = None
+        self.lost_words = 0
         self.past: list[NDArray[np.float32]] = []
 
     def start(self, planned: PlannedRow, buffers: EpisodeBuffers, begin: StageRequest | None) -> None:
         """Take an episode up; begin: the question that begins it, None if the stage does so already."""
         self.planned, self.buffers, self.seen = planned, buffers, None
         self.control_steps, self.steps, self.seconds = [], 0, 0.0
-        self.flagged, self.instruction_ids, self.past = None, None, []
+        self.flagged, self.instruction_ids, self.lost_words, self.past = None, None, 0, []
         self.ahead = begin is None
         if begin is not None:
             self.stage.ask(begin[0], *begin[1])
@@ -130,8 +131,9 @@ class EpisodeSlot:
 
     @property
     def counts(self) -> dict[str, int]:
-        """What the outcome record says of the policy's steps, where the policy can tell."""
-        return {} if self.flagged is None else {"inferences": self.calls, "flagged_steps": self.flagged}
+        """What the outcome record says of the policy's steps, where the policy can tell, and of lost words."""
+        flagged = {} if self.flagged is None else {"inferences": self.calls, "flagged_steps": self.flagged}
+        return flagged | ({"lost_words": self.lost_words} if self.lost_words else {})
 
     def leave(self) -> None:
         """The episode is over."""
@@ -224,6 +226,7 @@ class EpisodeLoop:
             for slot, turn in zip(due, turns, strict=True):
                 if turn.call == 0:
                     slot.instruction_ids = self._controller.instruction_ids(turn.seen.instruction)
+                    slot.lost_words = count_lost_words(self._controller.instruction_ids, turn.seen.instruction)
         except EPISODE_ERRORS as error:
             for slot in due:
                 yield self._give_up(slot, error)

@@ -6,6 +6,7 @@ from time import perf_counter
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.answer_controller import AnswerController, AskTurn
+from probe_kit.extract.rollout.controllers import count_lost_words
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Failure, Rollout
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Seen
@@ -82,8 +83,10 @@ class Asking:
                 yield self._give_up(chair, turn.planned, error)
             return
         for (chair, turn, seen), outcome in zip(due, outcomes, strict=True):
+            lost = count_lost_words(controller.instruction_ids, turn.seen.instruction)
             yield Rollout(
-                turn.planned, {**outcome, **seen.facts}, turn.buffers, [], seen.small_frames,
+                turn.planned, {**outcome, **seen.facts, **({"lost_words": lost} if lost else {})}, turn.buffers,
+                [], seen.small_frames,
                 instruction_ids=controller.instruction_ids(turn.seen.instruction),
                 control_steps=[0], seconds=Seconds(seconds, seen.seconds),
             )  # fmt: skip

@@ -144,7 +144,7 @@ function Episode({ run, one, place, near }) {
   if (!episode || (hasMap && !map)) return html`<p class="loading">Loading …</p>`;
   const names = { [one.side_correct]: one.target, [opposite(one.side_correct)]: one.distractor };
   return html`<article class="episode" aria-label=${`Episode ${one.number}`}>
-    <header><h2>“<${Text}>${one.instruction ?? one.id}<//>”</h2><${Facts} run=${run} one=${one} episode=${episode} /></header>
+    <header><h2>“<${Delivered} text=${one.instruction ?? one.id} lost=${episode.lost_words} />”</h2><${Facts} run=${run} one=${one} episode=${episode} /></header>
     <div class="stage"><div><${Film} run=${run.key} one=${one} frames=${episode.frames} now=${now} steps=${last} />
       ${last > 0 && html`<div class="scrub"><button type="button" onClick=${play} aria-label=${playing ? "Pause" : "Play"}>${playing ? "❚❚" : "▶"}</button>
         <input type="range" min="0" max=${last} value=${now} aria-label="Control step" onInput=${(e) => step(+e.target.value)} /><output>${now} / ${last}</output></div>`}</div>
@@ -155,6 +155,11 @@ function Episode({ run, one, place, near }) {
     ${Object.keys(episode.answers).length > 0 && html`<dl class="readout answers">${Object.entries(episode.answers).map(([name, value]) => html`<dt>${name}</dt><dd><${Text}>${value}<//></dd>`)}</dl>`}
   </article>`;
 }
+/* An instruction; words at its end that did not reach the network are struck out. */
+function Delivered({ text, lost }) {
+  const words = text.split(/\s+/), kept = words.length - lost;
+  return lost ? html`<${Text}>${words.slice(0, kept).join(" ")} <del>${words.slice(kept).join(" ")}</del><//>` : html`<${Text}>${text}<//>`;
+}
 function Facts({ run, one, episode }) {
   const rules = Object.entries(episode.outcomes);
   return html`<p class="facts"><${Outcome} outcome=${one.outcome} /> <span>correct: <b>${one.side_correct}</b></span> <span>${run.answers ? "answered" : "placed"}: <b>${one.side_placed ?? "none"}</b></span> <span>${titleOf(run, one.category)}</span> <span>${one.layout}</span>
@@ -162,6 +167,7 @@ function Facts({ run, one, episode }) {
     ${one.ending && html`<span>ended by: ${one.ending}</span>`}
     ${rules.map(([rule, outcome]) => html`<span class="soft" title=${run.rules[rule]}>${rule}: ${OUTCOMES[outcome] ?? outcome}</span>`)}
     ${episode.instruction_tokens > 0 && html`<span class="soft">instruction: ${episode.instruction_tokens} tokens</span>`}
+    ${episode.lost_words > 0 && html`<span class="lost">${episode.lost_words} ${episode.lost_words === 1 ? "word" : "words"} did not reach the model: its prompt is cut</span>`}
     <span class="soft">episode ${one.number}</span></p>`;
 }
 /* The captured inference at a step, and how many there are: log-odds exist of the first K only. */

@@ -45,9 +45,16 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
         "trajectory": None if trajectory is None else _trajectory(trajectory),
         "events": {} if trajectory is None else _events(trajectory),
         "outcomes": {} if trajectory is None else _outcomes(viewed, trajectory, row),
+        "lost_words": _lost_words(row),
         "instruction_tokens": len(run.instruction_ids(position) or ()),
         "answers": {name: str(row[name]) for name in _ANSWERS if name in row and viewed.answers},
     }
+
+
+def _lost_words(row: dict[str, Any]) -> int:
+    """How many words at the end of the instruction did not reach the network."""
+    lost = row.get("lost_words")
+    return 0 if lost is None or lost != lost else int(lost)
 
 
 def _inference_steps(viewed: ViewedRun, position: int, calls: int) -> list[int]:
