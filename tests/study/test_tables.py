@@ -20,6 +20,7 @@ from probe_kit.study import LoadedStudy
 from probe_kit.study.tables.compared import difference_table, stages_table
 from probe_kit.study.tables.rates import score_table, success_table, vlm_table
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
+from tests.view.payload_reader import read_payload
 
 
 def test_stages_count_items_that_are_right_in_both_layouts(tmp_path: Path) -> None:
@@ -168,3 +169,17 @@ def test_without_a_name_all_tables_are_printed_and_their_tests_are_counted(
     assert partly.exit_code == 0
     assert "no table drift: " in partly.stderr
     assert run.invoke(app, ["study", "table", str(file)]).exit_code != 0
+
+
+def test_the_viewer_opens_every_stored_run_of_a_study(played: LoadedStudy, tmp_path: Path) -> None:
+    answer = CliRunner().invoke(
+        app, ["view", str(played.file), "--export", str(tmp_path / "page"), "--without-frames"]
+    )
+    assert answer.exit_code == 0, answer.output
+    data = Path(answer.stdout.strip()).parent / "data"
+    _, index = read_payload((data / "index.js").read_bytes())
+    cells = [Path(cell.folder).name for cell in played.cells]
+    assert [one["key"] for one in index["runs"]] == cells
+    assert [one["episodes"] for one in index["runs"]] == [cell.episodes for cell in played.cells]
+    for cell, key in zip(played.cells, cells, strict=True):
+        assert read_payload((data / key / "run.js").read_bytes())[1]["model"] == cell.settings.model

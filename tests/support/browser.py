@@ -171,6 +171,16 @@ class Page:
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
         self.settle()
 
+    def hover_at(self, selector: str, x: float, y: float) -> None:
+        """Move the mouse to shares of the width and height of the first element of a selector."""
+        self._middle(selector)
+        left, top, width, height = self.read(
+            f"(() => {{ const b = document.querySelector({json.dumps(selector)}).getBoundingClientRect(); "
+            "return [b.left, b.top, b.width, b.height]; })()"
+        )
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=left + x * width, y=top + y * height)
+        self.settle()
+
     def drag(self, selector: str, share: float) -> None:
         """Press in the middle of an element, and drag to `share` of its width."""
         x, y = self._middle(selector)

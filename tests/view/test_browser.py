@@ -19,9 +19,11 @@ from probe_kit.suite import Suite
 from probe_kit.train import load_results
 from probe_kit.view import write_viewer
 from probe_kit.view.catalogue import Catalogue
+from probe_kit.view.payloads.coding import pack_log_odds, payload_script
 from tests.support.browser import CHROMIUM, WHY_SKIPPED, Browser, Page
 from tests.support.little_run import episode, little_plan, little_writer
-from tests.view.conftest import FILM_STEPS, FILMED, HOSTILE
+from tests.view.conftest import FILM_STEPS, FILMED, HOSTILE, LOST_WORDS, SHORTENED
+from tests.view.payload_reader import read_payload
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=WHY_SKIPPED)]
 
@@ -298,9 +300,77 @@ def test_the_page_can_be_used_by_keyboard_alone(page: Page, address: str) -> Non
     assert page.read("document.activeElement.name") == "words"
 
 
+CATEGORIES, LAYERS, ITERATIONS = 11, 19, 10
+"""As many as the benchmark has, and sites as pi0 has them."""
+
+
+@pytest.fixture
+def crowded(address: str, tmp_path: Path) -> str:
+    """The page with its category eleven times, and 209 sites whose accuracy says which one it is."""
+    folder = tmp_path / "page"
+    shutil.copytree(Path(address.removeprefix("file://")).parent, folder)
+    data = folder / "data" / "a"
+    run, own = (read_payload((data / f"{name}.js").read_bytes())[1] for name in ("run", "map/color"))
+    sites = [("backbone", layer, None) for layer in range(LAYERS)]
+    sites += [("expert", layer, step) for step in range(ITERATIONS) for layer in range(LAYERS)]
+    run["sites"] = [
+        {"name": f"{stream}.{layer:02d}.residual" + ("" if step is None else f"@{step}"), "stream": stream,
+         "layer": layer, "iteration": step}
+        for stream, layer, step in sites
+    ]  # fmt: skip
+    run["categories"] = [{**run["categories"][0], "name": f"c{n}", "title": f"C{n}"} for n in range(CATEGORIES)]
+    own["accuracy"] = [round(0.5 + place / 500, 4) for place in range(len(sites))]
+    own["signal"] = [place % 7 == 0 for place in range(len(sites))]
+    own["cells"] = [[f"cell {place}", *own["cells"][0][1:]] for place in range(len(sites))]
+    own["log_odds"] = pack_log_odds(np.zeros((len(sites), len(own["rows"]))))
+    (data / "run.js").write_bytes(payload_script("a/run", run))
+    for one in run["categories"]:
+        (data / "map" / f"{one['name']}.js").write_bytes(payload_script(f"a/map/{one['name']}", own))
+    return (folder / "index.html").as_uri()
+
+
+def test_maps_of_all_categories_are_few_elements_and_every_site_can_be_reached(page: Page, crowded: str) -> None:
+    page.open(f"{crowded}#/map?category=c1&site=expert.00.residual@0")
+    page.settle()
+    assert page.read("document.querySelectorAll('.smallmap').length") == CATEGORIES
+    assert page.read("document.querySelectorAll('*').length") <= 2000
+    page.read("document.querySelectorAll('.smallmap')[3].focus()")
+    for key, site in (("ArrowUp", 20), ("ArrowRight", 39), ("ArrowDown", 38), ("ArrowLeft", 19), ("ArrowLeft", 0)):
+        page.press(key)
+        said = text(page, "figure:nth-child(4) .smallmap [aria-live]")
+        assert said == page.read("document.activeElement.title")
+        assert said.endswith(f": cell {site}"), (key, said)
+    page.press("Enter")
+    assert "category=c3" in page.read("location.hash")
+    assert "site=backbone.00.residual" in page.read("location.hash")
+    for column, row, site in ((0, 0, 18), (3, LAYERS - 1, 19 + 2 * LAYERS), (10, 0, 18 + 10 * LAYERS)):
+        page.hover_at("figure:nth-child(6) .smallmap", *spot(column, row))
+        assert str(page.read("document.querySelectorAll('.smallmap')[5].title")).endswith(f": cell {site}")
+
+
+def spot(column: int, row: int) -> tuple[float, float]:
+    """Shares of width and height of the middle of a cell: the streams are 0.6 cells apart."""
+    return (column + 0.5 + 0.6 * (column > 0)) / (ITERATIONS + 1.6), (row + 0.5) / LAYERS
+
+
+def test_words_that_did_not_reach_the_model_are_struck_out(page: Page, address: str, runs: list[Run]) -> None:
+    words = str(runs[0].episodes["instruction"].iloc[SHORTENED]).split()
+    page.open(f"{address}#/episodes?ep={SHORTENED}")
+    assert text(page, ".episode h2 del") == " ".join(words[-LOST_WORDS:])
+    assert text(page, ".episode h2") == f"“{' '.join(words)}”"
+    assert f"{LOST_WORDS} words did not reach the model" in text(page, ".facts")
+    page.open(f"{address}#/episodes?ep=0")
+    assert page.read("document.querySelector('del')") is None
+
+
 FOCUS = "[getComputedStyle(document.activeElement).outlineStyle, document.activeElement.outerHTML.slice(0, 120)]"
 WIDE = """[...document.querySelectorAll("main *")].filter(one => !one.closest(".scroll, svg") &&
     one.getBoundingClientRect().right > innerWidth + 1).map(one => one.outerHTML.slice(0, 160))"""
+HIDDEN_VIEWS = """
+    [...document.querySelectorAll("nav[aria-label=Views] a")].filter(one => {
+    const box = one.getBoundingClientRect(), nav = one.parentElement.getBoundingClientRect();
+    return box.left < nav.left - 1 || box.right > nav.right + 1 || nav.right > innerWidth;
+    }).map(one => one.innerText)"""
 
 CONTRAST = """(() => {
     const canvas = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
@@ -336,6 +406,7 @@ def test_nothing_overflows_and_every_word_can_be_read(
         page.settle()
         assert page.read("document.documentElement.scrollWidth") <= width, (view, page.read(WIDE))
         assert page.read(CONTRAST) == [], view
+        assert page.read(HIDDEN_VIEWS) == [], view
     assert browser.complaints == []
 
 

@@ -12,6 +12,8 @@ function Maps({ run, list, place }) {
     const v = logOdds(map.log_odds), n = map.rows.length;
     return map.rows.map((row, i) => ({ one: list[row], value: v[site * n + i] })).filter((r) => r.one).sort((a, b) => a.value - b.value);
   }, [map, site, list]);
+  const shades = useMemo(() => all.map((own) => own && ((i) => ({ ...shadeOf(own, run.chance)(i), words: own.cells[i][0] }))), all);
+  const summary = (own, i) => `${own.signal.filter(Boolean).length} of ${own.signal.length} sites with signal; ${nice(run, run.sites[i])}: ${own.cells[i][0]}`;
   if (!names.length) return html`<p class="empty">${run.answers ? "This model was asked and no stream of it was probed." : html`This run has no probes. <code>probe-kit train RUN</code> fits them.`}</p>`;
   if (trouble) return html`<p class="trouble" role="alert">${trouble}</p>`;
   if (!map) return html`<p class="loading">Loading …</p>`;
@@ -30,6 +32,6 @@ function Maps({ run, list, place }) {
         return html`<div class=${`lane ${pair}`} data-pair=${pair}><div class="lanename">probe ${words} <b>${own.length}</b></div><div class="chips">${own.slice(0, CHIPS).map((r) => html`<a class=${`chip ${r.value > 0 ? "up" : "down"}`} style=${{ "--t": Math.min(1, Math.abs(r.value) / 6) }} href=${open(r.one)} title=${`${r.one.instruction} · ${signed(r.value)}`}>${r.one.number}</a>`)}
           ${own.length > CHIPS && html`<a class="more" href=${link({ view: "episodes", category, case: `site.${pair}`, site: run.sites[site].name, ep: undefined })}>all ${own.length}</a>`}</div></div>`;
       })}</div>` : html`<p class="soft">No signal is shown at this site, so that its sign says neither right nor wrong: ${ranked.length} episodes are not counted.</p>`}</section>
-    ${names.length > 1 && html`<section class="panel"><h2>All categories <small>one scale</small></h2><div class="small-multiples">${names.map((name, k) => all[k] && html`<figure class=${name === category ? "on" : ""}><figcaption><a href=${link({ category: name })}>${titleOf(run, name)}</a></figcaption><${SiteMap} run=${run} label=${titleOf(run, name)} chosen=${name === category ? site : null} cell=${(i) => ({ ...shadeOf(all[k], run.chance)(i), words: all[k].cells[i][0] })} onChoose=${(i) => go({ category: name, site: run.sites[i].name })} /></figure>`)}</div></section>`}
+    ${names.length > 1 && html`<section class="panel"><h2>All categories <small>sites in the places of the map above · one scale</small></h2><div class="small-multiples">${names.map((name, k) => all[k] && html`<figure class=${name === category ? "on" : ""}><figcaption><a href=${link({ category: name })}>${titleOf(run, name)}</a></figcaption><${SmallMap} run=${run} label=${`${titleOf(run, name)}, ${summary(all[k], site)}`} chosen=${name === category ? site : null} start=${site} cell=${shades[k]} onChoose=${(i) => go({ category: name, site: run.sites[i].name })} /></figure>`)}</div></section>`}
   </div>`;
 }

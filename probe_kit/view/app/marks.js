@@ -69,46 +69,94 @@ function Series({ title, unit, lines, steps, now, onNow, low, high, height = 150
   </figure>`;
 }
 
-/* Layer × iteration. cell(i) gives {t, kind, text, words} of a site. Arrow keys move between cells. */
-function SiteMap({ run, cell, chosen, onChoose, onHover, label, legend }) {
-  const grid = useRef(null), sites = run.sites;
-  const blocks = useMemo(() => [...new Set(sites.map((s) => s.stream))].map((stream) => {
-    const own = sites.map((s, i) => ({ ...s, i })).filter((s) => s.stream === stream);
+/* Where sites are drawn: a block per stream, layers upwards, iterations to the right. */
+function blocksOf(run) {
+  return [...new Set(run.sites.map((s) => s.stream))].map((stream) => {
+    const own = run.sites.map((s, i) => ({ ...s, i })).filter((s) => s.stream === stream);
     const layers = [...new Set(own.map((s) => s.layer))].sort((a, b) => a - b);
     const columns = [...new Set(own.map((s) => s.iteration ?? 0))].sort((a, b) => a - b);
     const at = new Map(own.map((s) => [`${s.layer}.${s.iteration ?? 0}`, s.i]));
     return { stream, label: run.streams.find((s) => s.name === stream)?.label ?? stream, layers, columns, at, iterated: own.some((s) => s.iteration != null) };
-  }), [sites]);
-  const move = (event, b, row, column) => {
-    const by = { ArrowUp: [1, 0], ArrowDown: [-1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] }[event.key];
-    if (!by) return;
+  });
+}
+const ARROWS = { ArrowUp: [1, 0], ArrowDown: [-1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+/* The site that an arrow key leads to from site i, on to the next stream at the side of one. */
+function beside(run, blocks, i, key) {
+  const site = run.sites[i], b = blocks.findIndex((block) => block.stream === site.stream), by = ARROWS[key];
+  let block = b, c = blocks[b].columns.indexOf(site.iteration ?? 0) + by[1];
+  const r = blocks[b].layers.indexOf(site.layer) + by[0];
+  if (c < 0 && b > 0) { block = b - 1; c = blocks[block].columns.length - 1; }
+  else if (c >= blocks[b].columns.length && b < blocks.length - 1) { block = b + 1; c = 0; }
+  const { layers, columns, at } = blocks[block];
+  return at.get(`${layers[Math.max(0, Math.min(r, layers.length - 1))]}.${columns[c]}`) ?? i;
+}
+/* Layer × iteration. cell(i) gives {t, kind, text, words} of a site. Arrow keys move between cells. */
+function SiteMap({ run, cell, chosen, onChoose, onHover, label, legend }) {
+  const grid = useRef(null), sites = run.sites, blocks = useMemo(() => blocksOf(run), [sites]);
+  const move = (event, i) => {
+    if (!ARROWS[event.key]) return;
     event.preventDefault();
     event.stopPropagation();
-    let block = b, c = column + by[1];
-    const r = row + by[0];
-    if (c < 0 && b > 0) { block = b - 1; c = blocks[block].columns.length - 1; }
-    else if (c >= blocks[b].columns.length && b < blocks.length - 1) { block = b + 1; c = 0; }
-    const { layers, columns, at } = blocks[block];
-    const next = at.get(`${layers[Math.max(0, Math.min(r, layers.length - 1))]}.${columns[c]}`);
-    if (next != null) grid.current.querySelector(`[data-site="${sites[next].name}"]`)?.focus();
+    grid.current.querySelector(`[data-site="${sites[beside(run, blocks, i, event.key)].name}"]`)?.focus();
   };
-  return html`<div class="sitemap" ref=${grid}>${blocks.map((block, b) => html`<div class="block" style=${{ "--columns": block.columns.length, "--rows": block.layers.length }}>
+  return html`<div class="sitemap" ref=${grid}>${blocks.map((block) => html`<div class="block" style=${{ "--columns": block.columns.length, "--rows": block.layers.length }}>
       <div class="blockname">${block.label} <i>${block.iterated ? "layer ↑ iteration →" : "layer ↑"}</i></div>
       <div class="cells" role="grid" aria-label=${`${label}, ${block.label}: layers upwards${block.iterated ? ", iterations to the right" : ""}`}>
       ${block.layers.map((layer, r) => [layer, r]).reverse().map(([layer, r]) => html`<div role="row" class="row">
         <span class="axis" aria-hidden="true">${block.layers.length <= 8 || layer % 3 === 0 || r === block.layers.length - 1 ? layer : ""}</span>
-        ${block.columns.map((column, c) => {
+        ${block.columns.map((column) => {
           const i = block.at.get(`${layer}.${column}`);
           if (i == null) return html`<span class="cell none"></span>`;
           const { t, kind = "", text = "", words } = cell(i);
           return html`<button type="button" role="gridcell" class=${`cell ${kind} ${chosen === i ? "chosen" : ""}`} data-site=${sites[i].name} style=${{ "--t": t }} aria-label=${`${sites[i].name}: ${words}`} title=${`${sites[i].name}: ${words}`}
-            tabindex=${chosen === i || (chosen == null && i === 0) ? 0 : -1} onClick=${() => onChoose(i)} onPointerEnter=${() => onHover?.(i)} onFocus=${() => onHover?.(i)} onPointerLeave=${() => onHover?.(null)} onKeyDown=${(e) => move(e, b, r, c)}>${text}</button>`;
+            tabindex=${chosen === i || (chosen == null && i === 0) ? 0 : -1} onClick=${() => onChoose(i)} onPointerEnter=${() => onHover?.(i)} onFocus=${() => onHover?.(i)} onPointerLeave=${() => onHover?.(null)} onKeyDown=${(e) => move(e, i)}>${text}</button>`;
         })}</div>`)}
       </div>
       <div class="foot" aria-hidden="true"><span class="axis"></span>${block.columns.map((c) => html`<span>${block.iterated ? c : ""}</span>`)}</div>
     </div>`)}
     ${legend}
   </div>`;
+}
+
+/* The same in small: a path per tone, so that hundreds of sites are few elements. The tab key stops once; arrows move, Enter chooses. */
+const TONES = 20, GAP = 0.6;
+function SmallMap({ run, cell, chosen, start, onChoose, label }) {
+  const blocks = useMemo(() => blocksOf(run), [run.sites]), [at, setAt] = useState(null);
+  const rows = Math.max(...blocks.map((block) => block.layers.length));
+  let width = -GAP;
+  const starts = blocks.map((block) => { const start = width + GAP; width = start + block.columns.length; return start; });
+  const spot = (i) => { const { stream, layer, iteration } = run.sites[i], b = blocks.findIndex((block) => block.stream === stream); return [starts[b] + blocks[b].columns.indexOf(iteration ?? 0), rows - 1 - blocks[b].layers.indexOf(layer)]; };
+  const tones = useMemo(() => {
+    const found = new Map();
+    run.sites.forEach((_, i) => {
+      const { t, kind } = cell(i), tone = Math.round(t * TONES), [x, y] = spot(i), own = found.get(tone) ?? { cells: "", dots: "" };
+      own.cells += `M${x + 0.04} ${y + 0.06}h.92v.88h-.92z`;
+      if (kind === "signal") own.dots += `M${x + 0.64} ${y + 0.16}h.2v.24h-.2z`;
+      found.set(tone, own);
+    });
+    return [...found];
+  }, [cell, blocks]);
+  const under = (event) => {
+    const box = event.currentTarget.getBoundingClientRect(), x = ((event.clientX - box.left) / box.width) * width, y = Math.floor(((event.clientY - box.top) / box.height) * rows);
+    const b = starts.findLastIndex((start) => x >= start), block = blocks[b];
+    return block?.at.get(`${block.layers[rows - 1 - y]}.${block.columns[Math.floor(x - starts[b])]}`) ?? null;
+  };
+  const keys = (event) => {
+    const here = at ?? start;
+    if (ARROWS[event.key]) setAt(beside(run, blocks, here, event.key));
+    else if (event.key === "Enter" || event.key === " ") onChoose(here);
+    else return;
+    event.preventDefault();
+    event.stopPropagation();
+  };
+  const words = at == null ? "" : `${run.sites[at].name}: ${cell(at).words}`;
+  const frame = (i, kind) => { const [x, y] = spot(i); return html`<rect class=${kind} x=${x} y=${y} width="1" height="1" />`; };
+  return html`<div class="smallmap" role="application" tabindex="0" aria-label=${`${label}; arrows move between sites, Enter chooses one`} title=${words} style=${{ "--rows": rows }}
+      onPointerMove=${(e) => setAt(under(e))} onPointerLeave=${() => setAt(null)} onFocus=${() => setAt(start)} onBlur=${() => setAt(null)} onKeyDown=${keys} onClick=${(e) => { const i = under(e); if (i != null) onChoose(i); }}>
+    <svg viewBox=${`0 0 ${width} ${rows}`} preserveAspectRatio="none" aria-hidden="true">
+      ${tones.map(([tone, { cells, dots }]) => html`<g key=${tone} style=${{ "--t": tone / TONES }}><path class="cells" d=${cells} />${dots && html`<path class="dots" d=${dots} />`}</g>`)}
+      ${chosen != null && frame(chosen, "chosen")}${at != null && frame(at, "here")}
+    </svg><span class="sr" aria-live="polite">${words}</span></div>`;
 }
 
 /* From above, as the camera looks: away from the robot is up, the left tile is left. Tiles are drawn where they are now. */

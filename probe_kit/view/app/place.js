@@ -42,7 +42,7 @@ function useKeys(press) {
   const latest = useRef(press);
   latest.current = press;
   useEffect(() => {
-    const listen = (e) => { if (!e.ctrlKey && !e.metaKey && !e.altKey && !e.target.closest("input, select, textarea, [role=gridcell]")) latest.current(e); };
+    const listen = (e) => { if (!e.ctrlKey && !e.metaKey && !e.altKey && !e.target.closest("input, select, textarea, [role=gridcell], [role=application]")) latest.current(e); };
     addEventListener("keydown", listen);
     return () => removeEventListener("keydown", listen);
   }, []);
