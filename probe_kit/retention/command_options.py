@@ -1,5 +1,6 @@
 """Options of `probe-kit retention` and `probe-kit stages`, by help panel."""
 
+from collections.abc import Mapping
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast, get_args
@@ -54,6 +55,14 @@ def read_iterations(text: str) -> "Iterations":
     return cast("Iterations", text)
 
 
+def check_no_others(given: Mapping[str, object]) -> None:
+    """Raise UsageError for an option that labels of your own do not have. given: options, by name."""
+    if wrong := [name for name, value in given.items() if value]:
+        raise UsageError(
+            f"{wrong[0]} is for sides and success rates, not for labels of your own; leave it out with --target"
+        )
+
+
 # -- runs and probes ---------------------------------------------------------------------------------------------
 
 Runs = Annotated[
@@ -70,6 +79,15 @@ Against = Annotated[
         "--against",
         metavar="NAME",
         help="Run or group that all others are compared with. Default: the first run; of groups every pair.",
+    ),
+]
+LabelTarget = Annotated[
+    str | None,
+    typer.Option(
+        "--target",
+        metavar="COLUMN",
+        help="Retention of a label of your own, by its column. Default: of the side of the correct picture.",
+        rich_help_panel=RUNS,
     ),
 ]
 ProbeKeys = Annotated[

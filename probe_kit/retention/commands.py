@@ -19,6 +19,7 @@ def retention(
     runs: own.Runs = None,
     group: own.Groups = None,
     against: own.Against = None,
+    target: own.LabelTarget = None,
     probes: own.ProbeKeys = None,
     views: own.Views = None,
     iterations: own.IterationChoice = "all",
@@ -36,13 +37,31 @@ def retention(
     html: own.Html = None,
     figures: own.Figures = None,
 ) -> None:
-    """Print success rates and how much of the backbone's signal reaches the action stream."""
+    """Print success rates and how much of the backbone's signal reaches the action stream.
+
+    With `--target COLUMN` the signal is that of a label of your own, see `probe-kit train --target COLUMN`.
+    """
     from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
     from probe_kit.extract import open_run
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
+    from probe_kit.retention.label_commands import show_label_retention
     from probe_kit.retention.rows.outcome_rules import check_epsilons
 
+    if target is not None:
+        refused = {
+            "--group": group, "--against": against, "--rule": rule != "disc", "--last-steps": last_steps != 1,
+            "--epsilons": epsilons, "--score": score != "text", "--vlm-vla": vlm_vla,
+            "--with-side-words": with_side_words, "--details": details, "--html": html,
+            "--figures": figures, "--absent-below": absent_below != 0.65,
+        }  # fmt: skip
+        own.check_no_others(refused)
+        if not runs:
+            raise UsageError("give run folders whose probes of a label are stored")
+        opened_runs = [open_run(p, allow_partial=partial).in_wording(wording) for p in runs]
+        options = own.read_iterations(iterations), _keys(runs, probes or [])
+        show_label_retention(opened_runs, target, views, *options, style)
+        return
     check_epsilons(rule, epsilons is not None)
     if bool(runs) == bool(group):
         raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")

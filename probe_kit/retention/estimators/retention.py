@@ -3,7 +3,7 @@
 That is the action expert or, in a policy without one, the positions that choose its action tokens.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import nan
 from typing import Literal
@@ -178,13 +178,24 @@ def _missing_signal(exceeds: Exceeds, at_most: Mapping[str, float], absent_below
 def stream_rows(curve: ProbeCurve, stream: str, iterations: Iterations) -> NDArray[np.intp]:
     """Positions of a stream's sites at these iterations. Raises UsageError if it has no such iteration."""
     rows = curve.stream(stream)
-    steps = {curve.sites[row].iteration for row in rows} - {None}
-    if iterations in ("all", "best") or not steps:
+    step = known_iteration(stream, [curve.sites[row].iteration for row in rows], iterations)
+    if step is None:
         return rows
+    return np.array([row for row in rows if curve.sites[row].iteration == step], dtype=np.intp)
+
+
+def known_iteration(stream: str, every: Sequence[int | None], iterations: Iterations) -> int | None:
+    """The one iteration that takes part; None for all, and of a stream that runs once.
+
+    every: the iterations of its sites. Raises UsageError if it has no such iteration.
+    """
+    steps = set(every) - {None}
+    if iterations in ("all", "best") or not steps:
+        return None
     step = max(filter(None, steps), default=0) if iterations == "last" else iterations
     if step not in steps:
         raise UsageError(f"the stream {stream} has iterations 0 to {len(steps) - 1}, not {step}")
-    return np.array([row for row in rows if curve.sites[row].iteration == step], dtype=np.intp)
+    return int(step)
 
 
 def _action_rows(curve: ProbeCurve, iterations: Iterations) -> NDArray[np.intp]:

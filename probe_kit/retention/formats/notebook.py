@@ -6,6 +6,7 @@ from html import escape
 from probe_kit._terminal.local_paths import without_places
 from probe_kit.retention.columns.summary import summarise_runs, summary_table
 from probe_kit.retention.columns.text import model_name
+from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.html import HtmlCell, HtmlTable, html_tables, plain_tables
 from probe_kit.retention.rows.row import RetentionRow
@@ -24,6 +25,12 @@ def table_html(rows: Sequence[RetentionRow], differences: Sequence[Difference]) 
     ]
     details = f"<details><summary>All tables</summary>{''.join(map(_table, tables))}</details>"
     return f"{_heading(rows)}{''.join(map(_table, summary))}<ul>{said}</ul>{details}"
+
+
+def text_table_html(table: TextTable, sentences: Sequence[str]) -> str:
+    """A table of text, and sentences below it."""
+    said = "".join(f"<li>{_safe(sentence)}</li>" for sentence in sentences)
+    return f"{''.join(map(_table, plain_tables([table])))}<ul>{said}</ul>"
 
 
 def _safe(text: str) -> str:

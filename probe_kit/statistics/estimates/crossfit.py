@@ -63,7 +63,7 @@ class Stream:
 class CrossFit:
     """Cross-fitted scores of K streams on the same groups.
 
-    above: (K,) mean held-out accuracy of the chosen sites, above one half. peaks: (K,) accuracy of the site that
+    above: (K,) mean held-out accuracy of the chosen sites, above chance. peaks: (K,) accuracy of the site that
     is best on all groups, scored on them too. differences: (K, HALVINGS) score on one half of the groups minus
     score on the other. n_groups, n_episodes: G and E. seed: of the halvings; equal seeds and groups have equal
     halvings.
@@ -105,20 +105,20 @@ class CrossFit:
         return covariance
 
 
-def crossfit(streams: Sequence[Stream], seed: int) -> CrossFit:
+def crossfit(streams: Sequence[Stream], seed: int, chance: float = CHANCE) -> CrossFit:
     """Choose each stream's best site on half of the groups and score it on the other half, both ways, 100 times.
 
     streams: on the same groups, in the same order. seed: of the halvings; derive it from the suite and the names
     of the groups (`units_seed`), so that neither other categories nor the order of work change a number, and so
-    that runs on the same groups stay paired. Sites that are equally good share the choice, so that their order
-    does not matter. Raises TooFewGroupsError for fewer than 4 groups, and UsageError for NaN or streams on other
-    groups.
+    that runs on the same groups stay paired. chance: 0 for sums from which the chance of every site is subtracted
+    already. Sites that are equally good share the choice, so that their order does not matter. Raises
+    TooFewGroupsError for fewer than 4 groups, and UsageError for NaN or streams on other groups.
     """
     n_groups = _check(streams)
     whole, parts = _splits(n_groups, seed)
     above, differences = [], []
     for stream in streams:
-        above.append(held_out_scores(stream, whole).mean() - CHANCE)
+        above.append(held_out_scores(stream, whole).mean() - chance)
         of_half = held_out_scores(stream, parts).reshape(HALVINGS, 2, REPEATS_OF_HALF).mean(axis=2)
         differences.append(of_half[:, 0] - of_half[:, 1])
     peaks = np.array([stream.peak for stream in streams])

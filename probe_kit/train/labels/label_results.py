@@ -57,6 +57,10 @@ class LabelCurve:
         """Positions of the sites of one stream."""
         return np.flatnonzero([site.stream == name for site in self.sites])
 
+    def of_part(self, part: str) -> str | None:
+        """The first stream of a part of the model, `backbone` or `action`; None if none was probed."""
+        return next((site.stream for site, own in zip(self.sites, self.parts, strict=True) if own == part), None)
+
     def p_fwe(self) -> Matrix:
         """(S,) family-wise p: each stream's sites are one family.
 

@@ -1,0 +1,1 @@
+"""Retention of labels of your own: estimates, and the table that shows them."""

@@ -1,0 +1,210 @@
+"""Retention of a label: share of the backbone's score above chance that is left in the action."""
+
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
+from probe_kit.hooks.contract.sites import label_of
+from probe_kit.retention.estimators.retention import Iterations, known_iteration
+from probe_kit.retention.estimators.stream_scores import ACTION, BACKBONE, Limits, limits
+from probe_kit.statistics.bootstrap import units_seed
+from probe_kit.statistics.estimates.balanced import GroupSums
+from probe_kit.statistics.estimates.crossfit import Stream, crossfit
+from probe_kit.statistics.estimates.retention import Ratio, retention
+from probe_kit.statistics.estimates.scores import Scores, t_quantile
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.labels.label_results import METRICS, LabelCurve, LabelResults
+
+LEAST_EXCESS = 0.05
+"""R² above chance that the backbone must have; a ratio of less is the ratio of two errors."""
+STEP = "step"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelPeak:
+    """The score of a label in one stream.
+
+    above: score above chance of a site chosen on half of the groups, on the other half; ci: its 95 % interval,
+    Student's. site: of the largest score above its own chance; score, chance, p_fwe: of that site. exceeds: by
+    control that was run, whether the site exceeds it.
+    """
+
+    stream: str
+    site: str
+    score: float
+    chance: float
+    p_fwe: float
+    exceeds: dict[str, bool]
+    above: float
+    ci: Limits
+
+    @property
+    def missed(self) -> tuple[str, ...]:
+        """What the site is not shown to exceed: chance and controls, by name."""
+        below = ("chance",) * (not self.p_fwe < SIGNIFICANCE)
+        return (*below, *(name for name, exceeded in self.exceeds.items() if not exceeded))
+
+    @property
+    def has_signal(self) -> bool:
+        """Whether it is above chance and exceeds every control that was run."""
+        return not self.missed
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelRetention:
+    """Retention of one label in one view.
+
+    value: score of the action above chance over that of the backbone; ci: 95 %, Fieller's, (None, None) where the
+    backbone is not known well enough to divide by. defined: whether the backbone has signal to retain; note else
+    names what is missing, and reason says what was found, what was expected and what to do.
+    """
+
+    view: str
+    target: str
+    task: str
+    metric: str
+    backbone: LabelPeak
+    action: LabelPeak
+    value: float
+    ci: Limits
+    n_groups: int
+    n_samples: int
+    note: str = ""
+    reason: str = ""
+
+    @property
+    def defined(self) -> bool:
+        """Whether there is something to retain."""
+        return not self.note
+
+
+def measure_label_retention(
+    results: LabelResults, view: str | None = None, iterations: Iterations = "all"
+) -> LabelRetention:
+    """Retention of the label that `results` are of.
+
+    view: the first probed one by default. From every sample's score the chance of its site is subtracted, which
+    is the mean score of the label permutations there. Then a site is chosen on half of the groups and scored on
+    the other half, as for sides; see `probe_kit.statistics.estimates`.
+    Raises UnknownSiteError for a view that was not probed, NoProbesError for a run without backbone or action, and
+    UsageError for an iteration that the action does not have.
+    """
+    own = results.settings
+    view = view or own.views[0]
+    if view not in results.curves:
+        raise UnknownSiteError(f"view {view!r} was not probed; probed: {', '.join(own.views)}")
+    curve = results.curves[view]
+    rows = {ACTION: _rows(curve, ACTION, iterations), BACKBONE: _rows(curve, BACKBONE, "all")}
+    above = [_above_chance(curve, found, results.groups) for found in rows.values()]
+    scores = Scores.of(crossfit(above, units_seed(results.groups, own.suite), chance=0.0))
+    action, backbone = (
+        _peak(results, view, found, scores, place) for place, found in enumerate(rows.values())
+    )  # fmt: skip
+    found: Ratio = retention(scores)
+    note, reason = _refusal(results, backbone)
+    return LabelRetention(
+        view=view,
+        target=own.target,
+        task=own.task,
+        metric=METRICS[own.task],
+        backbone=backbone,
+        action=action,
+        value=found.value,
+        ci=limits(found.interval),
+        n_groups=int(np.unique(results.groups).size),
+        n_samples=int(results.labels.size),
+        note=note,
+        reason=reason,
+    )
+
+
+def _rows(curve: LabelCurve, part: str, iterations: Iterations) -> NDArray[np.intp]:
+    """Positions of the sites of a part of the model. Raises NoProbesError without any."""
+    stream = curve.of_part(part)
+    if stream is None:
+        raise NoProbesError(
+            f"no site of the {part} was probed, so there is no retention; probed: "
+            f"{', '.join(dict.fromkeys(label_of(site.stream) for site in curve.sites))}. Extract a policy whose "
+            "backbone and action stream are captured"
+        )
+    rows = curve.stream(stream)
+    step = known_iteration(stream, [curve.sites[row].iteration for row in rows], iterations)
+    return rows if step is None else rows[[curve.sites[row].iteration == step for row in rows]]
+
+
+def _above_chance(curve: LabelCurve, rows: NDArray[np.intp], groups: NDArray[np.str_]) -> Stream:
+    """Scores of every sample minus the chance of its site, summed by group."""
+    names, group_of = np.unique(groups, return_inverse=True)
+    member = np.eye(names.size)[group_of]
+    chance = np.nan_to_num(curve.chance[rows])  # without permutations nothing is defined, and nothing is NaN
+    sums = GroupSums((curve.scores[rows] - chance[:, None]) @ member, member.sum(axis=0))
+    sites = [curve.sites[row] for row in rows]
+    return Stream.of(sums, [site.layer for site in sites], [site.iteration or 0 for site in sites])
+
+
+def _peak(results: LabelResults, view: str, rows: NDArray[np.intp], scores: Scores, place: int) -> LabelPeak:
+    curve = results.curves[view]
+    best = rows[np.argmax((curve.metric - np.nan_to_num(curve.chance))[rows])]
+    above = float(scores.above[place])
+    spread = t_quantile(scores.df) * sqrt(scores.covariance[place, place])
+    site = curve.sites[best]
+    return LabelPeak(
+        stream=site.stream,
+        site=str(site),
+        score=float(curve.metric[best]),
+        chance=float(curve.chance[best]),
+        p_fwe=float(curve.p_fwe()[best]),
+        exceeds=results.controls.exceeded(view, site),
+        above=above,
+        ci=(above - spread, above + spread),
+    )
+
+
+def _refusal(results: LabelResults, backbone: LabelPeak) -> tuple[str, str]:
+    """Why there is nothing to retain, in few words and in full; two empty texts where there is."""
+    own, score = results.settings, METRICS[results.settings.task]
+    found = f"the backbone's best site {backbone.site} has {score} {backbone.score:.2f}"
+    if backbone.p_fwe != backbone.p_fwe:
+        return "n/a (no permutations)", (
+            f"{found}, and no permuted labels say what chance is. Train with --permutations 200, on groups that "
+            "can exchange labels"
+        )
+    if own.window > 1 and STEP not in results.controls.names:
+        return "n/a (control step was not run)", (
+            f"{found}, and labels change within episodes, so their step may say as much. Train with the control "
+            f"step: `--controls {','.join([STEP, *results.controls.names])}`"
+        )
+    if missed := backbone.missed:
+        scores = {one.name: one.score for one in results.controls.scores if one.stream in ("", backbone.stream)}
+        facts = [f"chance {backbone.chance:.2f}, p {backbone.p_fwe:.3f}"]
+        facts += [f"{name} {scores[name]:.2f}" for name in missed if name in scores]
+        return f"n/a (backbone not shown to exceed {_listed(missed)})", (
+            f"{found} ({'; '.join(facts)}). Expected p < {SIGNIFICANCE} and more than every control that was run. "
+            "Label more groups, or choose a label that these controls do not decode"
+        )
+    if own.task == "continuous" and backbone.above < LEAST_EXCESS:
+        return f"n/a (backbone {backbone.above:.2f} above chance)", (
+            f"{found}, {backbone.above:.2f} above chance where a site is chosen on other groups; expected "
+            f"{LEAST_EXCESS} or more to divide by. Label more groups"
+        )
+    return "", ""
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    *others, last = names
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def check_same_label(results: list[LabelResults]) -> None:
+    """Raise UsageError where two results are of labels that differ in any value or sample."""
+    for one in results[1:]:
+        first = results[0]
+        if one.settings.label != first.settings.label:
+            raise UsageError(
+                f"the labels {one.settings.target!r} of {one.settings.model} and {first.settings.model} differ "
+                f"(sha256 {one.settings.label[:12]} and {first.settings.label[:12]}); retention is compared on "
+                "the same labels of the same episodes. Show the runs one by one"
+            )

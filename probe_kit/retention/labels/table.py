@@ -1,0 +1,219 @@
+"""The retention table of a label: a row per run and view, in the formats of every retention table."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from math import nan
+from typing import TYPE_CHECKING, Any
+
+from probe_kit._system.csv_text import csv_of_frame
+from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.sites import label_of
+from probe_kit.retention.behaviour.run_labels import full_names
+from probe_kit.retention.columns.text import number, with_limits
+from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.estimators.retention import Iterations
+from probe_kit.retention.labels.estimate import (
+    LabelPeak,
+    LabelRetention,
+    check_same_label,
+    measure_label_retention,
+)
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.labels.label_results import LabelResults
+from probe_kit.train.labels.label_store import load_label_results
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import Group
+
+_NOTE = (
+    "above chance: score of a site chosen on half of the groups, on the other half, minus its mean score with "
+    "permuted labels; 95 % intervals over groups"
+)
+
+
+@dataclass(frozen=True)
+class LabelRow:
+    """Retention of a label in one run and view. run: what tables call it. settings: key of its probes."""
+
+    run: str
+    location: str
+    settings: str
+    retention: LabelRetention
+
+
+@dataclass(frozen=True, repr=False)
+class LabelRetentionTable:
+    """Rows per run and view. results: the probes that they were made of, by location."""
+
+    rows: tuple[LabelRow, ...]
+    results: Mapping[str, LabelResults] = field(default_factory=dict)
+    iterations: Iterations = "all"
+
+    def __repr__(self) -> str:
+        names = ", ".join(dict.fromkeys(f"{row.retention.target} of {row.run}" for row in self.rows))
+        return f"<LabelRetentionTable of {names}; print(table.to_markdown()) shows it>"
+
+    @property
+    def text(self) -> TextTable:
+        """The table as text."""
+        one = self.rows[0].retention
+        return TextTable(
+            f"{one.target}: {one.metric}, and what reaches the action",
+            _NOTE,
+            (
+                *("run", "view"),
+                *("backbone site", "score", "chance", "above chance"),
+                *("action site", "score", "chance", "above chance"),
+                "retention",
+            ),
+            tuple(
+                (row.run, row.retention.view, *_peak(row.retention.backbone), *_peak(row.retention.action),
+                 _value(row.retention))
+                for row in self.rows
+            ),
+            (("", 2), ("backbone", 4), ("action", 4), ("", 1)),
+            names=2,
+        )  # fmt: skip
+
+    @property
+    def sentences(self) -> list[str]:
+        """One per row: what reaches the action, or why that has no number."""
+        return [_sentence(row, len(self.results) > 1) for row in self.rows]
+
+    def to_frame(self) -> "pd.DataFrame":
+        """One line per row with the fields of `LabelRetention`, of its streams as `backbone.score` and so on.
+
+        Intervals become two columns. Retention is NaN where it is not defined; `to_json` keeps the ratio.
+        """
+        import pandas as pd
+
+        return pd.DataFrame([_flat(row) for row in self.rows])
+
+    def to_json(self) -> str:
+        """All rows as a JSON list of objects."""
+        return json.dumps([_plain(asdict(row)) for row in self.rows], indent=2, ensure_ascii=False)
+
+    def to_csv(self) -> str:
+        """`to_frame` as comma-separated values with a header."""
+        return csv_of_frame(self.to_frame())
+
+    def to_markdown(self) -> str:
+        """The table and its sentences in Markdown."""
+        from probe_kit.retention.formats.markdown import markdown_table
+
+        said = "\n".join(f"* {sentence}" for sentence in self.sentences)
+        return f"{markdown_table(self.text)}\n{_NOTE}\n\n{said}"
+
+    def to_latex(self) -> str:
+        """The table in LaTeX; needs the package booktabs."""
+        from probe_kit.retention.formats.latex import latex_table
+
+        return "\n".join([latex_table(self.text), *(f"% {sentence}" for sentence in self.sentences)])
+
+    def to_rich(self) -> "Group":
+        """The table for a rich console, and a sentence per row."""
+        from rich.console import Group
+        from rich.text import Text
+
+        from probe_kit.retention.formats.terminal import responsive_table
+
+        return Group(responsive_table(self.text), *map(Text, self.sentences))
+
+    def _repr_html_(self) -> str:
+        from probe_kit.retention.formats.notebook import text_table_html
+
+        return text_table_html(self.text, self.sentences)
+
+
+def label_retention_table(
+    runs: Sequence[RunReader],
+    target: str,
+    views: Sequence[str] | None = None,
+    *,
+    iterations: Iterations = "all",
+    keys: Sequence[str | None] | None = None,
+) -> LabelRetentionTable:
+    """Retention of the label `target` in runs whose probes of it are stored; see `measure_label_retention`.
+
+    views: those that were probed by default. keys: which stored probes of each run, in order; those asked for last
+    by default. Raises NoProbesError for a run without probes of the label, UsageError for several runs whose
+    labels differ, and what `measure_label_retention` raises.
+    """
+    if not runs:
+        raise UsageError("retention of a label needs at least one run")
+    chosen = list(keys or [None] * len(runs))
+    if len(chosen) != len(runs):
+        raise UsageError(f"{len(chosen)} keys for {len(runs)} runs; give one per run, or None for the newest")
+    results = {
+        str(run.location): load_label_results(run, key, target) for run, key in zip(runs, chosen, strict=True)
+    }
+    check_same_label(list(results.values()))
+    names = dict(zip(results, full_names(runs), strict=True))
+    rows = [
+        LabelRow(names[place], place, own.key, measure_label_retention(own, view, iterations))
+        for place, own in results.items()
+        for view in views or own.settings.views
+    ]
+    return LabelRetentionTable(tuple(rows), results, iterations)
+
+
+def _peak(peak: LabelPeak) -> tuple[str, str, str, str]:
+    score = f"{number(peak.score)}{' ✓' * peak.has_signal}"
+    chance = "–" if peak.chance != peak.chance else number(peak.chance)
+    above = "–" if peak.chance != peak.chance else with_limits(number(peak.above), peak.ci, number)
+    return peak.site, score, chance, above
+
+
+def _value(found: LabelRetention) -> str:
+    return with_limits(number(found.value), found.ci, number) if found.defined else found.note
+
+
+def _sentence(row: LabelRow, several: bool) -> str:
+    found = row.retention
+    where = f"{found.target}, view {found.view}" + (f", {row.run}" if several else "")
+    if not found.defined:
+        return f"{where}: retention is not defined: {found.reason}."
+    action = label_of(found.action.stream)
+    limits = with_limits(number(found.value), found.ci, number)
+    missed = found.action.missed
+    reached = f"not shown to exceed {', '.join(missed)}" if missed else f"signal there (p < {SIGNIFICANCE})"
+    return (
+        f"{where}: {limits} of the backbone's score above chance is left in the {action}; {reached}. "
+        f"{found.n_groups} groups, {found.n_samples} samples."
+    )
+
+
+def _flat(row: LabelRow) -> dict[str, Any]:
+    """Fields of a row; nested names are joined by a dot."""
+    own = row.retention
+    line: dict[str, Any] = {"run": row.run, "target": own.target, "task": own.task, "metric": own.metric}
+    line["view"] = own.view
+    for name, peak in (("backbone", own.backbone), ("action", own.action)):
+        low, high = peak.ci
+        line |= {
+            f"{name}.stream": peak.stream, f"{name}.site": peak.site, f"{name}.score": peak.score,
+            f"{name}.chance": peak.chance, f"{name}.p_fwe": peak.p_fwe, f"{name}.above": peak.above,
+            f"{name}.ci_low": low, f"{name}.ci_high": high,
+            **{f"{name}.exceeds.{control}": better for control, better in peak.exceeds.items()},
+        }  # fmt: skip
+    low, high = own.ci
+    line |= {
+        "retention": own.value if own.defined else nan,
+        "retention.ci_low": low if own.defined and low is not None else nan,
+        "retention.ci_high": high if own.defined and high is not None else nan,
+        "note": own.note, "reason": own.reason, "n_groups": own.n_groups, "n_samples": own.n_samples,
+        "settings": row.settings,
+    }  # fmt: skip
+    return line
+
+
+def _plain(value: Any) -> Any:
+    """As JSON has it: without NaN."""
+    if isinstance(value, dict):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return None if isinstance(value, float) and value != value else value
