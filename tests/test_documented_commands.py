@@ -142,6 +142,8 @@ def test_a_command_is_accepted_as_it_is_typed(
 LOOKED_FOR = {
     "extract": "accepted so far|kitchen is no LeRobotDataset",
     "show": "kitchen is no LeRobotDataset",
+    "errors": "Make one with",
+    "check-environment": "there is no module kitchen",
     "ask": "accepted so far",
     "view": "Make one with",
     "labels": "Make one with",

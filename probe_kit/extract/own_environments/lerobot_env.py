@@ -118,7 +118,7 @@ def _naming_simulator(kind: str) -> Iterator[None]:
     except ImportError as error:
         raise MissingExtraError(
             f"lerobot:{kind} needs a simulator that is not installed: {str(error).rstrip('.')}. Install it as "
-            f"lerobot's page on {kind} says, such as `pip install 'lerobot[{kind}]'`"
+            f"lerobot's page on {kind} says; where lerobot has an extra for it, that is lerobot[{kind}]"
         ) from error
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probe_kit.errors import ProbeKitError
+from probe_kit.errors import MissingExtraError, ProbeKitError, UsageError
 from probe_kit.extract.own_environments.contract import EnvEpisode, OwnEnvironment, Step
 from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.own_environments.opening import (
@@ -169,12 +169,15 @@ _CHECKS: Sequence[tuple[str, str, Callable[[_Trial], None]]] = (
 def check_environment(source: EnvSource | str) -> Iterator[EnvironmentCheck]:
     """The promises of the contract, each tried on the first two episodes; an error is a failure.
 
-    source: an `EnvSource`, or MODULE:CLASS. Raises UsageError if there is no such class.
+    source: an `EnvSource`, or MODULE:CLASS. Raises UsageError if there is no such class, and MissingExtraError
+    naming a simulator that is not installed.
     """
     trial = _Trial(EnvSource(source) if isinstance(source, str) else source)
     for name, sentence, check in _CHECKS:
         try:
             check(trial)
+        except (UsageError, MissingExtraError):
+            raise
         except ProbeKitError as error:
             yield EnvironmentCheck(name, sentence, str(error))
         else:

@@ -69,6 +69,8 @@ def test_a_broken_promise_is_named(name: str, check: str, message: str) -> None:
 def test_a_class_that_is_not_there_is_a_wrong_argument(name: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         factory_of(name)
+    with pytest.raises(UsageError, match=message):
+        list(check_environment(name))
 
 
 def test_a_module_of_the_working_folder_is_found_and_its_own_error_is_told(
