@@ -26,11 +26,12 @@ from probe_kit.extract.run_layout import (
     ExportFormat,
     FrameChoice,
     LaterViews,
+    SaeDtype,
     Tokens,
     VideoChoice,
 )
 from probe_kit.extract.settings import SCENE_OPTIONS, AskSettings, ExtractSettings
-from probe_kit.extract.store.export import FOLDER_WRITERS, WRITERS
+from probe_kit.extract.store.exports.export import FORMATS
 from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
 from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.hooks.contract.protocol import ROTATIONS, ProtocolName
@@ -85,7 +86,8 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("intervene", "--kind"): KINDS,
     ("intervene", "--readout"): get_args(Readout),
     ("intervene", "--format"): get_args(get_args(Format)[0]),
-    ("export", "--format"): WRITERS | FOLDER_WRITERS,
+    ("export", "--dtype"): get_args(SaeDtype),
+    ("export", "--format"): FORMATS,
     ("retention", "--format"): get_args(TableFormat),
     ("retention", "--details"): (*get_args(Section), "all"),
     ("retention", "--rule"): RULES,
@@ -100,7 +102,7 @@ REQUIRED = {
     "ask": ["--model", "vlm-tiny"],
     "train": ["RUN"],
     "intervene": ["RUN"],
-    "export": ["RUN"],
+    "export": ["RUN", "--format", "sae"],
     "retention": ["RUN"],
     "stages": ["VLM_RUN", "RUN"],
     "suite build": ["FOLDER"],
@@ -146,7 +148,7 @@ def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> No
         (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Target, TARGETS),
         (Task, TASKS), (LabelControl, LABEL_CONTROLS),
         (Incomplete, INCOMPLETE), (Baseline, BASELINES), (FoldUnit, FOLD_UNITS), (Wording, WORDINGS),
-        (SuiteVersion, SUITE_VERSIONS), (ExportFormat, WRITERS | FOLDER_WRITERS),
+        (SuiteVersion, SUITE_VERSIONS), (ExportFormat, FORMATS),
         (RuleName, RULES), (AnswerScore, SCORES),
     ],
 )  # fmt: skip

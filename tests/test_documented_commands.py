@@ -55,6 +55,7 @@ OF_OTHERS = {
     "--help-all": "every command's",
     "--extra": "uv's",
     "--gpus": "docker's",
+    "--check": "sha256sum's",
     "--length": "b2sum's",
 }
 """Options in the text that are no command's of ours, and no benchmark's."""
@@ -150,6 +151,7 @@ LOOKED_FOR = {
     "train": "Make one with|AWS_ACCESS_KEY_ID",
     "intervene": "Make one with",
     "retention": "Make one with",
+    "export": "Make one with",
     "stages": "Make one with",
     "from-csv": "questions.csv",
     "convert": "no such|not a folder|does not exist|holds no|missing",

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from probe_kit.extract.recordings.lerobot_source import LeRobotSource
     from probe_kit.extract.settings import AskSettings, ExtractSettings
     from probe_kit.extract.store.copying import copy_run
-    from probe_kit.extract.store.export import export_run
+    from probe_kit.extract.store.exports.export import export_run
     from probe_kit.extract.store.integrity.audit import Audit, verify_run
     from probe_kit.extract.store.label import label_run
     from probe_kit.extract.store.locations.locate import locate
@@ -67,7 +67,7 @@ __getattr__, __dir__ = lazy_names(
         "ActionErrors": "store.recorded.action_errors",
         "compare_actions": "store.recorded.action_errors",
         "copy_run": "store.copying",
-        "export_run": "store.export",
+        "export_run": "store.exports.export",
         "ask_run": "extraction",
         "extract_run": "extraction",
         "prepare": "extraction",

@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from probe_kit._terminal.console import err, out, print_json
-from probe_kit._terminal.options import AsJson, Partial, RunFolder
-from probe_kit.extract.run_layout import ExportFormat
+from probe_kit._terminal.options import LISTED, AsJson, Names, Partial, RunFolder
+from probe_kit.extract.run_layout import ExportFormat, SaeDtype
 
 app = typer.Typer(help="Inspect, verify and finalise runs.", no_args_is_help=True)
 DAMAGED = 1
@@ -85,19 +85,41 @@ def export(
     run: RunFolder,
     style: Annotated[
         ExportFormat,
-        typer.Option("--format", help="Format. mp4 and lerobot write a folder, of a run with --frames all."),
+        typer.Option(
+            "--format",
+            help="Format. mp4, lerobot, hf and sae write a folder; mp4 and lerobot need a run with --frames all.",
+        ),
     ],
     out_file: Annotated[
         Path | None,
         typer.Option("--out", metavar="FILE", help="What to write. Default: <run>.<format> beside the run."),
     ] = None,
+    sites: Annotated[
+        Names | None,
+        typer.Option(
+            "--sites",
+            **LISTED,
+            help="Of parquet, npz, hf and sae: sites, such as backbone.07, expert or expert.*@9. Default: all.",
+        ),
+    ] = None,
+    view: Annotated[
+        str | None,
+        typer.Option(
+            "--view",
+            help="Of the same formats: a pooled view, tokens or tokens:ROLE. Default: all pooled views, or "
+            "mean in npz and sae.",
+        ),
+    ] = None,
+    dtype: Annotated[SaeDtype, typer.Option("--dtype", help="Of sae: type of the memory maps.")] = "bfloat16",
+    seed: Annotated[int, typer.Option("--seed", help="Of sae: seed of the order of rows.")] = 0,
     partial: Partial = False,
 ) -> None:
-    """Write a run to one file, and the sha256 of this file beside it; or its frames to a folder."""
+    """Write a run for other tools: to a file, and its sha256 beside it, or to a folder."""
     from probe_kit.extract import export_run
     from probe_kit.extract.store.locations.locate import locate
 
     location = locate(run)
     target = out_file or location.beside(f"{location.name}.{style}")
     with err.status("exporting"):
-        out.print(str(export_run(location, style, target, partial)), soft_wrap=True)
+        written = export_run(location, style, target, partial, sites=sites, view=view, dtype=dtype, seed=seed)
+    out.print(str(written), soft_wrap=True)

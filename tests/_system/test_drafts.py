@@ -10,7 +10,7 @@ import pytest
 
 from probe_kit._system.drafts import draft_of, write_whole
 from probe_kit.extract import open_run
-from probe_kit.extract.store.export import export_run
+from probe_kit.extract.store.exports.export import export_run
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.suite import build_suite
 

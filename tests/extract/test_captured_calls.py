@@ -130,7 +130,7 @@ def test_an_export_and_a_copy_know_of_later_inferences_that_keep_the_mean(mean_r
         assert file.get_slice("backbone.pooled").get_shape() == [48, 1, 2, 3, 8]
         assert file.get_slice("backbone.later").get_shape() == [48, 2, 2, 8]
     table = pd.read_parquet(export_run(mean_run.location, "parquet", tmp_path / "two"))
-    rows = table[(table["call"] == 2) & (table["site"] == str(SITE))]
+    rows = table[(table["inference"] == 2) & (table["site"] == str(SITE))]
     assert set(rows["view"]) == {"mean"}
     np.testing.assert_array_equal(np.stack(rows["vector"]), mean_run.column(SITE, "mean", 2))
     copy = copy_run(mean_run.location, tmp_path / "copy")

@@ -125,6 +125,14 @@ def decode_bfloat16(bits: NDArray[np.uint16]) -> NDArray[np.float32]:
     return (bits.astype(np.uint32) << 16).view(np.float32)
 
 
+def encode_bfloat16(values: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """float32 to the bits of bfloat16, to the nearest and half to even; NaN stays NaN."""
+    bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
+    rounded = (bits + (0x7FFF + ((bits >> 16) & 1))) >> 16  # wraps around only for NaN
+    found: NDArray[np.uint16] = np.where(np.isnan(values), NOT_A_NUMBER, rounded).astype(np.uint16)
+    return found
+
+
 def index_bytes(count: int) -> int:
     """Length of the index of a shard of so many inner chunks."""
     return count * ENTRY + CHECKSUM

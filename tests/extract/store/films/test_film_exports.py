@@ -39,7 +39,7 @@ def test_a_film_has_every_frame_at_the_rate_of_control(filmed: Run, tmp_path: Pa
     folder = export_run(filmed.path, "mp4", tmp_path / "films")
     rows = filmed.episodes.to_dict("records")
     names = [f"{row['episode']:08d}-{row['category']}-{row['outcome']}.mp4" for row in rows]
-    assert sorted(path.name for path in folder.iterdir()) == names
+    assert sorted(path.name for path in folder.iterdir()) == [*names, "SHA256SUMS"]
     for number, name in enumerate(names):
         with av.open(str(folder / name)) as film:
             assert film.streams.video[0].average_rate == 5

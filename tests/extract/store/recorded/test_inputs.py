@@ -85,5 +85,5 @@ def test_what_needs_a_scene_or_an_outcome_is_refused_by_name(shown_run: Run, wan
 def test_an_export_has_the_columns_that_the_run_has(shown_run: Run, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     table = parquet.read_table(export_run(shown_run.path, "parquet", tmp_path / "run.parquet"))
-    assert {"episode_id", "category", "outcome", "call", "site", "vector"} <= set(table.column_names)
+    assert {"episode_id", "category", "outcome", "inference", "frame", "site", "vector"} <= set(table.column_names)
     assert "layout" not in table.column_names
