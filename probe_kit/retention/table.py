@@ -218,6 +218,7 @@ def retention_table(
     labels: Mapping[str, str] | None = None,
     pairs: Sequence[tuple[str, str]] | None = None,
     categories: Sequence[str] | None = None,
+    with_behaviour: bool = True,
 ) -> RetentionTable:
     """Success rates, probe peaks and retention of several runs, per category and view.
 
@@ -234,7 +235,8 @@ def retention_table(
     compare every VLM run with every acting one, see `vlm_vla_differences`. labels: names of runs in tables and
     figures by their location, instead of their own. pairs: by location, the runs that are compared, each the first
     minus the second, instead of the first run with every other; all of them are one family of tests.
-    categories: rows of these alone, and means over them; probes are those of the whole runs.
+    categories: rows of these alone, and means over them; probes are those of the whole runs. with_behaviour: False
+    leaves empty what the rule `disc` does not need (other rules and behaviour), so that no trajectory is read.
     Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
     is not that of the runs, for a run that is given twice, or for `against` or `pairs` where they are none of the
     runs; SceneError for overlapping zones.
@@ -255,7 +257,7 @@ def retention_table(
     if unscored and isinstance(runs, Mapping):
         raise NoTrajectoryError(f"groups cannot be compared by the rule {rule}: {unscored[0]}")
     notes += unscored
-    settings = RowSettings(views, iterations, epsilons, rule, last_steps, absent_below, categories)
+    settings = RowSettings(views, iterations, epsilons, rule, last_steps, absent_below, categories, with_behaviour)
     drawn: list[RowWithEstimates] = []
     means: list[RetentionRow] = []
     for name, run in listed:

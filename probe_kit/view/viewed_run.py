@@ -38,8 +38,8 @@ class ViewedRun:
 
     @cached_property
     def table(self) -> RetentionTable:
-        """The retention table of this run alone."""
-        return retention_table([self.run])
+        """The retention table of this run alone, without the columns that no page shows and that take longest."""
+        return retention_table([self.run], with_behaviour=False)
 
     @property
     def places(self) -> tuple[str, str]:

@@ -3,6 +3,7 @@
 import json
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from probe_kit.env.scoring.rules import RULES
 from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.errors import NoTrajectoryError, UsageError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
-from probe_kit.extract.store.format.trajectories import Trajectories
 from probe_kit.retention import FinalPositionsDisplay, OutcomeRulesDisplay, retention_table, success_rate
 from probe_kit.retention.displays import collect_figures
 from probe_kit.retention.report import report_html
@@ -118,18 +118,32 @@ def test_a_run_by_another_rule_leaves_the_run_as_it_was(idle: Run) -> None:
 
 
 def test_a_table_with_its_report_reads_every_trajectory_once(idle: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    run, read = open_run(idle.path), Counter[int]()
-    at = Trajectories.__getitem__
+    run, read = open_run(idle.path), Counter[bytes]()
+    decode = Trajectory.of_frames
 
-    def counted(trajectories: Trajectories, position: int) -> Trajectory:
-        read[position] += 1
-        return at(trajectories, position)
+    def counted(frames: Any) -> Trajectory:
+        read[frames.tobytes()] += 1
+        return decode(frames)
 
-    monkeypatch.setattr(Trajectories, "__getitem__", counted)
+    monkeypatch.setattr(Trajectory, "of_frames", counted)
     table = retention_table([run], rule="box")
     report_html([run], table)
     OutcomeRulesDisplay.from_runs([run])
-    assert read == dict.fromkeys(range(4), 1)
+    assert sum(read.values()) == 4
+
+
+def test_a_table_without_behaviour_reads_no_trajectory_and_has_the_same_rates(
+    idle: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = retention_table([idle]).rows
+    monkeypatch.delattr(Trajectory, "of_frames")
+    rows = retention_table([open_run(idle.path)], with_behaviour=False).rows
+    assert [row.success for row in rows] == [row.success for row in whole]
+    assert [(row.rules.sr_answered, row.rules.sr_by_rule) for row in rows] == [
+        (row.rules.sr_answered, {}) for row in whole
+    ]
+    with pytest.raises(AttributeError):
+        retention_table([open_run(idle.path)], rule="box", with_behaviour=False)
 
 
 def test_every_rule_agrees_with_what_was_stored_where_it_is_the_same(recorded_run: Run) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from probe_kit.env.scoring.events import EVENTS, Events
 from probe_kit.env.scoring.rules import RULES
+from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.extract import Run, open_run
 from probe_kit.extract.store.locations.locate import locate
@@ -120,6 +121,18 @@ def test_the_rows_are_spelt_as_in_the_table(catalogue: Catalogue, little: Run) -
         for heading, cell in zip(headings, row["cells"], strict=True):
             assert heading in markdown
             assert cell["text"].replace("–", "") in markdown
+
+
+def test_overview_and_maps_read_no_trajectory(
+    catalogue: Catalogue, little: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("run/run", "run/episodes", "run/map/color")
+    expected = [catalogue.script(name) for name in names]
+    monkeypatch.delattr(Trajectory, "of_frames")
+    again = Catalogue([open_run(little.location.address)])
+    assert [again.script(name) for name in names] == expected
+    with pytest.raises(AttributeError):
+        again.script("run/e/00003")
 
 
 def test_the_cells_of_a_map_are_the_stored_scores(catalogue: Catalogue, little: Run) -> None:

@@ -65,6 +65,7 @@ class RowSettings:
 
     epsilons: zone radii in metres for `sr_by_epsilon`, which belong to the rule `disc`. rule, last_steps: see
     `probe_kit.env.scoring.rules.judge`. absent_below: accuracy below which a stream's best site counts as absent.
+    with_behaviour: see `RunUnderRule.of`.
     """
 
     views: Sequence[str] | None
@@ -74,6 +75,7 @@ class RowSettings:
     last_steps: int = 1
     absent_below: float = ABSENT_BELOW
     categories: Sequence[str] | None = None
+    with_behaviour: bool = True
 
 
 def run_rows(
@@ -87,7 +89,8 @@ def run_rows(
     if results is not None and (unknown := set(settings.views or ()) - set(results.settings.views)):
         probed = ", ".join(results.settings.views)
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
-    judged, found = RunUnderRule.of(run, settings.rule, settings.last_steps), stored_image_swaps(run)
+    judged = RunUnderRule.of(run, settings.rule, settings.last_steps, settings.with_behaviour)
+    found = stored_image_swaps(run)
     places = stored_places(run) if found else {}
     others = stored_other_readouts(run, found)
     ties = {view: stored_ties(run, results, view) if found else {} for view in shown}

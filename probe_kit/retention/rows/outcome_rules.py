@@ -79,13 +79,19 @@ class RunUnderRule:
     behaviour: "pd.DataFrame | None" = None
 
     @classmethod
-    def of(cls, run: RunReader, rule: str, last_steps: int = 1) -> Self:
-        """Judge every episode by every rule, where the run keeps trajectories; answers in words have no rule."""
+    def of(cls, run: RunReader, rule: str, last_steps: int = 1, with_behaviour: bool = True) -> Self:
+        """Judge every episode by every rule, where the run keeps trajectories; answers in words have no rule.
+
+        with_behaviour: False reads no trajectory for the rule whose outcomes are stored.
+        """
         if ask_of(run) is not None:
             return cls(run, DEFAULT_RULE, "", 1)
         scene = getattr(run, "settings", {}).get("scene")
         words = "" if scene is None else rule_of(rule, scene).words
-        if scene is None or run.episodes.empty or not getattr(run, "has_trajectories", False):
+        is_stored = (rule, last_steps) == (DEFAULT_RULE, 1)
+        if scene is None or run.episodes.empty or (is_stored and not with_behaviour):
+            return cls(run, rule, words, last_steps)
+        if not getattr(run, "has_trajectories", False):
             return cls(run, rule, words, last_steps)
         own = cast("Judgeable", run)
         verdicts = {name: own.judged(name) for name in RULES}

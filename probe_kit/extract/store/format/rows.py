@@ -1,5 +1,6 @@
 """Reading of the row store: the activations of one episode, and tokens by role."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,9 @@ from probe_kit.extract.store.format.arrays import decode_bfloat16
 from probe_kit.hooks.contract.views import PADDING, plays
 
 Spans = Sequence[tuple[str, int, int]]
+_BLOCK_BYTES = 1 << 24
+"""Rows that are read in order come this many bytes at a time: beginning a request takes longer than reading."""
+_DAMAGE = (ChunkNotFoundError, ValueError, RuntimeError)
 
 
 @dataclass(frozen=True)
@@ -33,12 +37,27 @@ class Rows:
         """All of one episode."""
         return self.read(position, ())
 
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        """All of every episode, in order; several are read at a time. Raises RunDamagedError at a damaged one."""
+        per_row = math.prod(self.array.shape[1:]) * self.array.dtype.itemsize
+        size = max(1, _BLOCK_BYTES // max(1, per_row))
+        for start in range(0, len(self), size):
+            yield from self._block(range(start, min(start + size, len(self))))
+
+    def _block(self, positions: range) -> Iterator[NDArray[Any]]:
+        try:
+            block = np.asarray(self.array.oindex[np.array([self.numbers[position] for position in positions])])
+        except (*_DAMAGE, RunDamagedError):
+            yield from (self[position] for position in positions)  # up to the damaged one, which is then named
+        else:
+            yield from block
+
     def read(self, position: int, index: tuple[Any, ...]) -> NDArray[Any]:
         """Part of one episode. Raises RunDamagedError if bytes are missing or fail their checksum."""
         number = self.numbers[position]
         try:
             return np.asarray(self.array[(number, *index)])
-        except (ChunkNotFoundError, ValueError, RuntimeError) as error:
+        except _DAMAGE as error:
             raise RunDamagedError(
                 f"{self.array.path or self.array.name} of episode {number} cannot be read: {error}. Delete "
                 f"commits/{number:08d}.json and run the same `probe-kit extract` again to redo the episode"

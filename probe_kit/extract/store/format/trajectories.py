@@ -57,7 +57,7 @@ def write_trajectory(store: Store, number: int, frames: NDArray[np.float32], con
 
 
 class Trajectories:
-    """The trajectories of the committed episodes of a run, in their order; read one at a time.
+    """The trajectories of the committed episodes of a run, in their order.
 
     rows: of the array `trajectory`. steps: how many actions every committed episode had. where: the run's name.
     Raises RunDamagedError if a channel that is read today is not among the stored ones.
@@ -78,13 +78,16 @@ class Trajectories:
 
     def __getitem__(self, position: int) -> Trajectory:
         """That of one episode. Raises RunDamagedError if stored bytes are missing, changed or too few."""
-        row, frames = self._rows[position], self._steps[position] + 1
+        return self._trajectory(self._rows[position], self._steps[position])
+
+    def __iter__(self) -> Iterator[Trajectory]:
+        return map(self._trajectory, self._rows, self._steps)
+
+    def _trajectory(self, row: NDArray[np.float32], steps: int) -> Trajectory:
+        frames = steps + 1
         if frames > len(row):
             raise RunDamagedError(
                 f"a trajectory of {self._where} has room for {len(row)} frames; its outcome says {frames - 1} "
                 "actions. Check the run with `probe-kit run verify --deep`"
             )
         return Trajectory.of_frames(row[:frames, self._columns])
-
-    def __iter__(self) -> Iterator[Trajectory]:
-        return (self[position] for position in range(len(self)))

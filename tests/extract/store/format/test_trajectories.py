@@ -11,6 +11,7 @@ import zarr
 from probe_kit.errors import NoTrajectoryError, RunDamagedError, UsageError
 from probe_kit.extract import Run, open_run, verify_run
 from probe_kit.extract.plan import make_plan
+from probe_kit.extract.store.format import rows
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.hooks.families.pi0.adapter import Pi0
@@ -66,6 +67,23 @@ def test_a_changed_bit_is_found_on_reading_and_by_verification(copy: Path) -> No
         run.trajectory(3)
     problems = verify_run(copy, deep=True).problems
     assert any("trajectory/c/3/0/0" in problem for problem in problems)
+
+
+@pytest.mark.parametrize("together", [1, 5, 99])
+def test_trajectories_that_are_read_together_are_those_that_are_read_alone(
+    recorded_run: Run, copy: Path, monkeypatch: pytest.MonkeyPatch, together: int
+) -> None:
+    array = zarr.open_array(str(copy / "data.zarr"), path="trajectory", mode="r")
+    monkeypatch.setattr(rows, "_BLOCK_BYTES", together * array[0].nbytes)
+    assert len(list(recorded_run.trajectories)) == 48
+    for position, trajectory in enumerate(recorded_run.trajectories):
+        np.testing.assert_array_equal(trajectory.frames, recorded_run.trajectories[position].frames)
+    chunk = copy / "data.zarr/trajectory/c/17/0/0"
+    chunk.write_bytes(chunk.read_bytes()[:-1] + b"x")
+    reading = iter(open_run(copy).trajectories)
+    assert [next(reading).steps for _ in range(17)] == [4] * 17
+    with pytest.raises(RunDamagedError, match="trajectory/c/17/0/0"):
+        next(reading)
 
 
 def test_a_lost_trajectory_is_no_empty_one(copy: Path) -> None:
