@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from probe_kit.train.results.probe_results import ProbeResults
     from probe_kit.train.results.store import load_results, save_results
     from probe_kit.train.settings import ProbeSettings
+    from probe_kit.train.transfer.transfer import transfer_probes
+    from probe_kit.train.transfer.transfer_results import TransferResults
 
 __all__ = [
     "BASELINES",
@@ -46,12 +48,14 @@ __all__ = [
     "Progress",
     "RunReader",
     "Target",
+    "TransferResults",
     "UntrainedScore",
     "load_label_results",
     "load_results",
     "load_results_by_call",
     "save_results",
     "train_probes",
+    "transfer_probes",
 ]
 
 # `probe-kit --help` must load neither pandas nor matplotlib.
@@ -85,5 +89,7 @@ __getattr__, __dir__ = lazy_names(
         "load_results": "results.store",
         "save_results": "results.store",
         "train_probes": "probe_sweep",
+        "TransferResults": "transfer.transfer_results",
+        "transfer_probes": "transfer.transfer",
     },
 )

@@ -11,6 +11,7 @@ from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import BASELINES, LABEL_CONTROLS, Incomplete, Task
 
 _label_option = partial(typer.Option, rich_help_panel="Labels of your own")
+_transfer_option = partial(typer.Option, rich_help_panel="Transfer")
 _control_option = partial(typer.Option, rich_help_panel="Controls")
 _statistics_option = partial(typer.Option, rich_help_panel="Statistics")
 MOST_PERMUTATIONS = 1_000_000
@@ -95,6 +96,22 @@ Window = Annotated[
         help="With a label per inference: inferences per episode. Default: what 90 % of the episodes reach.",
     ),
 ]
+
+# -- transfer -----------------------------------------------------------------------------------------------
+
+TestOn = Annotated[
+    str | None,
+    _transfer_option(
+        "--test-on",
+        metavar="RUN",
+        help="Fit the probes of a label on all of the first run, and score them on this one. Nothing is stored.",
+    ),
+]
+TestLabels = Annotated[
+    Path | None,
+    _transfer_option("--test-labels", metavar="FILE", help="Labels of that run. Default: the file of --labels."),
+]
+AcrossWeights = Annotated[bool, _transfer_option("--across-weights", help="Accept a run of another network.")]
 
 # -- controls -----------------------------------------------------------------------------------------------
 

@@ -1,7 +1,7 @@
 """`probe-kit train`, and how `probe-kit run show` lists what it stored."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from rich.text import Text
 
@@ -13,6 +13,7 @@ from probe_kit.train import command_options as own
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from probe_kit.extract import Run
     from probe_kit.train import Baseline, ProbeResults, RunReader, Target
     from probe_kit.train.results.inventory import Inventory, StoredProbes
 
@@ -27,6 +28,9 @@ def train(
     group_by: own.GroupBy = None,
     exchange_within: own.ExchangeWithin = None,
     window: own.Window = None,
+    test_on: own.TestOn = None,
+    test_labels: own.TestLabels = None,
+    across_weights: own.AcrossWeights = False,
     wording: common.Wording = None,
     call: own.Calls = "0",
     seed: common.Seed = 0,
@@ -50,63 +54,73 @@ def train(
     `probe-kit train RUN --labels labels.csv --target drawer --task classes`.
     """
     from probe_kit.extract import open_run
-    from probe_kit.train import train_probes
     from probe_kit.train.label_commands import (
         ColumnOptions,
+        TransferOptions,
         check_no_others,
         print_label_results,
         train_on_column,
+        transfer_column,
     )  # fmt: skip
-    from probe_kit.train.results.best_sites import best_sites_sentences, best_sites_table
 
     column = ColumnOptions.of(target, labels, task, group_by, exchange_within, window)
+    transfer = TransferOptions.of(test_on, test_labels, across_weights, column)
     opened = open_run(run, allow_partial=partial).in_wording(wording)
+    options = {
+        "views": views,
+        "permutations": permutations,
+        "seed": seed,
+        "jobs": jobs,
+        "ray": ray,
+        "suite": suite,
+    }
     if column is not None:
-        options = {
-            "views": views,
-            "permutations": permutations,
-            "seed": seed,
-            "jobs": jobs,
-            "ray": ray,
-            "suite": suite,
-        }
         refused = {"--folds": folds != "groups", "--incomplete": incomplete != "keep", "--untrained": untrained}
         check_no_others({**refused, "--device": device})
+        if transfer is not None:
+            of_one = {"--controls": controls is not None, "--suite": suite, "--jobs": jobs, "--ray": ray}
+            check_no_others(of_one, "a transfer")
+            other = open_run(transfer.run, allow_partial=partial).in_wording(wording)
+            options = {"views": views, "permutations": permutations, "seed": seed}
+            transfer_column(opened, other, column, transfer, categories, call, window, options, details)
+            return
         results = train_on_column(opened, column, categories, call, controls, window, options)
         print_label_results(results, details)
         return
     control = None if untrained is None else open_run(untrained, allow_partial=partial).in_wording(wording)
+    sides = {
+        **options,
+        "target": cast("Target", target),
+        "token_permutations": token_permutations,
+        "folds": folds,
+        "incomplete": incomplete,
+        "controls": cast("tuple[Baseline, ...] | None", controls),
+        "untrained": control,
+        "device": device,
+    }
+    _train_sides(opened, categories, call, sides, details)
+    say(marked("next: [bold]probe-kit retention {}[/]", run))
+
+
+def _train_sides(run: "Run", categories: Any, call: str, options: Mapping[str, Any], details: bool) -> None:
+    """Probe the side of a picture at the captured inferences that `call` names, and print the best sites."""
+    from probe_kit.train import train_probes
+    from probe_kit.train.results.best_sites import best_sites_sentences, best_sites_table
+
     left_out: dict[int, Exception] = {}
     fitted: list[ProbeResults] = []
-    for number in _calls(call, opened):
+    for number in _calls(call, run):
         try:
             with progress() as bar:
-                found = train_probes(
-                    opened,
-                    categories,
-                    views,
-                    permutations=permutations,
-                    token_permutations=token_permutations,
-                    target=cast("Target", target),
-                    call=number,
-                    folds=folds,
-                    incomplete=incomplete,
-                    controls=cast("tuple[Baseline, ...] | None", controls),
-                    suite=suite,
-                    untrained=control,
-                    seed=seed,
-                    jobs=jobs,
-                    device=device,
-                    ray=ray,
-                    progress=counter(bar, f"sites, call {number}" if number else "sites"),
-                )
+                shown = counter(bar, f"sites, call {number}" if number else "sites")
+                found = train_probes(run, categories, call=number, progress=shown, **options)
         except (TooFewGroupsError, UnbalancedEpisodesError) as error:
             if call != "all" or number == 0:
                 raise
             left_out[number] = error
             continue
         fitted.append(found)
-    out.print(best_sites_table(fitted, opened.random_weights, splits=details))
+    out.print(best_sites_table(fitted, run.random_weights, splits=details))
     for number, reason in left_out.items():
         say(marked("[yellow]left out:[/] call {}: {}", number, reason))
     if not fitted[0].controls.excess:
@@ -116,7 +130,6 @@ def train(
         )
     for sentence in best_sites_sentences(fitted[0]):
         out.print(sentence)
-    say(marked("next: [bold]probe-kit retention {}[/]", run))
 
 
 def facts_table(found: "Inventory", further: Mapping[str, str]) -> "Table":

@@ -13,7 +13,7 @@ from probe_kit.errors import UsageError
 from probe_kit.train.choices import TARGETS, Task
 
 if TYPE_CHECKING:
-    from probe_kit.train import LabelResults, RunReader
+    from probe_kit.train import LabelResults, Labels, RunReader
 
 
 def labels(
@@ -98,11 +98,55 @@ class ColumnOptions:
             )
         return cls(target, file, task, group_by, exchange_within)
 
+    def read(self, run: "RunReader", file: Path | None = None) -> "Labels":
+        """The labels of a run: of the table, of another `file`, or built in."""
+        from probe_kit.train import Labels
 
-def check_no_others(given: Mapping[str, Any]) -> None:
-    """Raise UsageError for an option that probes of a label do not have. given: options, with whether they are."""
+        further = self.task, self.group_by, self.exchange_within
+        if (table := file or self.file) is None:
+            return Labels.of_run(run, self.target, *further)
+        return Labels.read(table, self.target, *further)
+
+
+@dataclass(frozen=True)
+class TransferOptions:
+    """Options of `train` that name a run to score probes on."""
+
+    run: str
+    labels: Path | None
+    across_weights: bool
+
+    @classmethod
+    def of(
+        cls, run: str | None, labels: Path | None, across_weights: bool, column: ColumnOptions | None
+    ) -> "TransferOptions | None":
+        """The options; None without `--test-on`. Raises UsageError where one needs another."""
+        if run is None:
+            if labels is not None or across_weights:
+                given = "--test-labels" if labels is not None else "--across-weights"
+                raise UsageError(f"{given} is for a transfer; give --test-on RUN too, or leave it out")
+            return None
+        if column is None:
+            raise UsageError(
+                "--test-on scores probes of a label; name one with --target COLUMN, built in or of --labels FILE"
+            )
+        if labels is not None and column.file is None:
+            raise UsageError("--test-labels with a built-in column; give --labels FILE too, or leave it out")
+        return cls(run, labels, across_weights)
+
+
+def check_no_others(given: Mapping[str, Any], what: str = "labels of your own") -> None:
+    """Raise UsageError for an option that does not go with `what`. given: options, with whether they are given."""
     if wrong := [name for name, value in given.items() if value]:
-        raise UsageError(f"{wrong[0]} is not for labels of your own; leave it out")
+        raise UsageError(f"{wrong[0]} is not for {what}; leave it out")
+
+
+def _one_call(call: str) -> int:
+    if not call.isdecimal():
+        raise UsageError(
+            f"--call {call!r} with a label of your own; expected one number. Use --window for several"
+        )
+    return int(call)
 
 
 def train_on_column(
@@ -115,28 +159,54 @@ def train_on_column(
     options: Mapping[str, Any],
 ) -> "LabelResults":
     """Probe `run` for a label column, with a progress bar; see `train_probes`."""
-    from probe_kit.train import Labels, train_probes
+    from probe_kit.train import train_probes
 
-    if not call.isdecimal():
-        raise UsageError(
-            f"--call {call!r} with a label of your own; expected one number. Use --window for several"
-        )
-    further = column.task, column.group_by, column.exchange_within
-    if column.file is None:
-        labels = Labels.of_run(run, column.target, *further)
-    else:
-        labels = Labels.read(column.file, column.target, *further)
+    number, labels = _one_call(call), column.read(run)
     with progress() as bar:
         return train_probes(
             run,
             categories,
             labels=labels,
-            call=int(call),
+            call=number,
             window=window,
             controls=controls,
             progress=counter(bar, "sites"),
             **options,
         )
+
+
+def transfer_column(
+    run: "RunReader",
+    other: "RunReader",
+    column: ColumnOptions,
+    transfer: TransferOptions,
+    categories: Any,
+    call: str,
+    window: int | None,
+    options: Mapping[str, Any],
+    details: bool,
+) -> None:
+    """Fit probes of a label column on `run`, score them on `other` with a progress bar, and print the scores."""
+    from probe_kit.train import transfer_probes
+    from probe_kit.train.transfer.transfer_summary import transfer_sentences, transfer_table
+
+    with progress() as bar:
+        results = transfer_probes(
+            run,
+            other,
+            column.read(run),
+            column.read(other, transfer.labels),
+            categories,
+            call=_one_call(call),
+            window=window,
+            across_weights=transfer.across_weights,
+            progress=counter(bar, "sites"),
+            **options,
+        )
+    out.print(transfer_table(results, splits=details))
+    for sentence in transfer_sentences(results):
+        out.print(sentence, markup=False, highlight=False)
+    say("nothing was stored; [bold]transfer_probes[/] in Python gives every site as a frame")
 
 
 def print_label_results(results: "LabelResults", details: bool) -> None:

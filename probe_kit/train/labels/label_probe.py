@@ -45,13 +45,27 @@ def fit_label_probe(
     """
     labels, place = _distinct(labels)
     outer = [fold.outer for fold in folds]
-    fit = {"binary": _logistic, "classes": _indicators, "continuous": _ridge}[task]
-    predictions, penalties = fit(features, labels, folds)
+    predictions, penalties = _fit_of(task)(features, labels, folds)
     if task == "continuous":
         scores = explained_scores(predictions, labels, outer)
     else:
         scores = balanced_scores(predictions, labels)
     return LabelProbe(predictions[:, 0], scores[:, 0], scores.mean(axis=0)[place[1:]], penalties)
+
+
+def predict_once(
+    features: NDArray[np.floating], labels: Matrix, task: Task, fold: NestedFold
+) -> tuple[Matrix, float]:
+    """Predictions (m,) for the test samples of one outer fold, and its penalty as in `LabelProbe`.
+
+    features: (n, D). labels: (n,); those of test samples have no effect. Raises ProbeNotConvergedError.
+    """
+    predictions, penalties = _fit_of(task)(features, labels[:, None], [fold])
+    return predictions[fold.outer.test, 0], float(penalties[0])
+
+
+def _fit_of(task: Task) -> "Callable[[NDArray[np.floating], Matrix, list[NestedFold]], tuple[Matrix, Matrix]]":
+    return {"binary": _logistic, "classes": _indicators, "continuous": _ridge}[task]
 
 
 def _distinct(labels: Matrix) -> tuple[Matrix, NDArray[np.intp]]:

@@ -51,7 +51,7 @@ def train_label_probes(
     how many of each episode take part; by default as many as 90 % of the episodes reach. controls: of `step`,
     `state`, `instruction`, `pixels` and `random-features`; by default all that the run allows.
     """
-    _check_run(run, categories, views, permutations)
+    check_label_run(run, categories, views, permutations)
     samples = labelled_samples(run, labels, categories, call, window)
     labels, _ = labels.on(run)  # how many it does not show is counted among the samples
     settings = _settings(run, labels, samples, categories, views, permutations, call, seed)
@@ -68,7 +68,9 @@ def train_label_probes(
     return load_label_results(run, settings.key)
 
 
-def _check_run(run: RunReader, categories: Sequence[str] | None, views: Sequence[str], permutations: int) -> None:
+def check_label_run(
+    run: RunReader, categories: Sequence[str] | None, views: Sequence[str], permutations: int
+) -> None:
     """Raise for a run without episodes, activations or the categories, and for views that no label has."""
     if len(run.episodes) == 0:
         raise RunIncompleteError(f"{run.location} has no finished episode to probe. Finish it first")

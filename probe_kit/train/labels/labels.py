@@ -35,6 +35,7 @@ class Labels:
     None for the groups of the run. exchange_within: column within which label permutations exchange groups; None
     for everywhere. groups, strata: (n,) those columns, None where the run has them. table: where errors point to.
     of_source: whether episodes and inferences are numbers of episodes and frames of a data set; see `on`.
+    builtin: whether probe_kit computed the column.
     """
 
     target: str
@@ -47,6 +48,7 @@ class Labels:
     groups: tuple[str, ...] | None = None
     strata: tuple[str, ...] | None = None
     of_source: bool = False
+    builtin: bool = False
 
     @classmethod
     def read(
@@ -144,7 +146,9 @@ class Labels:
         lines = list(range(1, len(column.episodes) + 1))
         table = LabelTable(f"the built-in column {target}", "sample", tuple(keys), keys, lines)
         coded = code_labels(table.cells(target), task or column.task, target)
-        return cls(target, coded, column.episodes, column.inferences, table, group_by, exchange_within)
+        return cls(
+            target, coded, column.episodes, column.inferences, table, group_by, exchange_within, builtin=True
+        )
 
     @property
     def task(self) -> Task:
@@ -168,6 +172,21 @@ class Labels:
                 if value == value
             )
         )
+
+    @property
+    def definition(self) -> str:
+        """Hash of what the label is, not of its values: column, task, source, and per episode or inference.
+
+        A built-in column is one formula in every run. Of a table only the name is known: one column name must mean
+        one thing in both tables.
+        """
+        return sha256_json([self.target, self.task, self.builtin, self.per_step])
+
+    @property
+    def described(self) -> str:
+        """The definition in words."""
+        kind = "built-in column" if self.builtin else "column of a table"
+        return f"the {kind} {self.target!r} ({self.task}, per {'inference' if self.per_step else 'episode'})"
 
     def __repr__(self) -> str:
         present = int(np.isfinite(self.coded.values).sum())

@@ -1,0 +1,89 @@
+"""A transfer for a terminal: a table of the best sites, and a sentence per view."""
+
+from typing import TYPE_CHECKING
+
+from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
+from probe_kit.hooks.contract.sites import label_of
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.labels.label_results import METRICS
+from probe_kit.train.transfer.transfer_results import TransferResults
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_LEGEND = (
+    "Fitted on one run, scored on the other. The score of a chosen site is too high. Chance: mean score with "
+    "labels of the other run exchanged. Recentred: features of the other run moved to the mean of the first. Own: "
+    "cross-validated probe of the other run itself"
+)
+
+
+def transfer_table(results: TransferResults, splits: bool = True) -> ResponsiveTable:
+    """A row per stream and view for its best site."""
+    several, metric = len(results.curves) > 1, METRICS[results.task]
+    best = _best(results)
+    names = tuple(" · ".join([label_of(row["stream"]), *[row["view"]] * several]) for row in best)
+    said = [f"{results.target}: {metric}", f"{results.model} to {results.other_model}"]
+    said += ["OTHER WEIGHTS"] * (not results.same_weights)
+    return ResponsiveTable(
+        title=", ".join(said),
+        caption=_LEGEND,
+        name="stream",
+        names=names,
+        styles=("",) * len(names),
+        parts=(
+            Part(
+                "Best sites",
+                ("best site", f"{metric} [95 %]", "chance", "family-wise p", "recentred", "own [95 %]"),
+                tuple(tuple(map(Cell, _cells(row))) for row in best),
+            ),
+        ),
+        splits=splits,
+    )
+
+
+def transfer_sentences(results: TransferResults) -> list[str]:
+    """What was left out, then one per view: in which streams the label transfers."""
+    found = [f"left out: {count} {reason}" for reason, count in results.left_out.items()]
+    on = f"fitted on {results.trained_on['groups']} groups, {results.trained_on['samples']} samples"
+    for view in results.curves:
+        rows = [row for row in _best(results) if row["view"] == view]
+        of = f"{on}; scored on {rows[0]['groups']} groups, {rows[0]['n']} samples"
+        of += f", view {view}" if len(results.curves) > 1 else ""
+        found.append(f"{results.target} ({of}) {'; '.join(map(_verdict, rows))}.")
+    return found
+
+
+def _best(results: TransferResults) -> "list[pd.Series]":
+    """The row of `scores` of the best site of every view and stream: the largest excess over chance."""
+    scores = results.scores
+    excess = scores["score"] - scores["chance"].fillna(0.0)
+    found = excess.groupby([scores["view"], scores["stream"]], sort=False).idxmax()
+    return [scores.loc[number] for number in found]
+
+
+def _cells(row: "pd.Series") -> tuple[str, ...]:
+    return (
+        str(row["site"]),
+        f"{row['score']:.3f} [{row['ci_low']:.3f}, {row['ci_high']:.3f}]",
+        _number(row["chance"]),
+        _number(row["p_fwe"]),
+        f"{row['recentred']:.3f}",
+        f"{row['own']:.3f} [{row['own_ci_low']:.3f}, {row['own_ci_high']:.3f}]",
+    )
+
+
+def _verdict(row: "pd.Series") -> str:
+    where, numbers = (
+        f"in the {label_of(row['stream'])}",
+        f"({row['metric']} {row['score']:.2f}, own {row['own']:.2f})",
+    )
+    if row["p_fwe"] != row["p_fwe"]:
+        return f"was not tested {where} {numbers}"
+    if row["p_fwe"] < SIGNIFICANCE:
+        return f"transfers {where} at {row['site']} {numbers}"
+    return f"is not shown to transfer {where} {numbers}"
+
+
+def _number(value: float) -> str:
+    return "–" if value != value else f"{value:.3f}"
