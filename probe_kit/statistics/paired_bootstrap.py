@@ -25,12 +25,13 @@ def better_than_reference(
 
 
 def better_than_best(
-    correct: NDArray[np.bool_], others: NDArray[np.bool_], groups: ArrayLike, seed: int
+    correct: NDArray[np.bool_] | Matrix, others: NDArray[np.bool_] | Matrix, groups: ArrayLike, seed: int
 ) -> Matrix:
-    """Family-wise p (S,) of every site against the best of another model's: is its accuracy higher?
+    """Family-wise p (S,) of every site against the best of another model's: is its mean score higher?
 
-    correct: (S, E). others: (S', E) on the same episodes. groups: (E,). If the models are alike, a group's scores
-    could as well have come from either: whole groups change places, and both best sites are chosen anew.
+    correct: (S, E) scores, such as whether a decision is right. others: (S', E) on the same episodes. groups:
+    (E,). If the models are alike, a group's scores could as well have come from either: whole groups change
+    places, and both best sites are chosen anew.
     """
     here, there = _group_sums(correct, groups), _group_sums(others, groups)
     kept = (np.random.default_rng(seed).random((here.shape[1], DRAWS)) < 0.5).astype(float)

@@ -97,6 +97,15 @@ Window = Annotated[
     ),
 ]
 
+AlignTo = Annotated[
+    str | None,
+    _label_option(
+        "--align-to",
+        metavar="COLUMN",
+        help="Begin the window of each episode at the first inference where this column is true: sim.held.",
+    ),
+]
+
 # -- transfer -----------------------------------------------------------------------------------------------
 
 TestOn = Annotated[
@@ -128,7 +137,9 @@ Controls = Annotated[
 Untrained = Annotated[
     str | None,
     _control_option(
-        "--untrained", metavar="RUN", help="Run of the same episodes to subtract, usually with untrained weights."
+        "--untrained",
+        metavar="RUN",
+        help="Run of the same episodes to compare with, usually with untrained weights.",
     ),
 ]
 Suite = Annotated[

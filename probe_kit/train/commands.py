@@ -28,6 +28,7 @@ def train(
     group_by: own.GroupBy = None,
     exchange_within: own.ExchangeWithin = None,
     window: own.Window = None,
+    align_to: own.AlignTo = None,
     test_on: own.TestOn = None,
     test_labels: own.TestLabels = None,
     across_weights: own.AcrossWeights = False,
@@ -63,9 +64,10 @@ def train(
         transfer_column,
     )  # fmt: skip
 
-    column = ColumnOptions.of(target, labels, task, group_by, exchange_within, window)
+    column = ColumnOptions.of(target, labels, task, group_by, exchange_within, window, align_to)
     transfer = TransferOptions.of(test_on, test_labels, across_weights, column)
     opened = open_run(run, allow_partial=partial).in_wording(wording)
+    control = None if untrained is None else open_run(untrained, allow_partial=partial).in_wording(wording)
     options = {
         "views": views,
         "permutations": permutations,
@@ -75,19 +77,19 @@ def train(
         "suite": suite,
     }
     if column is not None:
-        refused = {"--folds": folds != "groups", "--incomplete": incomplete != "keep", "--untrained": untrained}
-        check_no_others({**refused, "--device": device})
+        refused = {"--folds": folds != "groups", "--incomplete": incomplete != "keep", "--device": device}
+        check_no_others(refused)
         if transfer is not None:
             of_one = {"--controls": controls is not None, "--suite": suite, "--jobs": jobs, "--ray": ray}
-            check_no_others(of_one, "a transfer")
+            check_no_others({**of_one, "--untrained": untrained, "--align-to": align_to}, "a transfer")
             other = open_run(transfer.run, allow_partial=partial).in_wording(wording)
             options = {"views": views, "permutations": permutations, "seed": seed}
             transfer_column(opened, other, column, transfer, categories, call, window, options, details)
             return
+        options["untrained"] = control
         results = train_on_column(opened, column, categories, call, controls, window, options)
         print_label_results(results, details)
         return
-    control = None if untrained is None else open_run(untrained, allow_partial=partial).in_wording(wording)
     sides = {
         **options,
         "target": cast("Target", target),

@@ -63,6 +63,7 @@ class ColumnOptions:
     task: Task | None
     group_by: str | None
     exchange_within: str | None
+    align_to: str | None = None
 
     @classmethod
     def of(
@@ -73,19 +74,24 @@ class ColumnOptions:
         group_by: str | None,
         exchange_within: str | None,
         window: int | None,
+        align_to: str | None = None,
     ) -> "ColumnOptions | None":
         """The options; None where `target` is a side. Raises UsageError for a target that nothing names."""
-        from probe_kit.train.labels.builtin_columns import ITEM, PLAYED, RECORDED, SIM, builtin_names
+        from probe_kit.train.labels.builtin_columns import builtin_names, is_builtin
 
         if file is None and target in TARGETS:
             further = {"--task": task, "--group-by": group_by, "--exchange-within": exchange_within}
-            given = [name for name, value in {**further, "--window": window}.items() if value is not None]
+            given = [
+                name
+                for name, value in {**further, "--window": window, "--align-to": align_to}.items()
+                if value is not None
+            ]
             if given:
                 raise UsageError(
                     f"{given[0]} is for labels of your own; give --labels FILE and --target COLUMN too"
                 )
             return None
-        if file is None and not target.startswith((SIM, ITEM, RECORDED, PLAYED)):
+        if file is None and not is_builtin(target):
             sides = ", ".join(map(repr, TARGETS))
             raise UsageError(
                 f"--target {target!r} is not one of {sides}, nor a built-in column ({', '.join(builtin_names())})."
@@ -96,7 +102,7 @@ class ColumnOptions:
                 f"--target {target} is a side, and --labels {file} is given. Name a column of the table with "
                 "--target; rename the column if it is called so"
             )
-        return cls(target, file, task, group_by, exchange_within)
+        return cls(target, file, task, group_by, exchange_within, align_to)
 
     def read(self, run: "RunReader", file: Path | None = None) -> "Labels":
         """The labels of a run: of the table, of another `file`, or built in."""
@@ -106,6 +112,17 @@ class ColumnOptions:
         if (table := file or self.file) is None:
             return Labels.of_run(run, self.target, *further)
         return Labels.read(table, self.target, *further)
+
+    def event(self, run: "RunReader") -> "Labels | None":
+        """The column where windows begin, of the table if it has one of that name, else built in."""
+        from probe_kit.train import Labels
+        from probe_kit.train.labels.builtin_columns import is_builtin
+
+        if self.align_to is None:
+            return None
+        if self.file is None or is_builtin(self.align_to):
+            return Labels.of_run(run, self.align_to)
+        return Labels.read(self.file, self.align_to)
 
 
 @dataclass(frozen=True)
@@ -169,6 +186,7 @@ def train_on_column(
             labels=labels,
             call=number,
             window=window,
+            align_to=column.event(run),
             controls=controls,
             progress=counter(bar, "sites"),
             **options,

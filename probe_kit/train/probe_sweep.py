@@ -46,6 +46,8 @@ def train_probes(
     call: int = 0,
     controls: Sequence[LabelControl] | None = None,
     suite: Path | None = None,
+    untrained: RunReader | None = None,
+    align_to: Labels | None = None,
     seed: int = 0,
     jobs: int | None = None,
     ray: str | None = None,
@@ -87,6 +89,7 @@ def train_probes(
     target: Target = "correct",
     labels: Labels | None = None,
     window: int | None = None,
+    align_to: Labels | None = None,
     call: int = 0,
     folds: FoldUnit = "groups",
     incomplete: Incomplete = "keep",
@@ -117,8 +120,8 @@ def train_probes(
     one on this machine; `jobs` is then how many sites at once, by default as many as it has cores.
 
     labels: a label of one's own, see `Labels`, instead of `target`. Its categories are probed together, as
-    `window`, `controls` and pooled views of `train_label_probes` have it, and the results are a `LabelResults`.
-    `target`, `folds`, `incomplete`, `untrained` and `device` are then left out.
+    `window`, `align_to`, `controls`, `untrained` and pooled views of `train_label_probes` have it, and the results
+    are a `LabelResults`. `target`, `folds`, `incomplete` and `device` are then left out.
 
     progress: by default a bar in a notebook, nothing elsewhere.
 
@@ -132,7 +135,7 @@ def train_probes(
     """
     _check_options(views, permutations, token_permutations, jobs, device, ray)
     if labels is not None:
-        _check_label_options(target, folds, incomplete, untrained, device)
+        _check_label_options(target, folds, incomplete, device)
         return train_label_probes(
             run,
             labels,
@@ -143,13 +146,16 @@ def train_probes(
             call=call,
             controls=controls,
             suite=suite,
+            untrained=untrained,
+            align_to=align_to,
             seed=seed,
             jobs=jobs,
             ray=ray,
             progress=progress,
         )
-    if window is not None:
-        raise UsageError(f"window={window} without labels; it needs labels of single inferences")
+    if window is not None or align_to is not None:
+        given = f"window={window}" if window is not None else "align_to"
+        raise UsageError(f"{given} without labels; it needs labels of single inferences")
     check_scene_run(run, f"a probe of the side ({target})")
     crew = ExecutionSettings(jobs, device, ray)
     if len(run.episodes) == 0:
@@ -210,15 +216,12 @@ def _check_options(
         raise UsageError(f"views {', '.join(views) or 'none'}; expected one or more, each once, such as mean")
 
 
-def _check_label_options(
-    target: Target, folds: FoldUnit, incomplete: Incomplete, untrained: RunReader | None, device: str | None
-) -> None:
+def _check_label_options(target: Target, folds: FoldUnit, incomplete: Incomplete, device: str | None) -> None:
     """Raise UsageError for options that probes of a label do not have."""
     given = {
         "target": target != "correct",
         "folds": folds != "groups",
         "incomplete": incomplete != "keep",
-        "untrained": untrained is not None,
         "device": device is not None,
     }
     if wrong := [name for name, other in given.items() if other]:

@@ -42,9 +42,10 @@ class ProbeSettings:
 def key_of(settings: Mapping[str, Any]) -> str:
     """The same of settings as they are stored, those of other formats included.
 
-    The first inference is left out, as before inferences could be chosen, so that older results keep their name.
+    What was added later is left out at its default, so that older results keep their name: the first inference,
+    and windows that begin there.
     """
-    first = (
-        settings.get("call") == 0
-    )  # left out, as before inferences could be chosen: older results keep their name
-    return sha256_json({name: value for name, value in settings.items() if not (first and name == "call")})[:12]
+    defaults = {"call": 0, "align_to": ""}
+    return sha256_json({n: value for n, value in settings.items() if n not in defaults or value != defaults[n]})[
+        :12
+    ]

@@ -25,12 +25,12 @@ PLANTED = 3
 """The feature of `backbone.layer1` that holds 10 × the y of the hand, metres."""
 
 
-def write_labelled_run(where: Path | str, suite: Suite, seed: int = 0) -> Run:
+def write_labelled_run(where: Path | str, suite: Suite, seed: int = 0, weights: str = "0" * 64) -> Run:
     """Every episode grasps at frame 4 and releases at frame 8; the last episode ends after two inferences."""
     plan = make_plan(suite, list(STREAMS), seed, CALLS, False)
     settings = {
         "model": "labelled",
-        "weights_sha256": "0" * 64,
+        "weights_sha256": weights,
         "random_weights": True,
         "captured_calls": CALLS,
         "tokens": "pooled",

@@ -45,12 +45,17 @@ def recorded_plan(episodes: int, pixels: bool = True) -> RecordedPlan:
     return RecordedPlan(rows, STREAMS, 1000, dataset, "kitchen")
 
 
-def write_recorded_run(where: Path | str, episodes: int = 12, pixels: bool = True) -> Run:
-    """Every number is drawn; the first of the state wanders, and lies in the features too."""
+def write_recorded_run(
+    where: Path | str, episodes: int = 12, pixels: bool = True, weights: str = "0" * 64, planted: bool = True
+) -> Run:
+    """Every number is drawn; with `planted` the first of the state lies in the features too.
+
+    Another network, by its `weights`, has other features of the same frames.
+    """
     plan = recorded_plan(episodes, pixels)
     settings = {
         "model": "shown",
-        "weights_sha256": "0" * 64,
+        "weights_sha256": weights,
         "random_weights": False,
         "captured_calls": CALLS,
         "tokens": "pooled",
@@ -66,8 +71,12 @@ def write_recorded_run(where: Path | str, episodes: int = 12, pixels: bool = Tru
         count = planned.count
         state = draw.normal(size=(count, STATE)).astype(np.float32)
         pooled = np.full((CALLS, 2, 1, 6), np.nan, np.float32)
-        pooled[:count] = draw.normal(size=(count, 2, 1, 6))
-        pooled[:count, 1, 0, PLANTED] = 5 * state[:, 0]
+        noise = draw.normal(size=(count, 2, 1, 6))
+        if weights != "0" * 64:
+            noise = np.random.default_rng(derive_seed("network", weights, planned.index)).normal(size=noise.shape)
+        pooled[:count] = noise
+        if planted:
+            pooled[:count, 1, 0, PLANTED] = 5 * state[:, 0]
         inputs = {
             "state": state,
             "action": draw.normal(size=(count, CHUNK, ACTION)).astype(np.float32),

@@ -170,6 +170,11 @@ def recorded_columns(run: RunReader) -> dict[str, NDArray[np.float64]]:
     return found
 
 
+def is_builtin(name: str) -> bool:
+    """Whether a name is that of a built-in column by its prefix; a run may lack it still."""
+    return name.startswith((SIM, ITEM, RECORDED, PLAYED))
+
+
 def builtin_names() -> list[str]:
     """Names of all built-in columns."""
     return [*(SIM + name for name in SIM_COLUMNS), *(ITEM + name for name in ITEM_COLUMNS)]

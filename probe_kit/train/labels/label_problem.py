@@ -134,7 +134,7 @@ def _blocks(
     table = run.episodes
     items = table["item_id" if "item_id" in table else "episode_id"].to_numpy(dtype=str)
     layouts = table["layout"].to_numpy(dtype=str) if "layout" in table else np.full(len(table), "")
-    shown = {row: (str(layouts[row]), tuple(samples.inferences[own].tolist())) for row, own in places.items()}
+    shown = {row: (str(layouts[row]), tuple(samples.steps[own].tolist())) for row, own in places.items()}
     blocks: dict[str, NDArray[np.intp]] = {}
     kinds: dict[str, tuple[Hashable, ...]] = {}
     for group, rows in members.items():

@@ -78,10 +78,11 @@ class LabelCurve:
 
 @dataclass(frozen=True)
 class LabelControl:
-    """The same probe on features that never were in the model.
+    """The same probe on features that never were in the model, or of its untrained network.
 
     score, ci: its metric with a 95 % interval over groups. chance, p: by the label permutations, None without any.
-    stream: whose width `random-features` have; empty for others.
+    stream: whose width `random-features` have, or whose best site that of `untrained` is; empty for others.
+    view: of `untrained`.
     """
 
     name: str
@@ -90,6 +91,7 @@ class LabelControl:
     chance: float | None
     p: float | None
     stream: str = ""
+    view: str = ""
 
 
 @dataclass(frozen=True)
@@ -105,11 +107,15 @@ class LabelComparison:
 
 @dataclass(frozen=True)
 class LabelControls:
-    """Controls so far. left_out: why a default one was not run, by name."""
+    """Controls so far.
+
+    left_out: why a default one was not run, by name. untrained: hash of that run's settings, empty without one.
+    """
 
     scores: tuple[LabelControl, ...] = ()
     comparisons: tuple[LabelComparison, ...] = ()
     left_out: Mapping[str, str] = field(default_factory=dict)
+    untrained: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -137,6 +143,7 @@ class LabelControls:
             tuple(LabelControl(**{**one, "ci": tuple(one["ci"])}) for one in stored["scores"]),
             tuple(LabelComparison(**one) for one in stored["comparisons"]),
             stored["left_out"],
+            stored.get("untrained", ""),
         )
 
 

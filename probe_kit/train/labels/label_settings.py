@@ -12,6 +12,7 @@ class LabelSettings:
 
     label: sha256 of the label column. grouping: sha256 of the groups and strata of its samples. episodes: sha256
     of the ids of the run's episodes. categories: those whose episodes are probed together; empty for all.
+    align_to: column of the event where windows begin, `#` and a part of its hash; empty for the first inference.
     """
 
     model: str
@@ -32,6 +33,7 @@ class LabelSettings:
     call: int
     permutations: int
     seed: int
+    align_to: str = ""
     format: str = LABEL_FORMAT
 
     @property

@@ -25,10 +25,12 @@ def label_table(results: LabelResults, splits: bool = True) -> ResponsiveTable:
         exceeds = "; ".join([", ".join(shown)] * bool(shown) + [f"not shown: {', '.join(missed)}"] * bool(missed))
         cells.append((str(row["site"]), score, _number(row["chance"]), _number(row["p_fwe"]), exceeds or "–"))
     for control in results.controls.scores:
-        names.append(f"control {control.name}" + (f" · {label_of(control.stream)}" if control.stream else ""))
+        of = [label_of(control.stream)] * bool(control.stream) + [control.view] * (several and bool(control.view))
+        names.append(" · ".join([f"control {control.name}", *of]))
         cells.append(_control(control))
     metric = METRICS[own.task]
     said = [f"{own.target}: {metric}", own.task, *[f"view {own.views[0]}"] * (not several)]
+    said += [f"from {own.align_to.partition('#')[0]} on"] * bool(own.align_to)
     said += ["RANDOM WEIGHTS"] * own.random_weights
     return ResponsiveTable(
         title=", ".join(said),

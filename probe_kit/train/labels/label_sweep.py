@@ -14,7 +14,8 @@ from probe_kit.train.data.run_reader import RunReader, check_several_wordings
 from probe_kit.train.data.samples import Samples, is_token_view, sites_of
 from probe_kit.train.execution.dispatch import probe_columns
 from probe_kit.train.execution.executor import Columns, ExecutionSettings, Problems
-from probe_kit.train.labels.label_controls import add_label_controls, prepare_controls
+from probe_kit.train.labels.controls.label_controls import add_label_controls, prepare_controls
+from probe_kit.train.labels.controls.untrained import add_untrained_control, same_frames
 from probe_kit.train.labels.label_probe import LabelProbe
 from probe_kit.train.labels.label_problem import LabelProblem, label_problem
 from probe_kit.train.labels.label_results import LabelCurve, LabelResults
@@ -40,6 +41,8 @@ def train_label_probes(
     call: int = 0,
     controls: Sequence[str] | None = None,
     suite: Path | None = None,
+    untrained: RunReader | None = None,
+    align_to: Labels | None = None,
     seed: int = 0,
     jobs: int | None = None,
     ray: str | None = None,
@@ -49,22 +52,30 @@ def train_label_probes(
 
     categories: the episodes that are probed together, all by default. window: with labels of single inferences,
     how many of each episode take part; by default as many as 90 % of the episodes reach. controls: of `step`,
-    `state`, `instruction`, `pixels` and `random-features`; by default all that the run allows.
+    `state`, `action`, `instruction`, `pixels` and `random-features`; by default all that the run allows but
+    `action`. untrained: a run that showed the same frames to a network of random weights; every site is compared
+    with the best of its stream there. align_to: with labels of single inferences, where windows begin: at the
+    first inference at which this column is true.
     """
     check_label_run(run, categories, views, permutations)
-    samples = labelled_samples(run, labels, categories, call, window)
+    samples = labelled_samples(run, labels, categories, call, window, align_to)
+    beside = None if untrained is None else same_frames(run, untrained, samples)
     labels, _ = labels.on(run)  # how many it does not show is counted among the samples
-    settings = _settings(run, labels, samples, categories, views, permutations, call, seed)
+    settings = _settings(run, labels, samples, categories, views, permutations, call, seed, align_to)
     names, inputs, left_out = prepare_controls(run, samples, controls, suite)
     stored = load_label_results(run, settings.key) if is_stored(run.location, settings.key) else None
     keys = [(view, site) for view in views for site in sites_of(run, view)]
-    if stored is not None and all(name in stored.controls.names for name in names):
+    compared = untrained is None or (stored is not None and stored.controls.untrained == untrained.settings_sha256)
+    if stored is not None and compared and all(name in stored.controls.names for name in names):
         save_label_results(stored, run)  # they were asked for last
         return stored
     problem = label_problem(run, labels, samples, permutations, seed)
     results = stored or _fit(run, problem, settings, keys, ExecutionSettings(jobs, None, ray), progress)
     widths = {site.stream: run.streams[site.stream].width for _, site in keys}
-    save_label_results(add_label_controls(results, problem, widths, names, inputs, left_out), run)
+    results = add_label_controls(results, problem, widths, names, inputs, left_out)
+    if untrained is not None and beside is not None and not compared:
+        results = add_untrained_control(results, problem, untrained, beside)
+    save_label_results(results, run)
     return load_label_results(run, settings.key)
 
 
@@ -92,7 +103,7 @@ def check_label_run(
 
 def _settings(
     run: RunReader, labels: Labels, samples: LabelledSamples, categories: Sequence[str] | None,
-    views: Sequence[str], permutations: int, call: int, seed: int,
+    views: Sequence[str], permutations: int, call: int, seed: int, align_to: Labels | None,
 ) -> LabelSettings:  # fmt: skip
     settings: dict[str, Any] = getattr(run, "settings", {})
     names = run.episodes["episode_id"].astype(str).to_numpy()[samples.rows].tolist()
@@ -116,6 +127,7 @@ def _settings(
         call=call,
         permutations=permutations,
         seed=seed,
+        align_to="" if align_to is None else f"{align_to.target}#{align_to.on(run)[0].sha256[:12]}",
     )
 
 

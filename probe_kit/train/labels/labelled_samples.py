@@ -1,7 +1,7 @@
 """The samples of a run that a label names: pairs of episode and captured inference, with groups and strata."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from probe_kit.train.labels.labels import Labels
 
 REACHED = 0.9
 """Share of the episodes that reach the last inference of the default window."""
+_TRUE_OR_FALSE = (("False", "True"), ("0", "1"))
 EVERYWHERE = "all"
 """The only stratum where groups exchange everywhere."""
 
@@ -26,7 +27,8 @@ class LabelledSamples:
 
     rows: (n,) positions in the run's episodes. inferences: (n,) captured inference. values: (n,) coded labels.
     groups, strata: (n,) names of the group and of where it exchanges. window: inferences per episode. left_out:
-    how many of what have no part in the probes, by reason.
+    how many of what have no part in the probes, by reason. aligned: (n,) place in a window that begins at an
+    event, None where windows begin at the first inference.
     """
 
     rows: NDArray[np.intp]
@@ -36,6 +38,17 @@ class LabelledSamples:
     strata: NDArray[np.str_]
     window: int
     left_out: dict[str, int]
+    aligned: NDArray[np.intp] | None = None
+
+    @property
+    def steps(self) -> NDArray[np.intp]:
+        """(n,) what corresponds between episodes: the place in the window, or the inference."""
+        return self.inferences if self.aligned is None else self.aligned
+
+    def of(self, kept: NDArray[np.bool_]) -> "LabelledSamples":
+        """Those of the samples that (n,) `kept` names."""
+        names = ("rows", "inferences", "values", "groups", "strata", *(["aligned"] * (self.aligned is not None)))
+        return replace(self, **{name: getattr(self, name)[kept] for name in names})
 
     def features(self, run: RunReader, view: str, site: Site) -> NDArray[np.float32]:
         """(n, D) pooled features of one site. Raises NonFiniteActivationError naming the first broken episode."""
@@ -59,14 +72,21 @@ class LabelledSamples:
 
 
 def labelled_samples(
-    run: RunReader, labels: Labels, categories: Sequence[str] | None, call: int, window: int | None
+    run: RunReader,
+    labels: Labels,
+    categories: Sequence[str] | None,
+    call: int,
+    window: int | None,
+    align_to: Labels | None = None,
 ) -> LabelledSamples:
     """The samples of `run` that `labels` name.
 
     categories: only their episodes; None for all. call: the captured inference that a label of whole episodes
     is decoded from. window: for labels of single inferences how many of each episode, from the first on; None for
-    the most that 90 % of the episodes reach. Episodes that end before are left out.
-    Raises UsageError for keys that the run does not have, and for groups that split an episode or items.
+    the most that 90 % of the episodes reach. Episodes that end before are left out. align_to: true or false by
+    inference; windows begin at the first inference where it is true, and episodes without one are left out.
+    Raises UsageError for keys that the run does not have, for groups that split an episode or items, and for an
+    event that is not true or false by inference.
     """
     labels, unseen = labels.on(run)
     if labels.per_step and call:
@@ -75,36 +95,58 @@ def labelled_samples(
             f"--window N for the first N inferences, or leave out the column {INFERENCE!r}"
         )
     table, reached, chosen = _label_grid(run, labels), _reached(run), _of_categories(run, categories)
+    start: NDArray[np.intp] = np.full(len(reached), call)
+    left_out: dict[str, int] = {}
+    if align_to is not None:
+        start = _events(run, labels, align_to)
+        left_out[f"episodes in which {align_to.target} is never true"] = int((chosen & (start < 0)).sum())
+        chosen = chosen & (start >= 0)
+    counts = reached.sum(axis=1) - start
     if labels.per_step:
-        window = _window(reached[chosen], window)
-        calls = np.arange(window)
+        window = _window(counts[chosen], reached.shape[1], window)
     else:
         if window is not None:
             raise UsageError(f"window={window} with labels of whole episodes; leave it out, or use --call N")
         restrict_to_call(run, call)
-        window, calls = 1, np.arange(call, call + 1)
+        window = 1
         table = np.repeat(table[:, :1], reached.shape[1], axis=1)
-    whole = chosen & reached[:, calls].all(axis=1)
-    values = table[:, calls]
+    whole = chosen & (counts >= window)
+    calls = start[:, None] + np.arange(window)
+    values = np.take_along_axis(table, calls.clip(0, table.shape[1] - 1), axis=1)
     labelled = whole[:, None] & np.isfinite(values)
     rows, steps = np.nonzero(labelled)
     groups, strata = _groups(run, labels), _column(run, labels, labels.exchange_within, labels.strata, EVERYWHERE)
     _check_groups(run, labels, groups, strata, np.unique(rows))
-    left_out = {
-        f"episodes that end before inference {calls[-1]}": int((chosen & ~whole).sum()),
+    short = f"before inference {call + window - 1}" if align_to is None else f"within {window} inferences of it"
+    left_out |= {
+        f"episodes that end {short}": int((chosen & ~whole).sum()),
         "episodes without a label": int((whole & ~labelled.any(axis=1)).sum()),
         "inferences without a label": int((~labelled)[labelled.any(axis=1)].sum()),
         "labels of frames or episodes that the run does not show": unseen,
     }
     return LabelledSamples(
         rows,
-        calls[steps],
+        calls[rows, steps],
         values[labelled],
         groups[rows],
         strata[rows],
         window,
         {reason: count for reason, count in left_out.items() if count},
+        None if align_to is None else steps,
     )
+
+
+def _events(run: RunReader, labels: Labels, align_to: Labels) -> NDArray[np.intp]:
+    """(E,) the first inference at which `align_to` is true, -1 without one. Raises UsageError."""
+    event, _ = align_to.on(run)
+    if not (labels.per_step and event.per_step and event.coded.classes in _TRUE_OR_FALSE):
+        raise UsageError(
+            f"windows of {labels.described} aligned to {event.described}"
+            + (f" with the values {', '.join(event.coded.classes[:4])}" if event.coded.classes else "")
+            + "; expected labels per inference, and a column of true and false, or 1 and 0, per inference"
+        )
+    happened = _label_grid(run, event) == 1
+    return np.where(happened.any(axis=1), happened.argmax(axis=1), -1)
 
 
 def _reached(run: RunReader) -> NDArray[np.bool_]:
@@ -122,15 +164,14 @@ def _of_categories(run: RunReader, categories: Sequence[str] | None) -> NDArray[
     return chosen
 
 
-def _window(reached: NDArray[np.bool_], asked: int | None) -> int:
-    """Inferences per episode."""
-    most = reached.shape[1]
+def _window(counts: NDArray[np.intp], most: int, asked: int | None) -> int:
+    """Inferences per episode. counts: those of every episode from the start of its window on."""
     if asked is not None:
         if not 1 <= asked <= most:
             raise UsageError(f"window={asked}; expected 1 to {most}, the captured inferences of an episode")
         return asked
-    shares = reached.mean(axis=0) if len(reached) else np.zeros(most)
-    return max(1, int(np.flatnonzero(shares >= REACHED).size))
+    shares = [float((counts >= size).mean()) if counts.size else 0.0 for size in range(1, most + 1)]
+    return max(1, sum(share >= REACHED for share in shares))
 
 
 def _label_grid(run: RunReader, labels: Labels) -> NDArray[np.float64]:

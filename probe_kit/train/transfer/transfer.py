@@ -1,7 +1,7 @@
 """Probes fitted on all of one run and scored on another: `transfer_probes`."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -184,8 +184,7 @@ def _unshared(
             f"{run.location} too, which leaves {left}; expected at least {OUTER_FOLDS} to score "
             "on. Give a run of other items or episodes"
         )
-    names = ("rows", "inferences", "values", "groups", "strata")
-    return replace(there, **{name: getattr(there, name)[kept] for name in names}), int(shared.size)
+    return there.of(kept), int(shared.size)
 
 
 def _codes(classes: Sequence[str], others: Sequence[str]) -> Matrix | None:

@@ -10,7 +10,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract import Run, open_run
 from probe_kit.train import LabelResults, Labels, train_probes
 from probe_kit.train.labels.builtin_columns import label_frame
-from probe_kit.train.labels.label_controls import prepare_controls, small_pictures, step_features
+from probe_kit.train.labels.controls.label_controls import prepare_controls, small_pictures, step_features
 from probe_kit.train.labels.labelled_samples import LabelledSamples, labelled_samples
 from tests.support.recorded_run import CALLS, EVERY, PLANTED, write_recorded_run
 

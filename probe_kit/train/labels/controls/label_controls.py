@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -26,7 +27,6 @@ from probe_kit.train.labels.label_problem import LabelProblem
 from probe_kit.train.labels.label_results import (
     LabelComparison,
     LabelControl,
-    LabelControls,
     LabelResults,
     score_interval,
 )
@@ -90,8 +90,8 @@ class ControlInputs:
         return found
 
     def _frames(self) -> NDArray[np.intp] | None:
-        """(n,) place of every recorded frame among those of its number, None for scenes."""
-        if self.recorded is None:
+        """(n,) place of every recorded frame in the order of frames; None for scenes, and from an event on."""
+        if self.recorded is None or self.samples.aligned is not None:
             return None
         steps = self.run.control_steps[self.samples.rows, self.samples.inferences]  # type: ignore[attr-defined]
         return np.asarray(np.unique(steps, return_inverse=True)[1], np.intp)
@@ -109,7 +109,7 @@ def step_features(samples: LabelledSamples, places: NDArray[np.intp] | None = No
 
     places: (n,) of recorded frames in the order of their numbers, which take the place of inferences.
     """
-    steps, count = samples.inferences, samples.window
+    steps, count = samples.steps, samples.window
     if places is not None:
         steps, count = places, int(places.max()) + 1
     bins = min(count, MOST_BINS)
@@ -231,7 +231,9 @@ def add_label_controls(
         comparisons += list(_compared(name, references, results))
     run = {score.name for score in scores}
     missing = {name: why for name, why in {**before.left_out, **left_out}.items() if name not in run}
-    return results.with_controls(LabelControls(tuple(scores), tuple(comparisons), missing))
+    return results.with_controls(
+        replace(before, scores=tuple(scores), comparisons=tuple(comparisons), left_out=missing)
+    )
 
 
 def _best_layer(inputs: ControlInputs, problem: LabelProblem, width: int, results: LabelResults) -> LabelProbe:

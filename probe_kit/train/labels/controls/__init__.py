@@ -1,0 +1,1 @@
+"""Controls of a label: other inputs, and another network, for the same probe."""

@@ -1,0 +1,100 @@
+"""Windows that begin at an event: which inferences they hold, and what corresponds between episodes."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.errors import UsageError
+from probe_kit.extract import Run, open_run
+from probe_kit.train import Labels, train_probes
+from probe_kit.train.labels.controls.label_controls import step_features
+from probe_kit.train.labels.label_problem import label_problem
+from probe_kit.train.labels.labelled_samples import labelled_samples
+from tests.support.labelled_run import CALLS
+
+GRASPED = 2
+"""The inference at frame 6 is the first at which the cube is held."""
+
+
+@pytest.fixture(scope="module")
+def run(labelled_run: Path) -> Run:
+    return open_run(labelled_run)
+
+
+def table_of(run: Run) -> pd.DataFrame:
+    """An event at inference 0, 1 or 2 of each episode in turn; the label is the number of inferences since."""
+    rows = [
+        {"episode_id": name, "inference": call, "open": call >= number % 3, "since": float(call - number % 3)}
+        for number, name in enumerate(run.episodes["episode_id"])
+        for call in range(CALLS if number + 1 < len(run.episodes) else 2)
+    ]
+    return pd.DataFrame(rows)
+
+
+def test_a_window_begins_where_the_cube_is_first_held(run: Run) -> None:
+    labels, event = Labels.of_run(run, "sim.tool_y"), Labels.of_run(run, "sim.held")
+    samples = labelled_samples(run, labels, None, 0, None, event)
+    assert samples.window == CALLS - GRASPED
+    assert set(samples.inferences.tolist()) == {GRASPED, GRASPED + 1}
+    assert samples.left_out == {"episodes in which sim.held is never true": 1}
+    expected = [
+        run.trajectory(int(row)).tool[3 * call, 1]
+        for row, call in zip(samples.rows, samples.inferences, strict=True)
+    ]
+    np.testing.assert_allclose(samples.values, expected, rtol=1e-6)
+    features = samples.features(run, "mean", run.sites("backbone")[1])
+    np.testing.assert_allclose(features[:, 3], 10 * samples.values, rtol=1e-5)
+
+
+def test_inferences_correspond_by_their_place_behind_the_event(run: Run) -> None:
+    table = table_of(run)
+    labels, event = Labels.read(table, "since", "continuous"), Labels.read(table, "open")
+    samples = labelled_samples(run, labels, None, 0, 2, event)
+    assert (samples.values == samples.steps).all()
+    assert set(samples.inferences.tolist()) == {0, 1, 2, 3}
+    assert (step_features(samples).argmax(axis=1) == samples.steps).all()
+    with pytest.warns(UserWarning, match="no p below"):
+        columns = label_problem(run, labels, samples, 19, 0).columns
+    assert (columns == samples.steps[:, None]).all(), "labels of one place stay at that place"
+
+
+def test_episodes_that_end_too_soon_behind_the_event_are_left_out(run: Run) -> None:
+    table = table_of(run)
+    labels, event = Labels.read(table, "since", "continuous"), Labels.read(table, "open")
+    samples = labelled_samples(run, labels, None, 0, 3, event)
+    late = sum(number % 3 == 2 for number in range(len(run.episodes) - 1))
+    assert samples.left_out["episodes that end within 3 inferences of it"] >= late
+    assert np.bincount(samples.rows)[np.unique(samples.rows)].tolist() == [3] * np.unique(samples.rows).size
+
+
+def test_what_is_no_event_is_refused(run: Run) -> None:
+    table = table_of(run)
+    labels = Labels.read(table, "since", "continuous")
+    with pytest.raises(UsageError, match=r"'since' .*aligned to .*sim.phase.*expected .* true and false"):
+        labelled_samples(run, labels, None, 0, None, Labels.of_run(run, "sim.phase"))
+    with pytest.raises(UsageError, match="expected labels per inference"):
+        labelled_samples(run, Labels.of_run(run, "item.named"), None, 0, None, Labels.read(table, "open"))
+    said = CliRunner().invoke(app, ["train", str(run.path), "--align-to", "sim.held"])
+    assert "--align-to is for labels of your own" in " ".join(said.stderr.split())
+
+
+def test_the_event_is_part_of_the_results_key(run: Run, tmp_path: Path) -> None:
+    copy = open_run(shutil.copytree(run.path, tmp_path / "run"))
+    labels, event = Labels.of_run(copy, "sim.tool_y"), Labels.of_run(copy, "sim.held")
+    plain = train_probes(copy, labels=labels, permutations=0, controls=(), window=2)
+    aligned = train_probes(copy, labels=labels, permutations=0, controls=(), window=2, align_to=event)
+    assert plain.key != aligned.key
+    assert plain.settings.align_to == ""
+    assert aligned.settings.align_to.startswith("sim.held#")
+    answer = CliRunner().invoke(
+        app,
+        ["train", str(copy.path), "--target", "sim.tool_y", "--align-to", "sim.held", "--permutations", "0",
+         "--window", "2", "--controls", "none"],
+        env={"COLUMNS": "200"},
+    )  # fmt: skip
+    assert "from sim.held on" in " ".join(answer.stdout.split())
