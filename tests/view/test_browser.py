@@ -1,11 +1,13 @@
-"""The page in a real Chromium, opened from a file: it shows what the run holds, by mouse and by keyboard."""
+"""The page in a real Chromium, from a file and from the server: it shows what the run holds."""
 
 import json
 import shutil
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,18 +21,43 @@ from probe_kit.suite import Suite
 from probe_kit.train import load_results
 from probe_kit.view import write_viewer
 from probe_kit.view.catalogue import Catalogue
-from probe_kit.view.payloads.coding import pack_log_odds, payload_script
+from probe_kit.view.payloads.coding import code_words, pack_log_odds, payload_script
 from tests.support.browser import CHROMIUM, WHY_SKIPPED, Browser, Page
 from tests.support.little_run import episode, little_plan, little_writer
 from tests.view.conftest import FILM_STEPS, FILMED, HOSTILE, LOST_WORDS, SHORTENED
-from tests.view.payload_reader import read_payload
+from tests.view.payload_reader import log_odds, read_payload
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=WHY_SKIPPED)]
 
 
 @pytest.fixture(scope="module")
-def address(runs: list[Run], tmp_path_factory: pytest.TempPathFactory) -> str:
-    return write_viewer(runs, tmp_path_factory.mktemp("viewer") / "page").as_uri()
+def index(runs: list[Run], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_viewer(runs, tmp_path_factory.mktemp("viewer") / "page")
+
+
+@pytest.fixture(scope="module", params=["file", "server"])
+def address(request: pytest.FixtureRequest, runs: list[Run], index: Path) -> Iterator[str]:
+    if request.param == "file":
+        yield index.as_uri()
+        return
+    with served(runs) as found:
+        yield found
+
+
+@contextmanager
+def served(runs: list[Run]) -> Iterator[str]:
+    """The address that opens the page of a server."""
+    pytest.importorskip("starlette", reason="the server of the viewer is not installed (starlette, uvicorn)")
+    from probe_kit.view.server import ViewerServer
+
+    server = ViewerServer(Catalogue(runs))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    try:
+        yield server.address
+    finally:
+        server.stop()
+        thread.join(30)
 
 
 @pytest.fixture(scope="module")
@@ -300,15 +327,32 @@ def test_the_page_can_be_used_by_keyboard_alone(page: Page, address: str) -> Non
     assert page.read("document.activeElement.name") == "words"
 
 
-CATEGORIES, LAYERS, ITERATIONS = 11, 19, 10
+CATEGORIES, LAYERS, ITERATIONS, EPISODES = 11, 19, 10, 3440
 """As many as the benchmark has, and sites as pi0 has them."""
 
 
+def repeated(payload: dict[str, Any]) -> dict[str, Any]:
+    """The payload of all episodes as that of as many as the benchmark has, two of an item."""
+    rows, own = [number % len(payload["id"]) for number in range(EPISODES)], dict(payload)
+    for name, column in payload.items():
+        if isinstance(column, list):
+            own[name] = [column[row] for row in rows]
+        elif "codes" in column:
+            own[name] = {**column, "codes": [column["codes"][row] for row in rows]}
+    packed = payload["log_odds"].items()
+    own["log_odds"] = {part: pack_log_odds(log_odds(values)[rows]) for part, values in packed}
+    own["number"], own["id"] = list(range(EPISODES)), [f"episode {number}" for number in range(EPISODES)]
+    own["item"] = code_words([f"item {number // 2}" for number in range(EPISODES)])
+    own["layout"] = code_words(["original", "swapped"] * (EPISODES // 2))
+    own["category"] = code_words([f"c{number // 2 % CATEGORIES}" for number in range(EPISODES)])
+    return own
+
+
 @pytest.fixture
-def crowded(address: str, tmp_path: Path) -> str:
-    """The page with its category eleven times, and 209 sites whose accuracy says which one it is."""
+def crowded(index: Path, tmp_path: Path) -> str:
+    """The page with 3,440 episodes of eleven categories, and 209 sites whose accuracy says which one it is."""
     folder = tmp_path / "page"
-    shutil.copytree(Path(address.removeprefix("file://")).parent, folder)
+    shutil.copytree(index.parent, folder)
     data = folder / "data" / "a"
     run, own = (read_payload((data / f"{name}.js").read_bytes())[1] for name in ("run", "map/color"))
     sites = [("backbone", layer, None) for layer in range(LAYERS)]
@@ -323,6 +367,15 @@ def crowded(address: str, tmp_path: Path) -> str:
     own["signal"] = [place % 7 == 0 for place in range(len(sites))]
     own["cells"] = [[f"cell {place}", *own["cells"][0][1:]] for place in range(len(sites))]
     own["log_odds"] = pack_log_odds(np.zeros((len(sites), len(own["rows"]))))
+    for key in ("a", "b"):
+        found = read_payload((folder / "data" / key / "episodes.js").read_bytes())[1]
+        (folder / "data" / key / "episodes.js").write_bytes(payload_script(f"{key}/episodes", repeated(found)))
+    script = (data / "e" / "00000.js").read_bytes()
+    for number in range(len(found["id"]), EPISODES):
+        (data / "e" / f"{number:05d}.js").write_bytes(
+            script.replace(b"a/e/00000", f"a/e/{number:05d}".encode(), 1)
+        )
+        (data / "f" / f"{number:05d}.webp").hardlink_to(data / "f" / "00000.webp")
     (data / "run.js").write_bytes(payload_script("a/run", run))
     for one in run["categories"]:
         (data / "map" / f"{one['name']}.js").write_bytes(payload_script(f"a/map/{one['name']}", own))
@@ -346,6 +399,26 @@ def test_maps_of_all_categories_are_few_elements_and_every_site_can_be_reached(p
     for column, row, site in ((0, 0, 18), (3, LAYERS - 1, 19 + 2 * LAYERS), (10, 0, 18 + 10 * LAYERS)):
         page.hover_at("figure:nth-child(6) .smallmap", *spot(column, row))
         assert str(page.read("document.querySelectorAll('.smallmap')[5].title")).endswith(f": cell {site}")
+
+
+def test_every_view_of_the_benchmarks_episodes_is_few_elements_and_every_item_can_be_reached(
+    page: Page, crowded: str
+) -> None:
+    for view in ("overview", "map", "episodes?ep=1", "compare?with=b&ep=1", "questions"):
+        page.open(f"{crowded}#/{view}")
+        page.settle()
+        assert 100 < page.read("document.querySelectorAll('*').length") <= 2000, view
+    listed = "[...document.querySelectorAll('[data-item]')].map(row => row.dataset.item)"
+    items = page.read(listed)
+    assert text(page, ".questions .note").startswith("Items 1 to 60 of 1,720")
+    while page.read("[...document.querySelectorAll('.note a')].some(one => one.innerText === 'next')"):
+        page.click(".note a:last-of-type")
+        items += page.read(listed)
+    assert len(items) == len(set(items)) == EPISODES // 2
+    page.click(".note a")
+    assert text(page, ".questions .note").startswith("Items 1,621 to 1,680")
+    page.open(f"{crowded}#/questions?from=99999&category=c3")
+    assert text(page, ".questions .note").startswith("Items 121 to 157 of 157")
 
 
 def spot(column: int, row: int) -> tuple[float, float]:
@@ -427,23 +500,18 @@ def test_a_served_page_shows_episodes_that_are_committed_while_it_is_open(
     browser: Browser, small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("starlette", reason="the server of the viewer is not installed (starlette, uvicorn)")
-    from probe_kit.view.server import ViewerServer
-
     monkeypatch.setattr("probe_kit.view.server.TICK_S", 0.05)
     browser.complaints.clear()
     plan = little_plan(small_suite.select(["color"]), 0, 6)
     writer = little_writer(locate(tmp_path / "run"), plan)
     for number in range(3):
         writer.write(episode(plan, number))
-    server = ViewerServer(Catalogue([open_run(tmp_path / "run", allow_partial=True)]))
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    try:
+    with served([open_run(tmp_path / "run", allow_partial=True)]) as opened:
         page = browser.page()
-        page.open(server.address)
+        page.open(opened)
         assert page.read("location.search") == ""
         assert text(page, ".live") == "3 of 6 episodes so far"
-        page.open(f"http://127.0.0.1:{server.port}/#/episodes?layout=original&ep=2&t=1")
+        page.open(f"{opened.partition('?')[0]}#/episodes?layout=original&ep=2&t=1")
         before = [text(page, selector) for selector in ("h2", ".scrub output", "output.count")]
         assert before[2] == "2 of 3"
         for number in (3, 4):
@@ -454,7 +522,4 @@ def test_a_served_page_shows_episodes_that_are_committed_while_it_is_open(
         assert after == before[:2]
         assert page.read("document.querySelector('.list [aria-selected=true] small').textContent").startswith("2 ")
         page.open("about:blank")
-    finally:
-        server.stop()
-        thread.join(30)
     assert browser.complaints == []

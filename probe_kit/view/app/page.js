@@ -9,7 +9,7 @@ try { const chosen = localStorage.getItem("probe_kit theme"); if (chosen) docume
 
 const VIEW = { overview: Overview, map: Maps, episodes: Episodes, compare: Compare, questions: Questions };
 const HELP = [["← →", "step back and forward"], ["space", "play and pause"], ["Home End", "first and last step"], ["j k", "next and previous episode"], ["/", "search"], [`1 … ${Object.keys(VIEWS).length}`, "views"], ["?", "these keys"]];
-const CLEARED = { ep: undefined, t: undefined, category: undefined, outcome: undefined, layout: undefined, case: undefined, words: undefined, site: undefined };
+const CLEARED = { ep: undefined, t: undefined, category: undefined, outcome: undefined, layout: undefined, case: undefined, words: undefined, site: undefined, from: undefined };
 
 /* Events of a server tell that a run grew: its payloads are read again, and filter, episode and scroll stay. */
 function useGrowth(known) {

@@ -1,6 +1,6 @@
 // Questions: a row per item, in both layouts: what the VLM answered, what the probes read, where the arm went.
 "use strict";
-const ROWS = 120, LAYOUTS = ["original", "swapped"], RESPONSES = { 1: ["✓ follows", "right"], 0: ["does not", ""], "-1": ["✗ reverses", "wrong"] };
+const ROWS = 60, LAYOUTS = ["original", "swapped"], RESPONSES = { 1: ["✓ follows", "right"], 0: ["does not", ""], "-1": ["✗ reverses", "wrong"] };
 
 /* The readings of one episode in the order of the flow; null where nothing is said. */
 function readingsOf(run, one, answer) {
@@ -35,12 +35,13 @@ function Questions({ run, list, place }) {
     const reading = own.readings[name], odds = name === "backbone" || name === "action" ? signed(own.one[name]) : "";
     return html`<a class=${`mark-cell ${reading ?? ""}`} title=${reading ? `${reading}${odds && `, log-odds ${odds}`}` : "no signal shown"} href=${link({ view: "episodes", ep: own.one.number, t: 0, case: undefined, outcome: undefined, layout: undefined, words: undefined })}>${reading ? `${reading === "right" ? "✓" : "✗"} ${odds}` : "–"}</a>`;
   };
-  const names = run.categories.map((c) => c.name);
-  return html`<div class="questions"><nav class="tabs" aria-label="Categories"><a href=${link({ category: undefined })} aria-current=${names.includes(place.category) ? null : "true"}>all</a>${names.map((name) => html`<a href=${link({ category: name })} aria-current=${name === place.category ? "true" : null}>${titleOf(run, name)}</a>`)}</nav>
+  const names = run.categories.map((c) => c.name), first = ROWS * Math.max(0, Math.min(Math.ceil(rows.length / ROWS) - 1, Math.floor(place.from / ROWS) || 0)), shown = rows.slice(first, first + ROWS);
+  const Turn = ({ by, words }) => (rows[first + by] ? html` · <a href=${link({ from: first + by || undefined })}>${words}</a>` : null);
+  return html`<div class="questions"><nav class="tabs" aria-label="Categories"><a href=${link({ category: undefined, from: undefined })} aria-current=${names.includes(place.category) ? null : "true"}>all</a>${names.map((name) => html`<a href=${link({ category: name, from: undefined })} aria-current=${name === place.category ? "true" : null}>${titleOf(run, name)}</a>`)}</nav>
     <section class="panel"><h2>Known, encoded, acted on <small>${rows.length.toLocaleString("en")} items, those with most disagreements first · each in the layouts ${LAYOUTS.join(" and ")} · log-odds at the category's best sites; a dash: no signal shown</small></h2>
     <div class="scroll" tabindex="0" role="region" aria-label="Table by item"><table><thead><tr><th>correct picture</th><th>wrong picture</th><th>category</th>${stages.map(([name, words]) => html`<th colspan="2" key=${name}>${words}</th>`)}${swapped && html`<th colspan="2" title="image swap: the first action goes to the correct picture, and to the other side once the two pictures are swapped">action, pictures swapped</th>`}</tr></thead>
-      <tbody>${rows.slice(0, ROWS).map((row) => html`<tr key=${row.one.item} data-item=${row.one.item}><th scope="row"><${Text}>${row.one.target ?? row.one.item}<//></th><td><${Text}>${row.one.distractor ?? ""}<//></td><td>${titleOf(run, row.one.category)}</td>
+      <tbody>${shown.map((row) => html`<tr key=${row.one.item} data-item=${row.one.item}><th scope="row"><${Text}>${row.one.target ?? row.one.item}<//></th><td><${Text}>${row.one.distractor ?? ""}<//></td><td>${titleOf(run, row.one.category)}</td>
         ${stages.flatMap(([name]) => LAYOUTS.map((layout) => html`<td data-stage=${`${name} ${layout}`}><${Mark} own=${row.layouts[layout]} name=${name} /></td>`))}${swapped && LAYOUTS.map((layout) => html`<td data-stage=${`swap ${layout}`}><${Response} own=${row.layouts[layout]} /></td>`)}</tr>`)}</tbody></table></div>
-      ${rows.length > ROWS && html`<p class="note">${ROWS} of ${rows.length} items are shown. Choose a category to see others.</p>`}
+      ${rows.length > ROWS && html`<p class="note">Items ${(first + 1).toLocaleString("en")} to ${(first + shown.length).toLocaleString("en")} of ${rows.length.toLocaleString("en")}<${Turn} by=${-ROWS} words="previous" /><${Turn} by=${ROWS} words="next" /></p>`}
       ${!vlm && !run.answers && html`<p class="note">Open a VLM run of the same suite too, and its answers stand beside: <code>probe-kit view RUN VLM_RUN</code></p>`}</section></div>`;
 }
