@@ -76,7 +76,7 @@ function EpisodeList({ run, shown, one: chosen, value }) {
       const { log_odds, signal } = value(one), read = says(log_odds, signal);
       return html`<a key=${one.number} role="option" aria-selected=${one === chosen} aria-setsize=${shown.length} aria-posinset=${from + k + 1} class="item" style=${{ transform: `translateY(${(from + k) * ROW}px)` }} href=${link({ ep: one.number, t: 0 })}>
         <span class=${`sign ${one.outcome}`} aria-label=${OUTCOMES[one.outcome] ?? one.outcome}>${SIGNS[one.outcome] ?? "○"}</span><span class="what"><b><${Text}>${one.instruction ?? one.id}<//></b><small>${one.number} · ${titleOf(run, one.category)} · ${one.layout}</small></span>
-        <span class=${`odds ${read === "right" ? "up" : read === "wrong" ? "down" : ""}`} title=${read ? "" : "no signal shown at this site"}>${signed(log_odds)}</span></a>`;
+        <span class=${`odds ${read === "right" ? "up" : read === "wrong" ? "down" : ""}`} title=${read ? "" : "no signal shown at this site"}>${signal ? signed(log_odds) : "–"}</span></a>`;
     })}</div></div>`;
 }
 function Episodes({ run, list, place }) {
@@ -193,7 +193,7 @@ function NetworkNow({ run, one, episode, map, now, place }) {
   };
   return html`<div class="now"><h3>Log-odds at inference ${call} <small>step ${episode.inferences[call]}</small></h3>
     <${SiteMap} run=${run} label="log-odds in this episode" chosen=${site} onChoose=${(i) => go({ site: run.sites[i].name }, true)} cell=${cell}
-      legend=${html`<div class="ramp two" aria-hidden="true"><span>wrong</span><i></i><span>correct</span><span class="swatch weak"></span><span>no signal shown</span></div>`} />
+      legend=${html`<div class="ramp two" aria-hidden="true"><span>wrong</span><i></i><span>correct</span><span><span class="swatch weak"></span> no signal shown</span></div>`} />
     ${episode.refitted && html`<label class="choice inline"><span>probes</span><select name="probe" value=${place.probe === "refitted" ? "refitted" : ""} onChange=${(e) => go({ probe: e.target.value }, true)}><option value="">of inference 0</option><option value="refitted">refitted at each inference</option></select></label>`}
     ${!episode.held_out && html`<p class="note">No fold tests this item: the mean of the folds' log-odds is shown.</p>`}
     ${calls === 1 && episode.inferences.length > 1 && html`<p class="note">One of ${episode.inferences.length} inferences was captured. <code>extract --captured-calls all</code> captures all.</p>`}</div>`;
