@@ -87,7 +87,8 @@ def export(
         ExportFormat,
         typer.Option(
             "--format",
-            help="Format. mp4, lerobot, hf and sae write a folder; mp4 and lerobot need a run with --frames all.",
+            help="Format. mp4, lerobot, rerun, hf and sae write a folder; the first three need a run with "
+            "--frames all.",
         ),
     ],
     out_file: Annotated[

@@ -19,6 +19,7 @@ from probe_kit.extract.store.exports.tables import write_hf, write_parquet
 from probe_kit.extract.store.exports.vectors import StreamChoice, choose
 from probe_kit.extract.store.exports.whole_arrays import write_h5, write_safetensors
 from probe_kit.extract.store.films.lerobot_dataset import write_lerobot
+from probe_kit.extract.store.films.rerun_recordings import write_rerun
 from probe_kit.extract.store.films.videos import write_films
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run, open_run
@@ -45,7 +46,8 @@ def export_run(
     h5: `<stream>/pooled`, `<stream>/later`, `<stream>/tokens`, and a dataset per column under `episodes`.
     safetensors: the same with a dot, the last two true bfloat16; episodes in the metadata.
     Axes of both are (episode, call, [iteration,] layer, view or token, feature).
-    mp4: a folder with a film per episode. lerobot: a LeRobotDataset. Both need a run with `--frames all`.
+    mp4: a folder with a film per episode. rerun: one with a recording per episode. lerobot: a LeRobotDataset.
+    These three need a run with `--frames all`.
 
     Four formats hold the vectors that `sites` and `view` choose, see `choose`.
     parquet, hf: a row per vector with episode, group, inference, frame, site, view, role and token; hf is a folder
@@ -67,7 +69,7 @@ def export_run(
     if out.exists():
         raise UsageError(f"{out} exists; choose another --out or remove it")
     run = open_run(path, allow_partial)
-    if not run.streams and style not in ("mp4", "lerobot"):
+    if not run.streams and style not in OF_FRAMES:
         raise UsageError(f"{path} has no activations to export; its episodes are in `open_run(...).episodes`")
     with draft_of(out) as draft:
         if style in OF_VECTORS:
@@ -121,6 +123,7 @@ WHOLE: dict[ExportFormat, Callable[[Run, Path], None]] = {
     "safetensors": write_safetensors,
     "mp4": write_films,
     "lerobot": write_lerobot,
+    "rerun": write_rerun,
 }
 """Formats that hold all that was stored."""
 CHOSEN: dict[ExportFormat, Callable[[Run, Choices, Path, str], None]] = {
@@ -128,6 +131,8 @@ CHOSEN: dict[ExportFormat, Callable[[Run, Choices, Path, str], None]] = {
     "npz": write_npz,
     "hf": write_hf,
 }
+OF_FRAMES: tuple[ExportFormat, ...] = ("mp4", "lerobot", "rerun")
+"""Formats that hold what was seen and done, and no activations."""
 SAE: ExportFormat = "sae"
 OF_VECTORS: tuple[ExportFormat, ...] = (*CHOSEN, SAE)
 """Formats that hold chosen vectors."""

@@ -40,6 +40,11 @@ def filmed_episodes(run: Run) -> Iterator[FilmedEpisode]:
         yield FilmedEpisode(position, named, decode_frames(sheet.content, sheet.count))
 
 
+def episode_name(one: FilmedEpisode) -> str:
+    """What a file of this episode is called: `<number>-<category>-<outcome>`."""
+    return f"{one.row['episode']:08d}-{one.row['category']}-{one.row['outcome']}"
+
+
 def control_rate(run: Run) -> float:
     """Actions per second of the run's scene. Raises UsageError for a run without a scene."""
     scene = run.settings.get("scene")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from probe_kit._system.optional_dependencies import require
-from probe_kit.extract.store.films.filmed_episodes import control_rate, filmed_episodes
+from probe_kit.extract.store.films.filmed_episodes import control_rate, episode_name, filmed_episodes
 from probe_kit.extract.store.run import Run
 from probe_kit.extract.store.small_frames import SmallFrames
 
@@ -23,8 +23,7 @@ def write_films(run: Run, folder: Path) -> None:
     rate = Fraction(control_rate(run)).limit_denominator(1000)
     for one in filmed_episodes(run):
         folder.mkdir(exist_ok=True)
-        name = f"{one.row['episode']:08d}-{one.row['category']}-{one.row['outcome']}.mp4"
-        _write_film(folder / name, one.frames, rate)
+        _write_film(folder / f"{episode_name(one)}.mp4", one.frames, rate)
 
 
 def _write_film(path: Path, frames: SmallFrames, rate: Fraction) -> None:
