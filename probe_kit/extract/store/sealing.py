@@ -103,9 +103,9 @@ def columns_of_rows(
         stop = min(start + _block(episodes), episodes)
         for slab in _slabs(cells, (stop - start) * stored.width * size):
             values = np.empty((len(slab), stop - start, stored.width), rows.array.dtype)
-            for position in range(start, stop):
-                row = np.moveaxis(rows[position], -2, 1) if kind == "pooled" else rows[position]
-                values[:, position - start] = row[tuple(np.transpose(slab))]
+            for place, stored_row in enumerate(rows.between(start, stop)):
+                row = np.moveaxis(stored_row, -2, 1) if kind == "pooled" else stored_row
+                values[:, place] = row[tuple(np.transpose(slab))]
             for cell, column in zip(slab, values, strict=True):
                 yield (*cell, slice(start, stop)), column
 

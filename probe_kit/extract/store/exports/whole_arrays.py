@@ -39,8 +39,8 @@ def write_h5(run: Run, out: Path) -> None:
             )
             dataset.attrs["views"] = list(run.views(stream))
             dataset.attrs["dtype"] = "float32" if kind == "pooled" else "bfloat16 bits"
-            for position in range(len(rows)):
-                dataset[position] = rows[position]
+            for position, row in enumerate(rows):
+                dataset[position] = row
         for name, values in _episodes(run).items():
             numeric = all(isinstance(value, bool | int | float) for value in values)
             file[f"episodes/{name}"] = values if numeric else ["" if v is None else str(v) for v in values]
@@ -64,8 +64,8 @@ def write_safetensors(run: Run, out: Path) -> None:
     with out.open("wb") as file:
         _write_header(file, header)
         for _, _, rows in _arrays(run):
-            for position in range(len(rows)):
-                file.write(np.ascontiguousarray(rows[position]).tobytes())
+            for row in rows:
+                file.write(np.ascontiguousarray(row).tobytes())
 
 
 def _write_header(file: BinaryIO, header: dict[str, Any]) -> None:

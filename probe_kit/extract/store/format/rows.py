@@ -38,11 +38,18 @@ class Rows:
         return self.read(position, ())
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """All of every episode, in order; several are read at a time. Raises RunDamagedError at a damaged one."""
+        """All of every episode, in order, as `between`."""
+        return self.between(0, len(self))
+
+    def between(self, start: int, stop: int) -> Iterator[NDArray[Any]]:
+        """All of the episodes from `start` up to `stop`, in order; several are read at a time.
+
+        Raises RunDamagedError at a damaged one.
+        """
         per_row = math.prod(self.array.shape[1:]) * self.array.dtype.itemsize
         size = max(1, _BLOCK_BYTES // max(1, per_row))
-        for start in range(0, len(self), size):
-            yield from self._block(range(start, min(start + size, len(self))))
+        for first in range(start, stop, size):
+            yield from self._block(range(first, min(first + size, stop)))
 
     def _block(self, positions: range) -> Iterator[NDArray[Any]]:
         try:

@@ -70,7 +70,7 @@ class StoredInputs:
         if kind not in self.kinds:
             raise KeyError(kind)
         rows = Rows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)
-        return np.stack([rows[position] for position in range(len(rows))])
+        return np.stack(list(rows))
 
     def column(self, name: str) -> NDArray[np.float64]:
         """(E, C) one column of the data set. Raises KeyError."""
