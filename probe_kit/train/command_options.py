@@ -102,7 +102,8 @@ AlignTo = Annotated[
     _label_option(
         "--align-to",
         metavar="COLUMN",
-        help="Begin the window of each episode at the first inference where this column is true: sim.held.",
+        help="Begin the window of each episode where this column is first true. COLUMN=VALUE: where it first has "
+        "a value, such as 'sim.phase=after release'.",
     ),
 ]
 

@@ -114,15 +114,15 @@ class ColumnOptions:
         return Labels.read(table, self.target, *further)
 
     def event(self, run: "RunReader") -> "Labels | None":
-        """The column where windows begin, of the table if it has one of that name, else built in."""
+        """The column where windows begin, built in or of the table; of `COLUMN=VALUE` whether it has the value."""
         from probe_kit.train import Labels
         from probe_kit.train.labels.builtin_columns import is_builtin
 
         if self.align_to is None:
             return None
-        if self.file is None or is_builtin(self.align_to):
-            return Labels.of_run(run, self.align_to)
-        return Labels.read(self.file, self.align_to)
+        name, equals, value = self.align_to.partition("=")
+        found = Labels.of_run(run, name) if self.file is None or is_builtin(name) else Labels.read(self.file, name)
+        return found.equal_to(value) if equals else found
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def transfer_column(
     out.print(transfer_table(results, splits=details))
     for sentence in transfer_sentences(results):
         out.print(sentence, markup=False, highlight=False)
-    say("nothing was stored; [bold]transfer_probes[/] in Python gives every site as a frame")
+    say(marked("nothing was stored; [bold]transfer_probes[/] in Python gives every site as a frame"))
 
 
 def print_label_results(results: "LabelResults", details: bool) -> None:

@@ -150,6 +150,21 @@ class Labels:
             target, coded, column.episodes, column.inferences, table, group_by, exchange_within, builtin=True
         )
 
+    def equal_to(self, value: str) -> "Labels":
+        """Whether these labels are the class `value`, as a binary label, such as an event where windows begin.
+
+        Raises UsageError for a value that is no class.
+        """
+        classes = self.coded.classes
+        if value not in classes:
+            there = ", ".join(classes[:8]) or "quantities, not classes"
+            raise UsageError(f"{self.described} has no value {value!r}; it has {there}")
+        own = self.coded.values
+        coded = LabelValues(
+            "binary", ("False", "True"), np.where(np.isnan(own), np.nan, own == classes.index(value))
+        )
+        return replace(self, target=f"{self.target}={value}", coded=coded)
+
     @property
     def task(self) -> Task:
         """binary, classes or continuous."""

@@ -51,6 +51,19 @@ def test_a_window_begins_where_the_cube_is_first_held(run: Run) -> None:
     np.testing.assert_allclose(features[:, 3], 10 * samples.values, rtol=1e-5)
 
 
+def test_an_event_may_be_a_value_of_a_column_of_classes(run: Run) -> None:
+    phase = Labels.of_run(run, "sim.phase")
+    samples = labelled_samples(
+        run, Labels.of_run(run, "sim.tool_y"), None, 0, None, phase.equal_to("after release")
+    )
+    assert (samples.window, set(samples.inferences.tolist())) == (1, {3})
+    assert samples.left_out == {"episodes in which sim.phase=after release is never true": 1}
+    with pytest.raises(UsageError, match="no value 'landed'; it has after release, before grasp, holding"):
+        phase.equal_to("landed")
+    with pytest.raises(UsageError, match="quantities, not classes"):
+        Labels.of_run(run, "sim.tool_y").equal_to("0")
+
+
 def test_inferences_correspond_by_their_place_behind_the_event(run: Run) -> None:
     table = table_of(run)
     labels, event = Labels.read(table, "since", "continuous"), Labels.read(table, "open")
@@ -93,8 +106,8 @@ def test_the_event_is_part_of_the_results_key(run: Run, tmp_path: Path) -> None:
     assert aligned.settings.align_to.startswith("sim.held#")
     answer = CliRunner().invoke(
         app,
-        ["train", str(copy.path), "--target", "sim.tool_y", "--align-to", "sim.held", "--permutations", "0",
-         "--window", "2", "--controls", "none"],
+        ["train", str(copy.path), "--target", "sim.tool_y", "--align-to", "sim.phase=holding", "--permutations",
+         "0", "--window", "2", "--controls", "none"],
         env={"COLUMNS": "200"},
     )  # fmt: skip
-    assert "from sim.held on" in " ".join(answer.stdout.split())
+    assert "from sim.phase=holding on" in " ".join(answer.stdout.split())
