@@ -189,7 +189,8 @@ def main() -> None:
     tests = chromium_of_tests()
     if tests.CHROMIUM is None:
         sys.exit(tests.WHY_SKIPPED)
-    with tempfile.TemporaryDirectory() as folder, tests.Browser(Path(folder) / "profile") as browser:
+    scratch = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+    with scratch as folder, tests.Browser(Path(folder) / "profile") as browser:
         measure_server(browser, options.run)
         if options.export:
             measure_export(browser, options.run, Path(folder))

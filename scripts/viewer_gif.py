@@ -22,8 +22,8 @@ from probe_kit.view import write_viewer
 
 ROOT = Path(__file__).parents[1]
 TARGET = ROOT / "docs" / "viewer.gif"
-WINDOW, SIZE = (1280, 880), (820, 559)
-COLORS = 64
+WINDOW, SIZE = (1400, 940), (860, 577)
+COLORS = 128
 FIRST_MS, STEP_MS, LAST_MS = 900, 280, 1500
 
 
@@ -72,7 +72,7 @@ def main() -> None:
     browser = tests_browser()
     if browser.CHROMIUM is None:
         sys.exit(browser.WHY_SKIPPED)
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         page = write_viewer([open_run(options.run, allow_partial=True)], Path(folder) / "viewer")
         with browser.Browser(Path(folder) / "profile") as chromium:
             pictures = film_episode(chromium.page(*WINDOW), page.as_uri(), options.episode)

@@ -84,7 +84,7 @@ function Episodes({ run, list, place }) {
   const [maps] = useLoaded(...(named >= 0 ? names.map((name) => `${run.key}/map/${name}`) : []));
   const ready = named >= 0 && maps.length > 0 && maps.every(Boolean);
   const value = useMemo(() => {
-    if (!ready) return (one) => { const part = Number.isNaN(one.action) ? "backbone" : "action"; return { log_odds: one[part], signal: categoryOf(run, one.category)?.best[part]?.signal, pair: partCase(run, one, part) }; };
+    if (!ready) return (one) => { const best = categoryOf(run, one.category)?.best, part = ["action", "backbone"].find((name) => best?.[name]?.signal) ?? "action"; return { log_odds: one[part], signal: best?.[part]?.signal, pair: partCase(run, one, part) }; };
     const at = new Map();
     maps.forEach((map) => { const v = logOdds(map.log_odds); map.rows.forEach((row, i) => at.set(row, [v[named * map.rows.length + i], map.signal[named]])); });
     return (one) => { const [log_odds, signal] = at.get(one.position) ?? [NaN, false]; return { log_odds, signal, pair: caseOf(one, log_odds, signal) }; };
@@ -98,7 +98,7 @@ function Episodes({ run, list, place }) {
     if (e.key === "/") { e.preventDefault(); document.querySelector("input[name=words]").focus(); }
   });
   return html`<div class="episodes"><${Filters} run=${run} list=${list} shown=${shown} place=${place} />
-    <div class="split"><aside><p class="listhead">${run.sites.length ? `log-odds at ${named >= 0 ? short(place.site) : "the best site of the category"}` : "this run has no probes"}</p><${EpisodeList} run=${run} shown=${shown} one=${one} value=${value} /></aside>
+    <div class="split"><aside><p class="listhead">${run.sites.length ? `log-odds at ${named >= 0 ? short(place.site) : "the category's best site with signal"}` : "this run has no probes"}</p><${EpisodeList} run=${run} shown=${shown} one=${one} value=${value} /></aside>
     ${one ? html`<${Episode} key=${`${run.key} ${one.number}`} run=${run} one=${one} place=${place} near=${[1, -1].map((by) => shown[shown.indexOf(one) + by]).filter(Boolean)} />`
       : html`<p class="empty">No episode is left. <a href=${link(Object.fromEntries(FILTERS.map((name) => [name, undefined])))}>Clear the filters</a></p>`}</div></div>`;
 }
