@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import InstructionError, SettingsMismatchError, UsageError
@@ -87,6 +88,21 @@ def test_every_episode_has_its_answer_and_the_run_is_whole(asked: Run) -> None:
     ask = asked.settings["ask"]
     assert (ask["prompt"], ask["picture_size"], ask["template_sha256"]) == ("p1", "224x224", P1.sha256)
     assert asked.label == "prismatic · tiny · tokenizer=bytes · p1 · 224×224"
+
+
+def test_a_question_by_letter_keeps_what_every_layer_would_answer(settings: AskSettings, asked: Run) -> None:
+    """By the model's own final norm and head; the last layer is the stored margin."""
+    model = load_answer_model(settings)
+    margins = asked.lens_margins
+    assert margins is not None
+    assert margins.shape == (4, len(asked.sites("answer")))
+    assert margins[:, -1] == pytest.approx(asked.episodes["margin"].to_numpy(), abs=1e-5)
+    assert margins[:, :-1].std() > 0
+    assert model.unembedding is not None
+    letters = [model.tokenizer.encode(letter)[-1] for letter in "AB"]  # type: ignore[attr-defined]
+    for layer, site in enumerate(asked.sites("answer")):
+        logits = model.unembedding.logits(torch.from_numpy(np.array(asked.column(site, "last")[:1])))
+        assert margins[0, layer] == pytest.approx(float(logits[0, letters[0]] - logits[0, letters[1]]), abs=1e-6)
 
 
 def test_its_streams_are_those_of_the_question_as_it_was_asked(asked: Run) -> None:

@@ -21,6 +21,7 @@ class SaidRun(ArrayRun):
     settings: dict = field(default_factory=dict)
     certificate: dict = field(default_factory=dict)
     called: str = ""
+    lens_margins: np.ndarray | None = None
 
     @property
     def label(self) -> str:

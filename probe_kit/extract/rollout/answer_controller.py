@@ -16,6 +16,7 @@ from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import AskSettings
+from probe_kit.extract.vqa.letter_lens import letter_margins
 from probe_kit.extract.vqa.parsing import Said, read_answer
 from probe_kit.extract.vqa.phrases import Phrase, phrases
 from probe_kit.extract.vqa.pictures import side_by_side
@@ -84,6 +85,7 @@ class AnswerController:
         if settings.tokens != "none":
             self.streams = self._streams(blank)
         self._capturer = Capturer(model, self.streams, settings.tokens == "all", "answers")
+        self._lens_stream = self._find_lens_stream() if self.template.lettered else None
         self.identity: dict[str, Any] = {
             "model": settings.model,
             "random_weights": card.random_weights,
@@ -116,6 +118,8 @@ class AnswerController:
             reading = self._read(questions, buffers if order == "original" else {})
             spoken.append(self.model.speak(reading, self.template.tokens))
             forced.append(self._forced(questions, reading, order))
+            if buffers and order == "original":
+                self._record_lens(turns, reading)
         first = self._questions(shown, phrases_asked, "original")
         sizes = self._sizes(first)
         return [
@@ -190,6 +194,26 @@ class AnswerController:
             )
             for number, row in enumerate(reading.option_logits)
         ]
+
+    def _find_lens_stream(self) -> StoredStream | None:
+        """The stored stream whose last position chooses the letter; None for a model without an unembedding."""
+        if self.model.unembedding is None:
+            return None
+        stored = {stream.name: stream for stream in self.streams if "last" in stream.views}
+        return stored.get(self.model.unembedding.streams[-1])
+
+    def _record_lens(self, turns: Sequence[AskTurn], reading: "Reading") -> None:
+        """Keep the margins of questions with left named first, where option 0 is the letter for left."""
+        stream = self._lens_stream
+        if stream is None or reading.option_ids is None:
+            return
+        for turn, letters, logits in zip(turns, reading.option_ids, reading.option_logits, strict=True):
+            turn.buffers.wait()
+            pooled = turn.buffers.pooled[stream.name][0]
+            residuals = (pooled if stream.iterations is None else pooled[0])[:, stream.views.index("last")]
+            turn.buffers.lens_margins = letter_margins(
+                self.model, residuals, letters, float(logits[0] - logits[1])
+            )
 
     # -- what came of it ---------------------------------------------------------------------------------
 

@@ -27,6 +27,7 @@ class EpisodeBuffers:
     later: (S - 1, *lead, D) uint16 bits of bfloat16 per stream, the view `mean` of the inferences after the first;
     empty unless they keep that view alone, and pooled then holds the first one.
     roles: per captured inference and stream, the spans of roles.
+    lens_margins: of a question that is answered by letter, see `letter_margins`; None for all else.
     pinned: page-locked memory, into which a GPU copies while it computes on.
     """
 
@@ -55,6 +56,7 @@ class EpisodeBuffers:
     def clear(self) -> None:
         """Forget the episode."""
         self.roles: list[dict[str, list[tuple[str, int, int]]]] = []
+        self.lens_margins: list[float] | None = None
         for pooled in self.pooled.values():
             pooled.fill(np.nan)
         for tokens in self.tokens.values():

@@ -51,6 +51,7 @@ class Rollout:
         return EpisodeRecord(
             self.planned, self.outcome, arrays, buffers.roles, self.trajectory, self.instruction_ids,
             control_steps=self.control_steps, seconds=self.seconds, inputs=self.inputs or {},
+            lens_margins=buffers.lens_margins,
         )  # fmt: skip
 
 

@@ -38,6 +38,7 @@ from probe_kit.extract.store.format.arrays import decode_bfloat16, open_array
 from probe_kit.extract.store.format.checking import CheckedStore
 from probe_kit.extract.store.format.columns import Columns, find_columns
 from probe_kit.extract.store.format.commits import (
+    LENS_MARGINS,
     WITH_CONTROL_STEPS,
     Commit,
     committed_sums,
@@ -422,6 +423,19 @@ class Run:
         for row, own in enumerate(stored):
             steps[row, : len(own)] = own
         return steps
+
+    @cached_property
+    def lens_margins(self) -> NDArray[np.float64] | None:
+        """(E, L) of the logit lens: logit of the letter for left minus that for right, at every layer.
+
+        Of questions that are answered by letter, with left named first. The last layer gives the model's answer.
+        None for every other run; NaN for episodes that were asked before probe_kit stored it.
+        """
+        stored = [commit.get(LENS_MARGINS, []) for commit in self.commits()]
+        layers = max(map(len, stored), default=0)
+        if not layers:
+            return None
+        return np.array([own or [np.nan] * layers for own in stored], np.float64)
 
     # -- trajectories ----------------------------------------------------------------------------------
 

@@ -32,6 +32,7 @@ from probe_kit.extract.store.certificates import write_certificate
 from probe_kit.extract.store.format.arrays import at_extent, create_arrays
 from probe_kit.extract.store.format.commits import (
     FRAME_COUNT,
+    LENS_MARGINS,
     Commit,
     commit_key,
     read_commit,
@@ -73,7 +74,8 @@ class EpisodeRecord:
     instruction_ids: the instruction as the policy was delivered it. pictures: encoded, by key in the run. frames:
     how many one of them holds, if it holds all of the episode.
     control_steps: of every inference, how many actions of the episode came before it; rising. seconds: what the
-    episode took, which no hash of the run covers. inputs: what was shown of recordings, by kind.
+    episode took, which no hash of the run covers. inputs: what was shown of recordings, by kind. lens_margins: of
+    an answer by letter, left minus right at every layer.
     """
 
     planned: PlannedRow
@@ -87,6 +89,7 @@ class EpisodeRecord:
     seconds: Seconds = field(default_factory=Seconds)
     frames: int | None = None
     inputs: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    lens_margins: Sequence[float] | None = None
 
 
 class RunWriter:
@@ -297,6 +300,7 @@ class RunWriter:
             "provenance": name_of(self.provenance),
             **({} if episode.instruction_ids is None else {"instruction_ids": list(episode.instruction_ids)}),
             "control_steps": [int(step) for step in episode.control_steps],
+            **({} if episode.lens_margins is None else {LENS_MARGINS: list(episode.lens_margins)}),
             "objects": {key: one.to_json() for key, one in store.sums.items()},
             "pictures": {key: one.to_json() for key, one in pictures.items()},
             **({} if episode.frames is None else {FRAME_COUNT: episode.frames}),

@@ -339,12 +339,14 @@ class Reading:
 
     option_logits: (B, options) float32, one column per option of the questions, in their order.
     option_mass: (B,) float32 share of the next token's probability that lies on the options together.
+    option_ids: (B, options) int64 tokens of the options; None if the model does not say them.
     state: from which `AnswerModel.speak` continues; opaque to all other code.
     """
 
     option_logits: NDArray[np.float32]
     option_mass: NDArray[np.float32]
     state: Any = None
+    option_ids: NDArray[np.int64] | None = None
 
     @classmethod
     def of(cls, logits: NDArray[np.float32], options: Sequence[Sequence[int]], state: Any = None) -> "Reading":
@@ -360,10 +362,11 @@ class Reading:
                     f"two options begin with the same token (ids {list(row)}): their logits would be one number. "
                     "Name options that differ in their first token, such as letters"
                 )
-        chosen = np.take_along_axis(logits, np.array(options, np.int64).reshape(len(logits), -1), axis=1)
+        ids = np.array(options, np.int64).reshape(len(logits), -1)
+        chosen = np.take_along_axis(logits, ids, axis=1)
         shares = np.exp(logits - logits.max(axis=1, keepdims=True))
         peak = np.exp(chosen - logits.max(axis=1, keepdims=True))
-        return cls(chosen, peak.sum(axis=1) / shares.sum(axis=1), state)
+        return cls(chosen, peak.sum(axis=1) / shares.sum(axis=1), state, ids)
 
 
 NEAR_TIE: Mapping[str, float] = MappingProxyType({"float32": 1e-4, "bfloat16": 0.1})

@@ -1,7 +1,7 @@
 """Drift of every category from one run to another: transfer, own probes, directions, likeness, and a verdict."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,7 @@ from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import retention_table
 from probe_kit.statistics.estimates.cka import unbiased_cka
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.study.drift.letter_lens import lens_accuracy
 from probe_kit.study.drift.transfer import Agreement, ProbedRun, Transfer, agreement, transfer
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.store import load_results
@@ -36,7 +37,10 @@ VERDICTS: Mapping[Verdict, str] = {
 
 @dataclass(frozen=True)
 class SiteDrift:
-    """One site of one category: accuracies of transferred probes, there and back, and likeness."""
+    """One site of one category: accuracies of transferred probes, there and back, and likeness.
+
+    lens: accuracy of the logit lens at this layer, before and after; None unless both runs answer by letter.
+    """
 
     site: Site
     raw: float
@@ -47,6 +51,7 @@ class SiteDrift:
     p_fwe_back: float
     cka: float
     agreement: Agreement | None
+    lens: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -184,9 +189,18 @@ def _category(
     there, back = (
         transfer(one, other, name, view, sites, episodes) for one, other in (sides, (sides[1], sides[0]))
     )
-    found = tuple(_site(at, site, sides, name, view, episodes, (there, back)) for at, site in enumerate(sites))
+    lenses = [lens_accuracy(side.run, episodes) for side in sides]
+    found = tuple(
+        replace(_site(at, site, sides, name, view, episodes, (there, back)), lens=_at_layer(lenses, site.layer))
+        for at, site in enumerate(sites)
+    )
     own = [curves[0].correct[curves[0].sites.index(site)].mean() for site in sites]
     return CategoryDrift(name, *rows, difference, found, int(np.argmax(own)), episodes.size)
+
+
+def _at_layer(lenses: list[NDArray[np.float64] | None], layer: int) -> tuple[float, float] | None:
+    before, after = (None if lens is None or layer >= lens.size else float(lens[layer]) for lens in lenses)
+    return None if before is None or after is None else (before, after)
 
 
 def _common_sites(sides: tuple[ProbedRun, ProbedRun], category: str, view: str) -> list[Site]:

@@ -25,23 +25,36 @@ _NOTE = (
     "cosine: of the probes' directions, where both sides have signal; ceiling: between folds of the first run",
     "CKA: unbiased, likeness of all features; it is no measure of loss",
 )
+_LENS = ("logit lens", ("lens before %", "lens after %"))
+_LENS_NOTE = (
+    "lens: share of episodes in which the model's own final norm and head, applied at that layer, name the right "
+    "letter; it says what a layer would answer, not what later layers read"
+)
 
 
 def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title: str, view: str) -> NamedTable:
     """Verdicts with their numbers. pairs: by the labels of both runs, the first one before the second."""
     shown = [(names, one) for names, found in pairs.items() for one in found]
+    has_lens = any(site.lens for _, one in shown for site in one.sites)
     cells = tuple(
-        (f"{before} → {after}", category_of(one.category).title, one.verdict, *_cells(one))
+        (
+            f"{before} → {after}",
+            category_of(one.category).title,
+            one.verdict,
+            *_cells(one),
+            *_lens(one)[: 2 * has_lens],
+        )
         for (before, after), one in shown
     )
     said = dict.fromkeys(one.verdict for _, one in shown)
-    note = [f"view {view}", *_NOTE, *(f"{name}: {VERDICTS[name]}" for name in said)]
+    note = [f"view {view}", *_NOTE, *[_LENS_NOTE][:has_lens], *(f"{name}: {VERDICTS[name]}" for name in said)]
     alone = {f"{names[0]} → {names[1]}": one.why_alone for names, one in shown if one.why_alone}
     note += [f"{name}: own accuracies only, {why}" for name, why in alone.items()]
     heading = f"Drift: {title}" + (f" ({', '.join(dict.fromkeys(alone.values()))})" if alone else "")
     numbers = tuple(number for names, one in shown for number in _numbers(names, one, view))
-    columns = tuple(name for _, names in _COLUMNS for name in names)
-    heads = tuple((head, len(names)) for head, names in _COLUMNS)
+    groups = (*_COLUMNS, *[_LENS][:has_lens])
+    columns = tuple(name for _, names in groups for name in names)
+    heads = tuple((head, len(names)) for head, names in groups)
     return NamedTable(TextTable(heading, "; ".join(note), columns, cells, heads, names=2), numbers)
 
 
@@ -66,6 +79,11 @@ def _cells(one: CategoryDrift) -> tuple[str, ...]:
         _cosine(site),
         f"{site.cka:.2f}",
     )
+
+
+def _lens(one: CategoryDrift) -> tuple[str, str]:
+    found = one.sites[one.best].lens if one.sites else None
+    return ("–", "–") if found is None else (percent(found[0]), percent(found[1]))
 
 
 def _own(row: RetentionRow) -> str:
@@ -111,4 +129,6 @@ def _of_site(site: SiteDrift) -> Number:
         "cosine": None if found is None else found.raw,
         "cosine_weighted": None if found is None else found.weighted,
         "cosine_ceiling": None if found is None else found.ceiling,
+        "lens_before": None if site.lens is None else site.lens[0],
+        "lens_after": None if site.lens is None else site.lens[1],
     }

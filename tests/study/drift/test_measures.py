@@ -163,6 +163,29 @@ def test_other_words_or_frames_give_own_accuracies_only(
         assert made.text.cells[0][6:] == ("–",) * 8
 
 
+def test_two_runs_that_answer_by_letter_have_the_lens_of_every_layer(pair: tuple[ArrayRun, ArrayRun]) -> None:
+    """Before, the last layer alone answers; after, both do, and one answer of four is a tie."""
+    before, after = pair
+    side = np.where(before.episodes["side_correct"] == "left", 1.0, -1.0)
+    sides = [
+        SaidRun(run.path, run.model, run.suite, run.episodes, run.features, lens_margins=margins)
+        for run, margins in (
+            (before, np.stack([-side, side], axis=1)),
+            (after, np.stack([side, np.where(np.arange(side.size) % 4 == 0, 0, side)], axis=1)),
+        )
+    ]
+    (kept, *_) = found = measure_drift(sides[0], sides[1])
+    assert [site.lens for site in kept.sites] == [(0, 1), (1, 0.875)]
+    made = drift_table({("before", "after"): found}, "training", "mean")
+    assert made.text.columns[-2:] == ("lens before %", "lens after %")
+    assert made.text.heads[-1] == ("logit lens", 2)
+    assert "the model's own final norm and head" in made.text.note
+    assert [number["lens_after"] for number in made.numbers if number.get("site")][:2] == [1, 0.875]
+    (plain, *_) = measure_drift(sides[0], after)
+    assert all(site.lens is None for site in plain.sites), "one side has none"
+    assert "logit lens" not in [head for head, _ in drift_table({("a", "b"): [plain]}, "t", "mean").text.heads]
+
+
 def test_backbones_of_another_width_are_refused(pair: tuple[ArrayRun, ArrayRun], tmp_path: Path) -> None:
     run, _ = pair
     wide = {place: np.hstack([values, values]) for place, values in run.features.items()}

@@ -38,6 +38,8 @@ _WITH_PLANS = 5
 """The first schema whose commits name the plan record that added their episode."""
 FRAME_COUNT = "frames"
 """In a commit: how many frames its picture holds, where it holds all of the episode."""
+LENS_MARGINS = "lens_margins"
+"""In a commit: the logit lens of an answer by letter, left minus right, one number per layer."""
 _NUMBERED = re.compile(r"([0-9]{8})\.json")
 _PROVENANCE = re.compile(r"[0-9a-f]{16}")
 
@@ -139,6 +141,9 @@ def _problems(root: Root, number: int, commit: Commit) -> Iterator[str]:
     ids = commit.get("instruction_ids", [])
     if not (isinstance(ids, list) and all(type(one) is int for one in ids)):
         yield "has other instruction ids than numbers"
+    margins = commit.get(LENS_MARGINS, [])
+    if not (isinstance(margins, list) and all(type(one) is float for one in margins)):
+        yield "has other margins of the logit lens than numbers"
     if problem := _control_step_problem(commit):
         yield problem
     count = commit.get(FRAME_COUNT, 1)
