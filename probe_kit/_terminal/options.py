@@ -5,7 +5,7 @@ vocabularies are `Literal` types of the library, whose values help lists and par
 do the same for comma-separated values and for the names of a registry.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -48,6 +48,12 @@ LISTED: Any = {"parser": Names.parse, "metavar": "A,B,…"}
 """Keywords of `typer.Option` for comma-separated names."""
 NAMED: Any = LISTED | {"parser": read_categories}
 """The same for categories."""
+
+
+def check_no_others(given: Mapping[str, object], what: str = "labels of your own") -> None:
+    """Raise UsageError for an option that does not go with `what`. given: options, with whether they are given."""
+    if wrong := [name for name, value in given.items() if value]:
+        raise UsageError(f"{wrong[0]} is not for {what}; leave it out")
 
 
 def choices(names: Collection[object]) -> str:

@@ -7,4 +7,6 @@ AnswerScore = Literal["text", "logits", "order-balanced"]
 both orders of the options."""
 Section = Literal["success", "rules", "answers", "probes", "retention", "controls", "interventions"]
 """Groups of tables that `retention --details` shows."""
+Family = Literal["label", "table"]
+"""Tests of labels that are corrected together: a stream's sites, or those of every label of the table (Holm)."""
 TableFormat = Literal["table", "json", "csv", "markdown", "latex"]

@@ -1,6 +1,5 @@
 """Options of `probe-kit retention` and `probe-kit stages`, by help panel."""
 
-from collections.abc import Mapping
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast, get_args
@@ -10,7 +9,7 @@ import typer
 from probe_kit._terminal.console import split, whole_number
 from probe_kit._terminal.options import Names, choices, some_of
 from probe_kit.errors import UsageError
-from probe_kit.retention.choices import AnswerScore, Section, TableFormat
+from probe_kit.retention.choices import AnswerScore, Family, Section, TableFormat
 from probe_kit.scene_names import RuleName
 
 if TYPE_CHECKING:
@@ -55,14 +54,6 @@ def read_iterations(text: str) -> "Iterations":
     return cast("Iterations", text)
 
 
-def check_no_others(given: Mapping[str, object]) -> None:
-    """Raise UsageError for an option that labels of your own do not have. given: options, by name."""
-    if wrong := [name for name, value in given.items() if value]:
-        raise UsageError(
-            f"{wrong[0]} is for sides and success rates, not for labels of your own; leave it out with --target"
-        )
-
-
 # -- runs and probes ---------------------------------------------------------------------------------------------
 
 Runs = Annotated[
@@ -81,12 +72,21 @@ Against = Annotated[
         help="Run or group that all others are compared with. Default: the first run; of groups every pair.",
     ),
 ]
-LabelTarget = Annotated[
-    str | None,
+LabelTargets = Annotated[
+    list[str] | None,
     typer.Option(
         "--target",
         metavar="COLUMN",
-        help="Retention of a label of your own, by its column. Default: of the side of the correct picture.",
+        help="Retention of a label of your own, by its column; repeat for several in one table. Default: of the "
+        "side of the correct picture.",
+        rich_help_panel=RUNS,
+    ),
+]
+LabelFamily = Annotated[
+    Family,
+    typer.Option(
+        "--family",
+        help="With several --target, table corrects p for all of them (Holm).",
         rich_help_panel=RUNS,
     ),
 ]

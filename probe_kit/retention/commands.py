@@ -8,18 +8,18 @@ from probe_kit._terminal import options as common
 from probe_kit._terminal.console import err, marked, out, print_json_text, print_text, say, split
 from probe_kit.errors import UsageError
 from probe_kit.retention import command_options as own
+from probe_kit.retention.label_commands import save_all, say_report
 
 if TYPE_CHECKING:
-    from probe_kit.retention import RetentionTable
     from probe_kit.retention.choices import Section
-    from probe_kit.train.data.run_reader import RunReader
 
 
 def retention(
     runs: own.Runs = None,
     group: own.Groups = None,
     against: own.Against = None,
-    target: own.LabelTarget = None,
+    target: own.LabelTargets = None,
+    family: own.LabelFamily = "label",
     probes: own.ProbeKeys = None,
     views: own.Views = None,
     iterations: own.IterationChoice = "all",
@@ -46,22 +46,29 @@ def retention(
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
     from probe_kit.retention.label_commands import show_label_retention
+    from probe_kit.retention.labels.table import label_retention_table
     from probe_kit.retention.rows.outcome_rules import check_epsilons
 
-    if target is not None:
+    if target:
         refused = {
             "--group": group, "--against": against, "--rule": rule != "disc", "--last-steps": last_steps != 1,
             "--epsilons": epsilons, "--score": score != "text", "--vlm-vla": vlm_vla,
-            "--with-side-words": with_side_words, "--details": details, "--html": html,
-            "--figures": figures, "--absent-below": absent_below != 0.65,
+            "--with-side-words": with_side_words, "--details": details, "--absent-below": absent_below != 0.65,
         }  # fmt: skip
-        own.check_no_others(refused)
+        common.check_no_others(refused)
         if not runs:
             raise UsageError("give run folders whose probes of a label are stored")
+        _check_doubles(runs)
+        _check_places(html, figures)
         opened_runs = [open_run(p, allow_partial=partial).in_wording(wording) for p in runs]
-        options = own.read_iterations(iterations), _keys(runs, probes or [])
-        show_label_retention(opened_runs, target, views, *options, style)
+        labels = label_retention_table(
+            opened_runs, target, views, iterations=own.read_iterations(iterations),
+            keys=_keys(runs, probes or []), family=family,
+        )  # fmt: skip
+        show_label_retention(opened_runs, labels, style, html, figures)
         return
+    if family != "label":
+        raise UsageError("--family is for labels of your own; give --target COLUMN too, or leave it out")
     check_epsilons(rule, epsilons is not None)
     if bool(runs) == bool(group):
         raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
@@ -82,14 +89,15 @@ def retention(
     )  # fmt: skip
     shown = [scored(run, score, with_side_words) for run in listed]
     if figures is not None:
-        _save_figures(shown, table, figures)
+        from probe_kit.retention.displays import collect_figures
+
+        save_all(collect_figures(shown, table), figures)
     if html is not None:
-        from probe_kit.extract.store.locations.disk import in_units
         from probe_kit.retention.report import write_report
 
         with err.status("drawing the report"):
             written = write_report(shown, html, table)
-        say(f"report: {written} ({in_units(written.stat().st_size)})")
+        say_report(written)
     if style == "table":
         out.print(table.to_rich("all" if "all" in details else cast("tuple[Section, ...]", details)))
     else:
@@ -152,10 +160,3 @@ def _groups(texts: list[str]) -> dict[str, tuple[str, ...]]:
             raise UsageError(f"--group {name!r} is given twice; write all of its runs after one {name}=")
         groups[name] = tuple(filter(None, map(str.strip, paths.split(","))))  # a run given twice is refused
     return groups
-
-
-def _save_figures(runs: "list[RunReader]", table: "RetentionTable", folder: Path) -> None:
-    from probe_kit.retention.displays import collect_figures, save_figures
-
-    for path in save_figures(collect_figures(runs, table), folder):
-        say(f"figure: {path}")

@@ -1,30 +1,53 @@
-"""`probe-kit retention --target COLUMN`: retention of a label of one's own."""
+"""`probe-kit retention --target COLUMN`: retention of labels of one's own."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probe_kit._terminal.console import out, print_json_text, print_text
+from probe_kit._terminal.console import err, out, print_json_text, print_text, say
 
 if TYPE_CHECKING:
     from probe_kit.retention.choices import TableFormat
-    from probe_kit.retention.estimators.retention import Iterations
+    from probe_kit.retention.displays.base.report_figure import ReportFigure
+    from probe_kit.retention.labels.table import LabelRetentionTable
     from probe_kit.train.data.run_reader import RunReader
 
 
 def show_label_retention(
     runs: "Sequence[RunReader]",
-    target: str,
-    views: Sequence[str] | None,
-    iterations: "Iterations",
-    keys: Sequence[str | None],
+    table: "LabelRetentionTable",
     style: "TableFormat",
+    html: Path | None,
+    figures: Path | None,
 ) -> None:
-    """Print the retention table of a label."""
-    from probe_kit.retention.labels.table import label_retention_table
+    """Print the retention table of labels, and write its report and figures where that was asked for."""
+    if figures is not None:
+        from probe_kit.retention.displays.labels import label_figures
 
-    table = label_retention_table(runs, target, views, iterations=iterations, keys=keys)
+        save_all(label_figures(runs, table), figures)
+    if html is not None:
+        from probe_kit.retention.report import write_label_report
+
+        with err.status("drawing the report"):
+            written = write_label_report(runs, html, table)
+        say_report(written)
     if style == "table":
         out.print(table.to_rich())
     else:
         show = print_json_text if style == "json" else print_text
         show(getattr(table, f"to_{style}")())
+
+
+def save_all(exhibits: "Sequence[ReportFigure]", folder: Path) -> None:
+    """Draw figures into a folder, and say where each is."""
+    from probe_kit.retention.displays import save_figures
+
+    for path in save_figures(exhibits, folder):
+        say(f"figure: {path}")
+
+
+def say_report(written: Path) -> None:
+    """Say where a report is, and how large."""
+    from probe_kit.extract.store.locations.disk import in_units
+
+    say(f"report: {written} ({in_units(written.stat().st_size)})")

@@ -58,7 +58,6 @@ def train(
     from probe_kit.train.label_commands import (
         ColumnOptions,
         TransferOptions,
-        check_no_others,
         print_label_results,
         train_on_column,
         transfer_column,
@@ -78,17 +77,17 @@ def train(
     }
     if column is not None:
         refused = {"--folds": folds != "groups", "--incomplete": incomplete != "keep", "--device": device}
-        check_no_others(refused)
+        common.check_no_others(refused)
         if transfer is not None:
             of_one = {"--controls": controls is not None, "--suite": suite, "--jobs": jobs, "--ray": ray}
-            check_no_others({**of_one, "--untrained": untrained, "--align-to": align_to}, "a transfer")
+            common.check_no_others({**of_one, "--untrained": untrained, "--align-to": align_to}, "a transfer")
             other = open_run(transfer.run, allow_partial=partial).in_wording(wording)
             options = {"views": views, "permutations": permutations, "seed": seed}
             transfer_column(opened, other, column, transfer, categories, call, window, options, details)
             return
         options["untrained"] = control
         results = train_on_column(opened, column, categories, call, controls, window, options)
-        print_label_results(results, details)
+        print_label_results(run, results, details)
         return
     sides = {
         **options,
@@ -171,7 +170,7 @@ def facts_table(found: "Inventory", further: Mapping[str, str]) -> "Table":
 _STATES = {
     "used": "what `probe-kit retention` reads: the probes asked for last",
     "other": "read with --probes RUN=KEY",
-    "label": "of a label of your own, read with `load_label_results` in Python",
+    "label": "of a label of your own, read with `probe-kit retention RUN --target COLUMN`",
     "other episodes": "of other episodes than the run has now",
     "other version": "written by another version of probe_kit, which this one cannot read",
 }

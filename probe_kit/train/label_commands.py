@@ -1,5 +1,6 @@
 """`probe-kit labels`, and `probe-kit train` for a label of one's own."""
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -152,12 +153,6 @@ class TransferOptions:
         return cls(run, labels, across_weights)
 
 
-def check_no_others(given: Mapping[str, Any], what: str = "labels of your own") -> None:
-    """Raise UsageError for an option that does not go with `what`. given: options, with whether they are given."""
-    if wrong := [name for name, value in given.items() if value]:
-        raise UsageError(f"{wrong[0]} is not for {what}; leave it out")
-
-
 def _one_call(call: str) -> int:
     if not call.isdecimal():
         raise UsageError(
@@ -227,11 +222,18 @@ def transfer_column(
     say(marked("nothing was stored; [bold]transfer_probes[/] in Python gives every site as a frame"))
 
 
-def print_label_results(results: "LabelResults", details: bool) -> None:
+def print_label_results(run: str, results: "LabelResults", details: bool) -> None:
     """The table and the sentences of probes of a label."""
     from probe_kit.train.labels.label_summary import label_sentences, label_table
 
     out.print(label_table(results, splits=details))
     for sentence in label_sentences(results):
         out.print(sentence, markup=False, highlight=False)
-    say(marked("next: [bold]load_label_results(run, '{}')[/] in Python gives every site as a frame", results.key))
+    target = shlex.quote(results.settings.target)
+    say(
+        marked(
+            "next: [bold]probe-kit retention {} --target {} --html report.html[/]; in Python "
+            "[bold]load_label_results(run, '{}')[/] gives every site as a frame",
+            run, target, results.key,
+        )
+    )  # fmt: skip

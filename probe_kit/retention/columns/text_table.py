@@ -23,7 +23,7 @@ class TextTable:
     """title and note: what it shows, and what to know when reading it. cells: a row of text per line.
 
     heads: names over adjoining columns and how many these are, empty names included. names: how many of the first
-    columns name the rows.
+    columns name the rows. means: whether a row that is called `mean` is one.
     """
 
     title: str
@@ -32,6 +32,7 @@ class TextTable:
     cells: tuple[tuple[str, ...], ...]
     heads: tuple[tuple[str, int], ...] = ()
     names: int = 1
+    means: bool = True
 
 
 def size_table(means: Sequence[RetentionRow]) -> TextTable | None:

@@ -91,17 +91,35 @@ def plain_tables(tables: Sequence[TextTable]) -> list[HtmlTable]:
             table.title,
             tuple(
                 HtmlColumn(_unbroken(name), HEADING_HELP.get(name, ""), name not in _WORDS, name)
-                for name in table.columns
+                for name in _full_headings(table)
             ),
-            tuple(tuple(HtmlCell(cell, cell) for cell in cells) for cells in table.cells if MEAN not in cells[:2]),
-            tuple(tuple(HtmlCell(cell, cell) for cell in cells) for cells in table.cells if MEAN in cells[:2]),
+            *(
+                tuple(
+                    tuple(HtmlCell(cell, cell) for cell in cells)
+                    for cells in table.cells
+                    if (table.means and MEAN in cells[:2]) == is_mean
+                )
+                for is_mean in (False, True)
+            ),
             (f"{table.note[:1].upper()}{table.note[1:]}.",) if table.note else (),
         )
         for table in tables
     ]
 
 
-_WORDS = ("model", "run", "category", "prompt", "verdict")
+def _full_headings(table: TextTable) -> list[str]:
+    """Columns with the name above them where they lack it, as a page has one line of headings."""
+    heads = [head for head, count in table.heads for _ in range(count)] or [""] * len(table.columns)
+    return [
+        f"{head} {name}" if head and not name.startswith(head) else name
+        for head, name in zip(heads, table.columns, strict=True)
+    ]
+
+
+_WORDS = (
+    "model", "run", "category", "prompt", "verdict", "label", "metric", "view", "backbone site", "action site",
+    "stream", "best site", "exceeds",
+)  # fmt: skip
 """Columns of plain tables that hold no numbers."""
 
 

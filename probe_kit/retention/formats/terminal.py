@@ -128,7 +128,7 @@ def responsive_table(table: TextTable) -> ResponsiveTable:
         caption=table.note,
         name=" · ".join(table.columns[: table.names]),
         names=tuple(" · ".join(cells[named]) for cells in table.cells),
-        styles=tuple("bold" if MEAN in cells[: table.names] else "" for cells in table.cells),
+        styles=tuple("bold" if table.means and MEAN in cells[: table.names] else "" for cells in table.cells),
         parts=tuple(_parts(table)),
         sections=tuple(firsts) if sections else (),
     )

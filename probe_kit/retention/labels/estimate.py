@@ -1,6 +1,6 @@
 """Retention of a label: share of the backbone's score above chance that is left in the action."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
@@ -121,6 +121,18 @@ def measure_label_retention(
     )
 
 
+def with_corrected_p(
+    found: LabelRetention, results: LabelResults, backbone: float | None, action: float | None
+) -> LabelRetention:
+    """The same with p of both streams corrected for further tests; None for no p. results: what it is made of."""
+    peaks = [
+        one if p is None else replace(one, p_fwe=p)
+        for one, p in ((found.backbone, backbone), (found.action, action))
+    ]
+    note, reason = _refusal(results, peaks[0])
+    return replace(found, backbone=peaks[0], action=peaks[1], note=note, reason=reason)
+
+
 def _rows(curve: LabelCurve, part: str, iterations: Iterations) -> NDArray[np.intp]:
     """Positions of the sites of a part of the model. Raises NoProbesError without any."""
     stream = curve.of_part(part)
@@ -147,7 +159,7 @@ def _above_chance(curve: LabelCurve, rows: NDArray[np.intp], groups: NDArray[np.
 
 def _peak(results: LabelResults, view: str, rows: NDArray[np.intp], scores: Scores, place: int) -> LabelPeak:
     curve = results.curves[view]
-    best = rows[np.argmax((curve.metric - np.nan_to_num(curve.chance))[rows])]
+    best = curve.largest_excess(rows)
     above = float(scores.above[place])
     spread = t_quantile(scores.df) * sqrt(scores.covariance[place, place])
     site = curve.sites[best]

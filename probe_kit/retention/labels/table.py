@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from math import nan
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +10,7 @@ from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.behaviour.run_labels import full_names
+from probe_kit.retention.choices import Family
 from probe_kit.retention.columns.text import number, with_limits
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.estimators.retention import Iterations
@@ -18,11 +19,13 @@ from probe_kit.retention.labels.estimate import (
     LabelRetention,
     check_same_label,
     measure_label_retention,
+    with_corrected_p,
 )
+from probe_kit.statistics.paired_tests import holm
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.labels.label_results import LabelResults
-from probe_kit.train.labels.label_store import load_label_results
+from probe_kit.train.labels.label_store import load_label_results, stored_targets
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,6 +35,8 @@ _NOTE = (
     "above chance: score of a site chosen on half of the groups, on the other half, minus its mean score with "
     "permuted labels; 95 % intervals over groups"
 )
+_NAMED = 8
+"""Labels of a run that a sentence names."""
 
 
 @dataclass(frozen=True)
@@ -46,42 +51,77 @@ class LabelRow:
 
 @dataclass(frozen=True, repr=False)
 class LabelRetentionTable:
-    """Rows per run and view. results: the probes that they were made of, by location."""
+    """Rows per target, run and view; no row is a mean, as labels of different tasks have different metrics.
+
+    results: the probes that they were made of, by location and target. tried: by location, all label columns of
+    which the run has probes. family: which tests the signal is corrected for.
+    """
 
     rows: tuple[LabelRow, ...]
-    results: Mapping[str, LabelResults] = field(default_factory=dict)
+    results: Mapping[tuple[str, str], LabelResults] = field(default_factory=dict)
     iterations: Iterations = "all"
+    tried: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    family: Family = "label"
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The label columns, in order."""
+        return tuple(dict.fromkeys(row.retention.target for row in self.rows))
 
     def __repr__(self) -> str:
         names = ", ".join(dict.fromkeys(f"{row.retention.target} of {row.run}" for row in self.rows))
         return f"<LabelRetentionTable of {names}; print(table.to_markdown()) shows it>"
 
+    def of_target(self, target: str) -> "LabelRetentionTable":
+        """The rows of one label; p stays as it is."""
+        rows = tuple(row for row in self.rows if row.retention.target == target)
+        results = {name: one for name, one in self.results.items() if name[1] == target}
+        return replace(self, rows=rows, results=results, tried={})
+
     @property
     def text(self) -> TextTable:
         """The table as text."""
-        one = self.rows[0].retention
+        one, several = self.rows[0].retention, len(self.targets) > 1
         return TextTable(
-            f"{one.target}: {one.metric}, and what reaches the action",
+            "Labels, and what reaches the action"
+            if several
+            else f"{one.target}: {one.metric}, and what reaches the action",
             _NOTE,
             (
+                *(("label", "metric") if several else ()),
                 *("run", "view"),
                 *("backbone site", "score", "chance", "above chance"),
                 *("action site", "score", "chance", "above chance"),
                 "retention",
             ),
             tuple(
-                (row.run, row.retention.view, *_peak(row.retention.backbone), *_peak(row.retention.action),
-                 _value(row.retention))
+                (*((row.retention.target, row.retention.metric) if several else ()), row.run, row.retention.view,
+                 *_peak(row.retention.backbone), *_peak(row.retention.action), _value(row.retention))
                 for row in self.rows
             ),
-            (("", 2), ("backbone", 4), ("action", 4), ("", 1)),
-            names=2,
+            (("", 2 + 2 * several), ("backbone", 4), ("action", 4), ("", 1)),
+            names=2 + 2 * several,
+            means=False,
         )  # fmt: skip
 
     @property
     def sentences(self) -> list[str]:
-        """One per row: what reaches the action, or why that has no number."""
-        return [_sentence(row, len(self.results) > 1) for row in self.rows]
+        """One per row: what reaches the action, or why that has no number. Then how many labels were tried."""
+        several = len({place for place, _ in self.results}) > 1
+        return [*(_sentence(row, several) for row in self.rows), *self._tried()]
+
+    def _tried(self) -> list[str]:
+        """What the p-values are corrected for, wherever a run has probes of several labels."""
+        names = {row.location: row.run for row in self.rows}
+        found = []
+        for place, targets in self.tried.items():
+            if len(targets) > 1:
+                shown = ", ".join([*targets[:_NAMED], *["…"] * (len(targets) > _NAMED)])
+                corrected = "of each label alone" if self.family == "label" else (
+                    f"corrected for the {len(self.targets)} labels of this table (Holm)"
+                )  # fmt: skip
+                found.append(f"{names[place]} has probes of {len(targets)} labels ({shown}); p is {corrected}.")
+        return found
 
     def to_frame(self) -> "pd.DataFrame":
         """One line per row with the fields of `LabelRetention`, of its streams as `backbone.score` and so on.
@@ -130,34 +170,66 @@ class LabelRetentionTable:
 
 def label_retention_table(
     runs: Sequence[RunReader],
-    target: str,
+    targets: str | Sequence[str],
     views: Sequence[str] | None = None,
     *,
     iterations: Iterations = "all",
     keys: Sequence[str | None] | None = None,
+    family: Family = "label",
 ) -> LabelRetentionTable:
-    """Retention of the label `target` in runs whose probes of it are stored; see `measure_label_retention`.
+    """Retention of one label or several in runs whose probes of them are stored; see `measure_label_retention`.
 
     views: those that were probed by default. keys: which stored probes of each run, in order; those asked for last
-    by default. Raises NoProbesError for a run without probes of the label, UsageError for several runs whose
-    labels differ, and what `measure_label_retention` raises.
+    by default; with one target only. family: `table` corrects p for all targets by Holm's method, per run, view
+    and stream. Raises NoProbesError for a run without probes of a label, UsageError for several runs whose
+    labels differ, a target given twice, and keys of another target, and what `measure_label_retention` raises.
     """
-    if not runs:
-        raise UsageError("retention of a label needs at least one run")
+    named = [targets] if isinstance(targets, str) else list(targets)
+    if not runs or not named:
+        raise UsageError("retention of a label needs at least one run and one target")
+    if doubles := [name for at, name in enumerate(named) if name in named[:at]]:
+        raise UsageError(f"the target {doubles[0]!r} is given twice; leave one out")
     chosen = list(keys or [None] * len(runs))
     if len(chosen) != len(runs):
         raise UsageError(f"{len(chosen)} keys for {len(runs)} runs; give one per run, or None for the newest")
-    results = {
-        str(run.location): load_label_results(run, key, target) for run, key in zip(runs, chosen, strict=True)
-    }
-    check_same_label(list(results.values()))
-    names = dict(zip(results, full_names(runs), strict=True))
+    if len(named) > 1 and any(chosen):
+        raise UsageError(
+            f"stored probes are chosen by key for {len(named)} targets ({', '.join(named)}); a key is of one. "
+            "Show one target at a time, or leave the keys out"
+        )
+    places = [str(run.location) for run in runs]
+    results: dict[tuple[str, str], LabelResults] = {}
+    for target in named:
+        own = [load_label_results(run, key, target) for run, key in zip(runs, chosen, strict=True)]
+        check_same_label(own)
+        results |= {(place, target): one for place, one in zip(places, own, strict=True)}
+    names = dict(zip(places, full_names(runs), strict=True))
     rows = [
-        LabelRow(names[place], place, own.key, measure_label_retention(own, view, iterations))
-        for place, own in results.items()
-        for view in views or own.settings.views
+        LabelRow(names[place], place, one.key, measure_label_retention(one, view, iterations))
+        for (place, _), one in results.items()
+        for view in views or one.settings.views
     ]
-    return LabelRetentionTable(tuple(rows), results, iterations)
+    tried = {place: stored_targets(run) for place, run in zip(places, runs, strict=True)}
+    corrected = rows if family == "label" else _corrected(rows, results)
+    return LabelRetentionTable(tuple(corrected), results, iterations, tried, family)
+
+
+def _corrected(rows: Sequence[LabelRow], results: Mapping[tuple[str, str], LabelResults]) -> list[LabelRow]:
+    """The rows with p of both streams corrected for the targets, within each run and view."""
+    families: dict[tuple[str, str], list[int]] = {}
+    for place, row in enumerate(rows):
+        families.setdefault((row.location, row.retention.view), []).append(place)
+    found = list(rows)
+    for members in families.values():
+        own = [rows[place].retention for place in members]
+        p = [
+            holm([None if peak.p_fwe != peak.p_fwe else peak.p_fwe for peak in peaks])
+            for peaks in ([one.backbone for one in own], [one.action for one in own])
+        ]
+        for place, one, backbone, action in zip(members, own, *p, strict=True):
+            probes = results[rows[place].location, one.target]
+            found[place] = replace(rows[place], retention=with_corrected_p(one, probes, backbone, action))
+    return found
 
 
 def _peak(peak: LabelPeak) -> tuple[str, str, str, str]:

@@ -1,9 +1,7 @@
 """Putting the page together: one HTML file with everything in it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from probe_kit._system.drafts import write_whole
 from probe_kit._terminal.local_paths import without_places
@@ -13,15 +11,16 @@ from probe_kit.retention.columns.known_used_table import known_used_tables
 from probe_kit.retention.columns.modes import Modes, modes_of
 from probe_kit.retention.columns.summary import summary_table
 from probe_kit.retention.columns.text import model_name
-from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.formats.heat import heat_key
 from probe_kit.retention.formats.html import HtmlTable, html_tables, plain_tables
 from probe_kit.retention.joins import joins_of
 from probe_kit.retention.report.episodes import PICTURES, EpisodeGrid, episode_grid
+from probe_kit.retention.report.label_sections import stored_label_sections
 from probe_kit.retention.report.opening import Question, opening_curve, opening_question, opening_row
-from probe_kit.retention.report.pictures import data_uri
+from probe_kit.retention.report.pictures import Picture, arranged, data_uri
 from probe_kit.retention.report.provenance import citation, provenance
+from probe_kit.retention.report.render import render
 from probe_kit.retention.report.summaries import RunInWords, read_run
 from probe_kit.retention.report.words import words_of
 from probe_kit.retention.rows.outcome_rules import under_rule
@@ -29,20 +28,6 @@ from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.version import __version__
-
-_HERE = Path(__file__).parent
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure in the page. run: its name, empty for a figure of all runs. caption: what it is about, in full."""
-
-    title: str
-    run: str
-    reading: str
-    source: str
-    caption: str
-    extra: bool
 
 
 def write_report(
@@ -84,8 +69,11 @@ def report_html(
     shown_names = [without_places(name, places) for name in names]
     grid = episode_grid(as_judged, shown_names, pictures)
     in_words = _in_words(table)
+    labels = stored_label_sections(runs, names, places)
     question, curve = _opening(table, runs, shown_names, grid, places)
-    return _render(
+    label_tables = [table for label in labels for table in label.tables]
+    return render(
+        "page.html.jinja",
         places,
         modes=modes,
         answered=_ANSWERED[modes],
@@ -107,7 +95,7 @@ def report_html(
         joined=plain_tables([one for joined in joins.found for one in known_used_tables(joined)]),
         join_notes=[*joins.refused, *dict.fromkeys(note for joined in joins.found for note in joined.notes)],
         pictures={
-            subject: _pictures(exhibits, subject, names, places)
+            subject: arranged(exhibits, subject, names, places)
             for subject in ("behaviour", "probes", "retention", "interventions", "join")
         },
         grid=grid,
@@ -116,7 +104,8 @@ def report_html(
             provenance(name, run, table.results.get(str(run.location)))
             for name, run in zip(names, runs, strict=True)
         ],
-        words=words_of([*summary, *(one for own in tables.values() for one in own)]),
+        labels=labels,
+        words=words_of([*summary, *(one for own in tables.values() for one in own), *label_tables]),
         heat=heat_key(),
         sentence=sentence,
         bibtex=bibtex,
@@ -128,24 +117,6 @@ _ANSWERED: dict[Modes, str] = {
     "answers": "the answer is what the model says",
     "both": "a policy answers by where the cube ends, a model that was asked by what it says",
 }
-
-
-def _render(places: tuple[str, ...], **content: Any) -> str:
-    """The page; no text in it holds `places` or another absolute path of this machine."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
-
-    def shown(value: Any) -> Any:
-        if not isinstance(value, str) or isinstance(value, Markup) or value.startswith("data:"):
-            return value
-        return without_places(value, places)
-
-    environment = Environment(
-        loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True, finalize=shown,
-    )  # fmt: skip
-    assets = {name: Markup((_HERE / f"page.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
-    return environment.get_template("page.html.jinja").render(**assets, **content)
 
 
 def _tables(rows: Sequence[RetentionRow], table: RetentionTable, subject: str) -> list[HtmlTable]:
@@ -187,30 +158,3 @@ def listed(names: Sequence[str]) -> str:
     """A, B and C."""
     *others, last = names
     return f"{', '.join(others)} and {last}" if others else last
-
-
-def _pictures(
-    exhibits: Sequence[ReportFigure], subject: str, names: Sequence[str], places: tuple[str, ...]
-) -> list[list[Picture]]:
-    """Figures of one subject by kind: those of several runs side by side.
-
-    All but the first of a kind and run are extra, to be unfolded, and so are those of single runs that another
-    figure shows side by side.
-    """
-    found: dict[str, list[Picture]] = {}
-    own = [exhibit for exhibit in exhibits if exhibit.subject == subject]
-    together = {_kind(exhibit) for exhibit in own if exhibit.run is None}
-    for exhibit in own:
-        run = "" if exhibit.run is None else names[exhibit.run]
-        kind = _kind(exhibit)
-        before = [other for pictures in found.values() for other in pictures]
-        extra = any(other.run == run and other.title.partition(",")[0] == kind for other in before)
-        extra |= exhibit.run is not None and f"{kind} side by side" in together
-        found.setdefault(exhibit.title, []).append(
-            Picture(exhibit.title, run, exhibit.reading, *data_uri(exhibit, places), extra)
-        )
-    return list(found.values())
-
-
-def _kind(exhibit: ReportFigure) -> str:
-    return exhibit.title.partition(",")[0]

@@ -2,6 +2,8 @@
 
 import re
 from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
 from io import BytesIO
 from urllib.parse import quote
 from xml.etree import ElementTree
@@ -20,6 +22,45 @@ _FONTS = re.compile(r"'[^;]*sans-serif")
 """The fonts of a text, the first of them matplotlib's; a page has those of the machine that shows it."""
 _IN_URI = " !$'()*+,-./:;=?@[]_`{|}~"
 """What a URI in double quotes may hold as it is."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure in the page. run: its name, empty for a figure of all runs. caption: what it is about, in full."""
+
+    title: str
+    run: str
+    reading: str
+    source: str
+    caption: str
+    extra: bool
+
+
+def arranged(
+    exhibits: Sequence[ReportFigure], subject: str, names: Sequence[str], places: tuple[str, ...]
+) -> list[list[Picture]]:
+    """Figures of one subject by kind: those of several runs side by side.
+
+    All but the first of a kind and run are extra, to be unfolded, and so are those of single runs that another
+    figure shows side by side.
+    """
+    found: dict[str, list[Picture]] = {}
+    own = [exhibit for exhibit in exhibits if exhibit.subject == subject]
+    together = {_kind(exhibit) for exhibit in own if exhibit.run is None}
+    for exhibit in own:
+        run = "" if exhibit.run is None else names[exhibit.run]
+        kind = _kind(exhibit)
+        before = [other for pictures in found.values() for other in pictures]
+        extra = any(other.run == run and other.title.partition(",")[0] == kind for other in before)
+        extra |= exhibit.run is not None and f"{kind} side by side" in together
+        found.setdefault(exhibit.title, []).append(
+            Picture(exhibit.title, run, exhibit.reading, *data_uri(exhibit, places), extra)
+        )
+    return list(found.values())
+
+
+def _kind(exhibit: ReportFigure) -> str:
+    return exhibit.title.partition(",")[0]
 
 
 def data_uri(exhibit: ReportFigure, places: tuple[str, ...] = ()) -> tuple[str, str]:

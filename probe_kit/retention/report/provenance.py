@@ -8,6 +8,7 @@ from typing import Any
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.labels.label_results import LabelResults
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.version import __version__
 
@@ -24,8 +25,13 @@ class Provenance:
     documents: tuple[tuple[str, str], ...]
 
 
-def provenance(name: str, run: RunReader, results: ProbeResults | None) -> Provenance:
-    """What a run says about itself and its probes; runs that were not made by probe_kit say less."""
+def provenance(
+    name: str, run: RunReader, results: ProbeResults | None, labels: Sequence[LabelResults] = ()
+) -> Provenance:
+    """What a run says about itself and its probes; runs that were not made by probe_kit say less.
+
+    labels: its probes of labels.
+    """
     settings: dict[str, Any] = getattr(run, "settings", {})
     certificate: dict[str, Any] = getattr(run, "certificate", {})
     probes = _probe_settings(results)
@@ -43,9 +49,11 @@ def provenance(name: str, run: RunReader, results: ProbeResults | None) -> Prove
             certificate.get("hooks_on_equals_hooks_off"), "no"
         ),
         "mixed": ", ".join(getattr(run, "mixed", ())),
-        "probes": str(probes.get("key", "none")),
+        "probes": str(probes.get("key", "none" * (not labels))),
+        **{f"probes of {one.settings.target}": one.key for one in labels},
     }
     documents = {"run settings": settings, "certificate": certificate, "probe settings": probes}
+    documents |= {f"probe settings of {one.settings.target}": _probe_settings(one) for one in labels}
     return Provenance(
         name,
         ProvenanceLine.of_run(run).line,
@@ -104,7 +112,7 @@ def _stream(run: RunReader, name: str) -> str:
     return f"{name} {stream.layers} layers{steps}, width {stream.width}"
 
 
-def _probe_settings(results: ProbeResults | None) -> dict[str, Any]:
+def _probe_settings(results: ProbeResults | LabelResults | None) -> dict[str, Any]:
     if results is None:
         return {}
     return {"key": results.key, "created": results.created, **asdict(results.settings)}

@@ -57,6 +57,10 @@ class LabelCurve:
         """Positions of the sites of one stream."""
         return np.flatnonzero([site.stream == name for site in self.sites])
 
+    def largest_excess(self, rows: NDArray[np.intp]) -> int:
+        """Which of some positions has the largest score above its own chance; the largest score without chance."""
+        return int(rows[np.argmax((self.metric - np.nan_to_num(self.chance))[rows])])
+
     def of_part(self, part: str) -> str | None:
         """The first stream of a part of the model, `backbone` or `action`; None if none was probed."""
         return next((site.stream for site, own in zip(self.sites, self.parts, strict=True) if own == part), None)
@@ -82,7 +86,7 @@ class LabelControl:
 
     score, ci: its metric with a 95 % interval over groups. chance, p: by the label permutations, None without any.
     stream: whose width `random-features` have, or whose best site that of `untrained` is; empty for others.
-    view: of `untrained`.
+    view: of `untrained`. by_step: mean score of the samples at each of `LabelResults.steps`, in order.
     """
 
     name: str
@@ -92,6 +96,7 @@ class LabelControl:
     p: float | None
     stream: str = ""
     view: str = ""
+    by_step: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -127,6 +132,11 @@ class LabelControls:
         own = (one for one in self.comparisons if (one.view, one.site) == (view, str(site)))
         return {one.control: one.p < SIGNIFICANCE for one in own}
 
+    def of_stream(self, view: str, stream: str) -> tuple[LabelControl, ...]:
+        """The scores that sites of a stream are compared with in a view, the best first."""
+        own = [one for one in self.scores if one.stream in ("", stream) and one.view in ("", view)]
+        return tuple(sorted(own, key=lambda one: -one.score))
+
     def reference(self, view: str, site: Site) -> float:
         """Score of the best control of a site; NaN without any."""
         own = [one.reference for one in self.comparisons if (one.view, one.site) == (view, str(site))]
@@ -140,7 +150,10 @@ class LabelControls:
     def from_json(cls, stored: dict[str, Any]) -> "LabelControls":
         """What `to_json` gave."""
         return cls(
-            tuple(LabelControl(**{**one, "ci": tuple(one["ci"])}) for one in stored["scores"]),
+            tuple(
+                LabelControl(**{**one, "ci": tuple(one["ci"]), "by_step": tuple(one.get("by_step", ()))})
+                for one in stored["scores"]
+            ),
             tuple(LabelComparison(**one) for one in stored["comparisons"]),
             stored["left_out"],
             stored.get("untrained", ""),
@@ -154,6 +167,7 @@ class LabelResults:
     classes: names of the classes, empty for a continuous label. labels: (n,) coded. episodes, groups: (n,) names.
     inferences: (n,) captured inference. fold_of: (n,) outer fold. curves: by view. smallest_p: no p can be lower.
     left_out: how many episodes and inferences have no part, by reason. created: when they were fitted (UTC).
+    aligned: (n,) place behind the event where windows begin, None where they begin at the first inference.
     """
 
     settings: LabelSettings
@@ -169,6 +183,22 @@ class LabelResults:
     controls: LabelControls = field(default_factory=LabelControls)
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="microseconds"))
     stamp: str = ""
+    aligned: NDArray[np.int64] | None = None
+
+    @property
+    def places(self) -> NDArray[np.int64]:
+        """(n,) the inference, or its place behind the event where windows begin."""
+        return self.inferences if self.aligned is None else self.aligned
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """(W,) the different places, in order."""
+        return np.unique(self.places)
+
+    def by_step(self, scores: Matrix) -> Matrix:
+        """(W,) mean of (n,) scores at each of the steps."""
+        found: Matrix = np.array([scores[self.places == step].mean() for step in self.steps])
+        return found
 
     @property
     def key(self) -> str:

@@ -10,7 +10,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from probe_kit._system.csv_text import csv_of_frame
-from probe_kit.errors import NoProbesError, RunDamagedError
+from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.extract.run_layout import PROBES
 from probe_kit.extract.store.format.bundles import Bundle, complete_key, write_bundle
 from probe_kit.hooks.contract.sites import Site
@@ -23,6 +23,7 @@ from probe_kit.train.settings import LABEL_FORMAT
 
 SCORES, PREDICTIONS, CONTROLS = "scores.csv", "predictions.npz", "controls.json"
 _SAMPLES = ("labels", "episodes", "inferences", "groups", "fold_of")
+_ALIGNED = "aligned"
 _CURVE = ("predictions", "scores", "null", "penalties")
 
 
@@ -47,26 +48,44 @@ def load_label_results(run: RunReader, key: str | None = None, target: str | Non
     """The stored probes of a label called `key`, or else the newest, of `target` if that is given.
 
     key: as `probe-kit run show` lists it; its beginning will do. Newest: those that were asked for last, of the
-    episodes that the run has now. Raises NoProbesError if there are none, UsageError for a key that is not there,
-    and RunDamagedError for results that were changed.
+    episodes that the run has now. Raises NoProbesError if there are none, UsageError for a key that is not there
+    or of another target, and RunDamagedError for results that were changed.
     """
-    stored = {name: bundle for name, bundle in read_probes(run.location).items() if is_of_label(bundle)}
     if key is not None:
-        return _read(run, stored[complete_key(key, stored, run.location, "probes of labels")])
-    current = [
-        bundle
-        for bundle in stored.values()
-        if bundle.head["settings"].get("run_settings") == run.settings_sha256
-        and bundle.head["settings"].get("episodes") == episodes_sha256(run)
-        and target in (None, bundle.head["settings"].get("target"))
-    ]
+        stored = {name: bundle for name, bundle in read_probes(run.location).items() if is_of_label(bundle)}
+        found = stored[complete_key(key, stored, run.location, "probes of labels")]
+        if target not in (None, found.head["settings"]["target"]):
+            raise UsageError(
+                f"{run.location}: the probes {found.key} are of {found.head['settings']['target']!r}, not of "
+                f"{target!r}. Give their key with --target {found.head['settings']['target']}, or leave it out"
+            )
+        return _read(run, found)
+    current, count = _current(run)
+    current = [bundle for bundle in current if target in (None, bundle.head["settings"].get("target"))]
     if not current:
         of = "" if target is None else f" {target!r}"
         raise NoProbesError(
-            f"{run.location} has no probes of a label{of} on its episodes (of {len(stored)} stored). Run "
+            f"{run.location} has no probes of a label{of} on its episodes (of {count} stored). Run "
             f"`probe-kit train {run.location} --target COLUMN`"
         )
     return _read(run, max(current, key=lambda bundle: (bundle.times.get("asked", ""), bundle.key)))
+
+
+def stored_targets(run: RunReader) -> tuple[str, ...]:
+    """The label columns of which the run has probes on its present episodes, in alphabetical order."""
+    return tuple(sorted({str(bundle.head["settings"]["target"]) for bundle in _current(run)[0]}))
+
+
+def _current(run: RunReader) -> tuple[list[Bundle], int]:
+    """Probes of labels on the episodes that the run has now, and how many there are of any episodes."""
+    stored = [bundle for bundle in read_probes(run.location).values() if is_of_label(bundle)]
+    now = run.settings_sha256, episodes_sha256(run)
+    own = [bundle.head["settings"] for bundle in stored]
+    return [
+        bundle
+        for bundle, settings in zip(stored, own, strict=True)
+        if (settings.get("run_settings"), settings.get("episodes")) == now
+    ], len(stored)
 
 
 def is_of_label(bundle: Bundle) -> bool:
@@ -76,6 +95,8 @@ def is_of_label(bundle: Bundle) -> bool:
 
 def _packed(results: LabelResults) -> bytes:
     arrays: dict[str, Any] = {name: getattr(results, name) for name in _SAMPLES}
+    if results.aligned is not None:
+        arrays[_ALIGNED] = results.aligned
     for view, curve in results.curves.items():
         arrays |= {f"{view}/{name}": getattr(curve, name) for name in _CURVE}
         arrays[f"{view}/sites"] = np.array([str(site) for site in curve.sites])
@@ -97,6 +118,7 @@ def _read(run: RunReader, bundle: Bundle) -> LabelResults:
         settings = LabelSettings(**{**stored, **lists})
         with np.load(BytesIO(bundle.read(PREDICTIONS)), allow_pickle=False) as arrays:
             samples = {name: arrays[name] for name in _SAMPLES}
+            aligned = arrays.get(_ALIGNED)
             curves = {view: _curve(arrays, view) for view in settings.views}
         controls = LabelControls.from_json(bundle.read_json(CONTROLS))
         return LabelResults(
@@ -109,6 +131,7 @@ def _read(run: RunReader, bundle: Bundle) -> LabelResults:
             controls=controls,
             created=bundle.times.get("created", ""),
             stamp=stamp,
+            aligned=aligned,
         )
     except (BadZipFile, ValueError, KeyError, TypeError, OSError) as error:
         raise RunDamagedError(

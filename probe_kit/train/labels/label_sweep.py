@@ -157,6 +157,7 @@ def _fit(
         smallest_p=problem.smallest_p,
         left_out=samples.left_out,
         stamp=stamp_of_run(run),
+        aligned=None if samples.aligned is None else samples.aligned.astype(np.int64),
     )
 
 

@@ -5,6 +5,7 @@ from typing import Self
 
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.labels.label_results import LabelResults
 from probe_kit.train.results.probe_results import ProbeResults
 
 RANDOM = "RANDOM WEIGHTS"
@@ -47,6 +48,16 @@ class ProvenanceLine:
         return cls(
             results.label, settings.random_weights, settings.weights, settings.suite, n, settings.run_settings,
             results.key, settings.target, settings.call,
+        )  # fmt: skip
+
+    @classmethod
+    def of_label(cls, results: LabelResults, view: str) -> Self:
+        """Of probes of a label in one view."""
+        own, groups = results.settings, len(set(results.groups.tolist()))
+        n = f"n = {results.labels.size} samples in {groups} groups, view {view}"
+        return cls(
+            own.model, own.random_weights, own.weights, own.suite, n, own.run_settings, results.key, own.target,
+            own.call if own.window == 1 else None,
         )  # fmt: skip
 
     @classmethod

@@ -251,6 +251,7 @@ def _scored(name: Name, probe: LabelProbe, results: LabelResults, stream: str = 
         float(probe.null.mean()) if probe.null.size else None,
         None if np.isnan(p) else p,
         stream,
+        by_step=tuple(results.by_step(probe.scores).tolist()),
     )
 
 

@@ -1,0 +1,85 @@
+"""All figures of a table of labels: what `retention --target --figures` saves and the report shows."""
+
+import re
+from collections.abc import Iterator, Sequence
+from functools import partial
+
+from probe_kit.errors import UsageError
+from probe_kit.retention.displays.base.report_figure import ONLY_FILLED, ReportFigure, in_view, view_suffix
+from probe_kit.retention.displays.labels.class_confusion import class_confusions
+from probe_kit.retention.displays.labels.label_curve import label_curves
+from probe_kit.retention.displays.labels.predicted_values import predicted_values
+from probe_kit.retention.displays.labels.step_scores import step_scores
+from probe_kit.retention.displays.report_figures import run_names
+from probe_kit.retention.labels.table import LabelRetentionTable
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.labels.label_results import LabelResults
+
+
+def label_figures(runs: Sequence[RunReader], table: LabelRetentionTable) -> list[ReportFigure]:
+    """The figures of every label, run and view of a table, label by label; `subject` is the label.
+
+    Nothing is drawn yet. Raises UsageError for a run that the table was not made of.
+    """
+    known = {place for place, _ in table.results}
+    if strangers := [str(run.location) for run in runs if str(run.location) not in known]:
+        raise UsageError(f"the table has no rows of {', '.join(strangers)}; make it of the runs that are drawn")
+    stems = file_names(table.targets)
+    return [
+        figure
+        for target, of_label in zip(table.targets, stems, strict=True)
+        for position, (run, of_run) in enumerate(zip(runs, run_names(runs), strict=True))
+        for view in _views(table, run, target)
+        for figure in _of_view(
+            table.results[str(run.location), target], view, f"{of_run}-{of_label}", position, target
+        )
+    ]
+
+
+def _views(table: LabelRetentionTable, run: RunReader, target: str) -> list[str]:
+    """Those of the table's rows."""
+    place = str(run.location)
+    return [row.retention.view for row in table.rows if (row.location, row.retention.target) == (place, target)]
+
+
+def file_names(targets: Sequence[str]) -> list[str]:
+    """Label columns as parts of file names, no two alike."""
+    names: list[str] = []
+    for target in targets:
+        name = re.sub(r"[^\w.-]+", "-", target).strip(".-") or "label"
+        count = 1 + sum(other.casefold() == name.casefold() for other in names)
+        names.append(name if count == 1 else f"{name}-{count}")
+    return names
+
+
+def _of_view(results: LabelResults, view: str, stem: str, position: int, target: str) -> Iterator[ReportFigure]:
+    views = results.settings.views
+    suffix = view_suffix(view, views)
+    yield ReportFigure(
+        f"{stem}-layer-curves{suffix}", in_view("Layer curves", view, views), target,
+        "How well a linear probe decodes the label in groups it has not seen, layer by layer, with 95 % intervals "
+        f"over groups. {ONLY_FILLED}. Grey: what the same probes reach with labels exchanged between groups. "
+        "Dotted: the best control.",
+        position, partial(label_curves, results, view),
+    )  # fmt: skip
+    if results.steps.size > 1:
+        yield ReportFigure(
+            f"{stem}-steps{suffix}", in_view("Score by step", view, views), target,
+            "The same by inference, at the best site of each part, beside controls. The mean over all samples is "
+            "the metric. Samples of a frequent class weigh less, so compare with the controls at that step.",
+            position, partial(step_scores, results, view),
+        )  # fmt: skip
+    if results.classes:
+        yield ReportFigure(
+            f"{stem}-confusion{suffix}", in_view("Confusion matrix", view, views), target,
+            "Which class the best site of each part predicts for which, in groups it has not seen. Each row sums "
+            "to 100 %; the mean of the diagonal is the balanced accuracy.",
+            position, partial(class_confusions, results, view),
+        )  # fmt: skip
+    else:
+        yield ReportFigure(
+            f"{stem}-predicted{suffix}", in_view("Predicted against true", view, views), target,
+            "A point per sample, predicted by the best site of each part in groups it has not seen. Colours are "
+            "groups. Predictions are clipped to the range of the training labels.",
+            position, partial(predicted_values, results, view),
+        )  # fmt: skip

@@ -1,0 +1,131 @@
+"""Score of a label at every step of the window, with those of its controls."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.style import GREEN, PARTS, Line
+from probe_kit.retention.displays.labels.label_panel import (
+    LabelPanel,
+    best_row,
+    label_panels,
+    label_view,
+    streams_of,
+)
+from probe_kit.train.labels.label_results import METRICS, LabelControl, LabelResults, score_interval
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+STEP = "step"
+_CONTROLS = (Line("black", "", ":"), Line(GREEN, "", (0, (5, 1))))  # type: ignore[arg-type]  # as `SERIES`
+
+
+@dataclass
+class StepScoresDisplay(LabelPanel):
+    """Mean score of the samples at each step, of the best site of a stream; arrays (W,).
+
+    The mean over all samples is the metric of the label. steps: inferences, or places behind the event where
+    windows begin. low, high: 95 % interval over groups. controls: by name, the mean scores of the best control and
+    of `step`. site: of the largest score above its own chance.
+    """
+
+    target: str
+    metric: str
+    view: str
+    stream: str
+    part: str
+    site: str
+    steps: NDArray[np.int64]
+    from_event: bool
+    score: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    controls: dict[str, NDArray[np.float64]]
+    certificate: ProvenanceLine
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+
+    @classmethod
+    def from_results(cls, results: LabelResults, stream: str = "backbone", view: str | None = None) -> Self:
+        """From stored probes; view: the first probed one by default.
+
+        Raises UnknownSiteError for a view or stream that was not probed, UsageError for labels of a single step.
+        """
+        view = label_view(results, view)
+        if results.steps.size < 2:
+            raise UsageError(f"the label {results.settings.target!r} has one step; expected several to show")
+        curve, row = results.curves[view], best_row(results, view, stream)
+        own, scores = results.settings, curve.scores[row]
+        limits = [
+            score_interval(scores[here], results.groups[here], own.task, own.seed)
+            for here in (results.places == step for step in results.steps)
+        ]
+        return cls(
+            target=own.target,
+            metric=METRICS[own.task],
+            view=view,
+            stream=stream,
+            part=curve.parts[row],
+            site=str(curve.sites[row]),
+            steps=results.steps,
+            from_event=results.aligned is not None,
+            score=results.by_step(scores),
+            low=np.array([low for low, _ in limits]),
+            high=np.array([high for _, high in limits]),
+            controls={one.name: np.array(one.by_step) for one in _shown(results, view, stream)},
+            certificate=ProvenanceLine.of_label(results, view),
+        )
+
+    @property
+    def title(self) -> str:
+        """The site."""
+        return self.site
+
+    @property
+    def measure(self) -> str:
+        """Their mean is the metric."""
+        return f"mean score (over all steps: {self.metric})"
+
+    def draw(self, axes: "Axes") -> None:
+        """The site's and the controls' scores."""
+        line = PARTS[self.part]
+        arms = np.array([self.score - self.low, self.high - self.score]).clip(min=0)
+        axes.errorbar(self.steps, self.score, yerr=arms, fmt="none", ecolor=line.colour, elinewidth=0.8, alpha=0.7)
+        axes.plot(
+            self.steps,
+            self.score,
+            color=line.colour,
+            lw=1.3,
+            marker=line.marker,
+            ms=4.5,
+            label=f"best site, {self.part}",
+        )
+        for (name, scores), dash in zip(self.controls.items(), _CONTROLS, strict=False):
+            axes.plot(self.steps, scores, color=dash.colour, ls=dash.dash, lw=1.2, label=f"control {name}")
+        axes.axhline(0, color="0.85", lw=0.8, zorder=0)
+        _whole_numbers(axes, "inferences from the event on" if self.from_event else "inference of the episode")
+
+
+def _shown(results: LabelResults, view: str, stream: str) -> list[LabelControl]:
+    """The best control and `step`, each once; none of results that were stored without scores by step."""
+    own = [one for one in results.controls.of_stream(view, stream) if len(one.by_step) == results.steps.size]
+    return [one for number, one in enumerate(own) if number == 0 or one.name == STEP]
+
+
+def _whole_numbers(axes: "Axes", label: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, min_n_ticks=2))
+    axes.set_xlabel(label, fontsize=8.5)
+
+
+def step_scores(results: LabelResults, view: str | None = None) -> "Figure":
+    """Score of a label by step, a panel per stream; arguments and errors as of `StepScoresDisplay`."""
+    view = label_view(results, view)
+    streams = streams_of(results, view)
+    return label_panels([StepScoresDisplay.from_results(results, one, view) for one in streams], level=True)

@@ -1,0 +1,105 @@
+"""A label in a page: its row of the retention table, its figures, its best sites beside their controls."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.displays.labels import label_figures
+from probe_kit.retention.formats.html import HtmlTable, plain_tables
+from probe_kit.retention.labels.table import LabelRetentionTable, label_retention_table
+from probe_kit.retention.report.pictures import Picture, arranged
+from probe_kit.train.choices import Task
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.labels.label_results import METRICS, LabelResults
+from probe_kit.train.labels.label_store import stored_targets
+from probe_kit.train.labels.label_summary import label_sentences, label_table
+
+
+@dataclass(frozen=True)
+class LabelSection:
+    """One label. run: its name, empty where the section is of all runs. measured: task and metric.
+
+    retention, sentences: its rows of the retention table, and what they say. pictures: by kind, see `arranged`.
+
+    probes: best sites and controls, a table per run. notes: what the probes say, and what was left out.
+    """
+
+    target: str
+    run: str
+    measured: str
+    retention: HtmlTable
+    sentences: tuple[str, ...]
+    pictures: list[list[Picture]]
+    probes: tuple[HtmlTable, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def tables(self) -> tuple[HtmlTable, ...]:
+        """All of them."""
+        return self.retention, *self.probes
+
+
+def label_sections(
+    runs: Sequence[RunReader],
+    table: LabelRetentionTable,
+    names: Sequence[str],
+    places: tuple[str, ...],
+    of_one: str = "",
+) -> list[LabelSection]:
+    """A section per label of the table. names: of the runs. of_one: name of the run where sections are of one."""
+    exhibits = label_figures(runs, table)
+    found = []
+    for target in table.targets:
+        own = table.of_target(target)
+        (shown,) = plain_tables([own.text])
+        probes = {name: table.results[str(run.location), target] for name, run in zip(names, runs, strict=True)}
+        several = len(probes) > 1
+        found.append(
+            LabelSection(
+                target,
+                of_one,
+                _measured(next(iter(probes.values()))),
+                shown,
+                tuple(own.sentences),
+                arranged(exhibits, target, names, places),
+                tuple(
+                    _probes_table(one, f"Best sites and controls{f', {name}' if several else ''}")
+                    for name, one in probes.items()
+                ),
+                tuple(
+                    f"{name}: {sentence}" if several else sentence
+                    for name, one in probes.items()
+                    for sentence in label_sentences(one)
+                ),
+            )
+        )
+    return found
+
+
+def stored_label_sections(
+    runs: Sequence[RunReader], names: Sequence[str], places: tuple[str, ...]
+) -> list[LabelSection]:
+    """A section per run and label column of which the run has probes; none for other runs."""
+    found = []
+    for run, name in zip(runs, names, strict=True):
+        if targets := stored_targets(run):
+            table = label_retention_table([run], targets)
+            found += label_sections([run], table, [name], places, name if len(runs) > 1 else "")
+    return found
+
+
+def _measured(results: LabelResults) -> str:
+    own = results.settings
+    classes = f" of {len(results.classes)} classes" if results.classes else ""
+    return f"A {_TASKS[own.task]} label{classes}; the score is {METRICS[own.task]}."
+
+
+_TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "continuous": "continuous"}
+
+
+def _probes_table(results: LabelResults, title: str) -> HtmlTable:
+    shown = label_table(results)
+    (part,) = shown.parts
+    cells = tuple((name, *(cell.text for cell in row)) for name, row in zip(shown.names, part.rows, strict=True))
+    (found,) = plain_tables([TextTable(title, shown.caption, ("stream", *part.headings), cells)])
+    return found
