@@ -13,6 +13,7 @@ from probe_kit.hashing import derive_seed
 from tests.support.little_run import certify
 
 STREAMS = (StoredStream("backbone", 2, 6, None, 4, ("mean",), quantities=("residual",)),)
+EXPERT = StoredStream("expert", 1, 4, 2, 2, ("mean",), quantities=("residual",))
 CALLS, EVERY, STATE, ACTION, CHUNK = 4, 5, 3, 2, 2
 SHORT = 11
 """The episode that has a frame less."""
@@ -20,7 +21,7 @@ PLANTED = 2
 """The feature of `backbone.layer1` that holds the first number of the state."""
 
 
-def recorded_plan(episodes: int, pixels: bool = True) -> RecordedPlan:
+def recorded_plan(episodes: int, pixels: bool = True, streams: tuple[StoredStream, ...] = STREAMS) -> RecordedPlan:
     """Frames 0, 5, 10 and 15 of every episode but SHORT, which has three; of two tasks in turn."""
     rows = tuple(
         PlannedStretch(
@@ -42,17 +43,23 @@ def recorded_plan(episodes: int, pixels: bool = True) -> RecordedPlan:
         "columns": ["timestamp", "next.reward"],
         "names": {"state": ["x", "y", "z"], "action": ["dx", "grip"]},
     }
-    return RecordedPlan(rows, STREAMS, 1000, dataset, "kitchen")
+    return RecordedPlan(rows, streams, 1000, dataset, "kitchen")
 
 
 def write_recorded_run(
-    where: Path | str, episodes: int = 12, pixels: bool = True, weights: str = "0" * 64, planted: bool = True
+    where: Path | str,
+    episodes: int = 12,
+    pixels: bool = True,
+    weights: str = "0" * 64,
+    planted: bool = True,
+    expert: bool = False,
 ) -> Run:
     """Every number is drawn; with `planted` the first of the state lies in the features too.
 
-    Another network, by its `weights`, has other features of the same frames.
+    Another network, by its `weights`, has other features of the same frames. With `expert` there is an action
+    stream, of noise.
     """
-    plan = recorded_plan(episodes, pixels)
+    plan = recorded_plan(episodes, pixels, (*STREAMS, EXPERT) if expert else STREAMS)
     settings = {
         "model": "shown",
         "weights_sha256": weights,
@@ -89,11 +96,18 @@ def write_recorded_run(
             EpisodeRecord(
                 planned,
                 {"outcome": CAPTURE_ONLY, "frames_blake2b": "0" * 32},
-                {"pooled": {"backbone": pooled}},
-                [{"backbone": [("language", 0, 4)]}] * count,
+                {"pooled": {"backbone": pooled, **({"expert": noisy(draw, count)} if expert else {})}},
+                [{"backbone": [("language", 0, 4)], **({"expert": [("action", 0, 2)]} if expert else {})}] * count,
                 control_steps=tuple(planned.frames),
                 inputs=inputs,
             )
         )
     seal(where)
     return open_run(where)
+
+
+def noisy(draw: np.random.Generator, count: int) -> np.ndarray:
+    """Activations of the action stream, of `count` inferences."""
+    found = np.full((CALLS, *EXPERT.lead, 1, EXPERT.width), np.nan, np.float32)
+    found[:count] = draw.normal(size=(count, *found.shape[1:]))
+    return found

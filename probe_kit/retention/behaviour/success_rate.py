@@ -110,8 +110,13 @@ def normalised_score(success_rates: Sequence[float]) -> float:
 
 
 def capture_only(episodes: "pd.DataFrame") -> bool:
-    """Whether the model of these episodes only captured: it did not act, and there is no success rate."""
-    return not episodes.empty and bool((episodes["outcome"] == CAPTURE_ONLY).all())
+    """Whether the model of these episodes only captured: it did not act, and there is no success rate.
+
+    Episodes without a column `outcome`, such as those of arrays of your own, do not say so.
+    """
+    if episodes.empty or "outcome" not in episodes:
+        return False
+    return bool((episodes["outcome"] == CAPTURE_ONLY).all())
 
 
 def _check_acted(episodes: "pd.DataFrame") -> None:

@@ -93,18 +93,21 @@ def plain_tables(tables: Sequence[TextTable]) -> list[HtmlTable]:
                 HtmlColumn(_unbroken(name), HEADING_HELP.get(name, ""), name not in _WORDS, name)
                 for name in _full_headings(table)
             ),
-            *(
-                tuple(
-                    tuple(HtmlCell(cell, cell) for cell in cells)
-                    for cells in table.cells
-                    if (table.means and MEAN in cells[:2]) == is_mean
-                )
-                for is_mean in (False, True)
-            ),
+            _plain_rows(table, means=False),
+            _plain_rows(table, means=True),
             (f"{table.note[:1].upper()}{table.note[1:]}.",) if table.note else (),
         )
         for table in tables
     ]
+
+
+def _plain_rows(table: TextTable, means: bool) -> tuple[tuple[HtmlCell, ...], ...]:
+    """Those of means, or the others."""
+    return tuple(
+        tuple(HtmlCell(cell, cell) for cell in cells)
+        for cells in table.cells
+        if (table.means and MEAN in cells[:2]) == means
+    )
 
 
 def _full_headings(table: TextTable) -> list[str]:

@@ -20,7 +20,6 @@ class LabelSection:
     """One label. run: its name, empty where the section is of all runs. measured: task and metric.
 
     retention, sentences: its rows of the retention table, and what they say. pictures: by kind, see `arranged`.
-
     probes: best sites and controls, a table per run. notes: what the probes say, and what was left out.
     """
 

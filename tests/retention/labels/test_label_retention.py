@@ -17,9 +17,13 @@ from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
 from probe_kit.extract import Run, open_run
 from probe_kit.hooks import Site
 from probe_kit.retention import label_retention_table, measure_label_retention, measure_retention
+from probe_kit.retention.behaviour.success_rate import capture_only
+from probe_kit.retention.labels.estimate import with_corrected_p
 from probe_kit.train import Labels, ProbeCurve, train_probes
 from probe_kit.train.labels.label_results import LabelComparison, LabelControl, LabelControls
+from probe_kit.train.results.inventory import stored_probes
 from tests.support.label_results import label_results
+from tests.support.recorded_run import write_recorded_run
 
 GROUPS, EACH = 20, 4
 BACKBONE, ACTION = (Site("backbone", 0), Site("backbone", 1)), (Site("expert", 0),)
@@ -178,10 +182,10 @@ def test_the_command_prints_it_in_every_format_and_names_what_a_label_does_not_h
         assert "sim.tool" in done.stdout.replace("\\", "")
     done = CliRunner().invoke(app, ["retention", place, "--target", "sim.tool_y", "--rule", "box"])
     assert done.exit_code == 2
-    assert "--rule is for sides" in " ".join(done.stderr.split())
-    done = CliRunner().invoke(app, ["retention", place, "--target", "sim.tool_y", "--html", "report.html"])
+    assert "--rule is not for labels of your own" in " ".join(done.stderr.split())
+    done = CliRunner().invoke(app, ["retention", place, "--family", "table"])
     assert done.exit_code == 2
-    assert "--html" in done.stderr
+    assert "--family is for labels of your own" in " ".join(done.stderr.split())
     done = CliRunner().invoke(app, ["retention", place, "--target", "sim.tool_z"])
     assert done.exit_code == 2
     assert "'sim.tool_z'" in done.stderr
@@ -195,3 +199,138 @@ def test_runs_whose_labels_differ_are_not_put_into_one_table(trained: Run, tmp_p
         train_probes(run, labels=Labels.read(values, "y", task="continuous"), permutations=9, controls=())
     with pytest.raises(UsageError, match="sha256"):
         label_retention_table([trained, other], "y")
+
+
+# -- several labels in one table ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def three(trained: Run) -> Run:
+    """Probes of a continuous label, a binary one and one of classes."""
+    frame = pd.DataFrame({"episode_id": trained.episodes["episode_id"]})
+    for name, count in (("even", 2), ("kind", 3)):
+        drawn = np.random.default_rng(0).integers(count, size=len(frame) // 2).repeat(2)
+        table = frame.assign(**{name: [f"{name} {number}" for number in drawn]})
+        train_probes(trained, labels=Labels.read(table, name), permutations=39, controls=("instruction",))
+    return trained
+
+
+NAMES = ["even", "kind", "sim.tool_y"]
+
+
+def test_one_table_has_a_binary_label_one_of_classes_and_a_continuous_one_and_no_mean_of_them(three: Run) -> None:
+    command = ["retention", str(three.path), *(part for name in NAMES for part in ("--target", name))]
+    done = CliRunner().invoke(app, [*command, "--format", "json"])
+    assert done.exit_code == 0, done.output
+    rows = [row["retention"] for row in json.loads(done.stdout)]
+    assert [(row["target"], row["task"], row["metric"]) for row in rows] == [
+        ("even", "binary", "balanced accuracy"),
+        ("kind", "classes", "balanced accuracy"),
+        ("sim.tool_y", "continuous", "R²"),
+    ]
+    for row, name in zip(rows, NAMES, strict=True):
+        alone = label_retention_table([three], name).rows[0].retention
+        assert row["value"] == alone.value, "the same as by itself"
+    text = label_retention_table([three], NAMES).text
+    assert text.columns[:4] == ("label", "metric", "run", "view")
+    assert len(text.cells) == len(NAMES), "no row is a mean over tasks"
+    for style in ("table", "csv", "markdown", "latex"):
+        done = CliRunner().invoke(app, [*command, "--format", style], env={"COLUMNS": "250"})
+        assert done.exit_code == 0, done.output
+        assert all(name.replace("_", "") in done.stdout.replace("\\", "").replace("_", "") for name in NAMES)
+
+
+def test_trap_9_the_table_says_how_many_labels_were_tried_and_corrects_them_by_holm(three: Run) -> None:
+    alone = label_retention_table([three], NAMES)
+    assert (
+        alone.sentences[-1]
+        == "labelled (random weights) has probes of 3 labels (even, kind, sim.tool_y); p is of each label alone."
+    )
+    family = label_retention_table([three], NAMES, family="table")
+    assert family.sentences[-1].endswith("p is corrected for the 3 labels of this table (Holm).")
+    for part in ("backbone", "action"):
+        before = [getattr(row.retention, part).p_fwe for row in alone.rows]
+        after = [getattr(row.retention, part).p_fwe for row in family.rows]
+        assert after == pytest.approx([holm_by_hand(before, p) for p in before])
+    assert (
+        label_retention_table([three], "kind")
+        .sentences[-1]
+        .startswith("labelled (random weights) has probes of 3")
+    )
+
+
+def holm_by_hand(family: list[float], p: float) -> float:
+    """The largest of the smaller p, each times how many of the family are not smaller than it."""
+    return min(1.0, max(smaller * sum(other >= smaller for other in family) for smaller in family if smaller <= p))
+
+
+def test_a_site_that_is_above_chance_alone_may_not_be_among_several_labels() -> None:
+    results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH)
+    found = measure_label_retention(results)
+    assert found.defined
+    corrected = with_corrected_p(found, results, 0.06, None)
+    assert not corrected.defined
+    assert corrected.note == "n/a (backbone not shown to exceed chance)"
+    assert "p 0.060" in corrected.reason
+    assert corrected.action.p_fwe == found.action.p_fwe
+    assert corrected.value == found.value
+
+
+def test_stored_probes_are_chosen_by_key_for_one_target_that_they_are_of(three: Run) -> None:
+    labels = Labels.of_run(three, "sim.tool_y")
+    other = train_probes(three, labels=labels, permutations=19, controls=("step",))
+    newest = label_retention_table([three], "sim.tool_y")
+    assert newest.rows[0].settings == other.key
+    first = next(one for one in stored_probes(three) if one.permutations == 39 and "tool_y" in str(one.target))
+    place = str(three.path)
+
+    def asked(*further: str) -> tuple[int, str, str]:
+        done = CliRunner().invoke(app, ["retention", place, *further, "--format", "csv"])
+        return done.exit_code, done.stdout, " ".join(done.stderr.split())
+
+    code, said, _ = asked("--target", "sim.tool_y", "--probes", f"{place}={first.key}")
+    assert code == 0
+    assert first.key in said
+    code, _, error = asked("--target", "kind", "--probes", f"{place}={first.key}")
+    assert code == 2
+    assert f"the probes {first.key} are of 'sim.tool_y', not of 'kind'" in error
+    code, _, error = asked("--target", "kind", "--target", "even", "--probes", f"{place}={first.key}")
+    assert code == 2
+    assert "a key is of one" in error
+    code, _, error = asked("--probes", f"{place}={first.key}")
+    assert code == 2, "without --target a key of a label is none of sides"
+    assert first.key in error
+    with pytest.raises(UsageError, match="'kind' is given twice"):
+        label_retention_table([three], ["kind", "kind"])
+    code, _, error = asked(place, "--target", "kind")
+    assert code == 2
+    assert "is given twice" in error
+
+
+# -- recordings --------------------------------------------------------------------------------------------------
+
+
+def test_recordings_have_a_table_and_a_page_though_they_have_no_success_rate(tmp_path: Path) -> None:
+    run = write_recorded_run(tmp_path / "run", expert=True)
+    train_probes(
+        run, labels=Labels.of_run(run, "dataset.state.x"), permutations=39, controls=("step", "instruction")
+    )
+    found = label_retention_table([run], "dataset.state.x")
+    assert found.rows[0].run == "shown (capture only)"
+    assert found.rows[0].retention.defined
+    page = tmp_path / "report.html"
+    done = CliRunner().invoke(
+        app, ["retention", str(run.path), "--target", "dataset.state.x", "--html", str(page)]
+    )
+    assert done.exit_code == 0, done.output
+    assert "kitchen#" in page.read_text(encoding="utf-8")
+    assert "data:image/webp" not in page.read_text(encoding="utf-8"), "no picture of a recording"
+    done = CliRunner().invoke(app, ["retention", str(run.path)])
+    assert done.exit_code == 2
+    assert "probe-kit retention RUN --target COLUMN" in " ".join(done.stderr.split())
+
+
+def test_runs_without_outcomes_have_a_name(trained: Run) -> None:
+    episodes = trained.episodes.drop(columns="outcome")
+    assert not capture_only(episodes)
+    assert capture_only(episodes.assign(outcome="capture_only"))

@@ -17,5 +17,5 @@ def check_scene_run(run: object, wanted: str) -> None:
     where, shown = getattr(run, "location", run), getattr(run, "suite", "")
     raise UsageError(
         f"{where} {reason.format(shown)}, so {wanted} is not possible. Decode labels of your own: "
-        "`probe-kit train RUN --labels FILE --target COLUMN`"
+        "`probe-kit train RUN --labels FILE --target COLUMN`, then `probe-kit retention RUN --target COLUMN`"
     )

@@ -47,8 +47,9 @@ def file_names(targets: Sequence[str]) -> list[str]:
     names: list[str] = []
     for target in targets:
         name = re.sub(r"[^\w.-]+", "-", target).strip(".-") or "label"
-        count = 1 + sum(other.casefold() == name.casefold() for other in names)
-        names.append(name if count == 1 else f"{name}-{count}")
+        tries = (name, *(f"{name}-{number}" for number in range(2, len(targets) + 1)))
+        taken = {other.casefold() for other in names}
+        names.append(next(one for one in tries if one.casefold() not in taken))
     return names
 
 

@@ -1,0 +1,222 @@
+"""Figures of labels and their page: numbers as pandas and scikit-learn have them, nothing clipped."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib import pyplot as plt
+from sklearn.metrics import balanced_accuracy_score
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.errors import UnknownSiteError, UsageError
+from probe_kit.extract import Run, open_run
+from probe_kit.retention import label_retention_table
+from probe_kit.retention.displays.labels import (
+    ClassConfusionDisplay,
+    LabelCurveDisplay,
+    PredictedValuesDisplay,
+    StepScoresDisplay,
+    label_curves,
+    label_figures,
+    step_scores,
+)
+from probe_kit.retention.displays.labels.figures import file_names
+from probe_kit.retention.report import report_html
+from probe_kit.train import LabelResults, Labels, load_label_results, train_probes
+
+
+@pytest.fixture(autouse=True)
+def _closed_figures() -> Iterator[None]:
+    yield
+    plt.close("all")
+
+
+@pytest.fixture(scope="module")
+def run(labelled_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Probes of a quantity, of classes per inference, and of classes per episode with a name fit for no file."""
+    folder = tmp_path_factory.mktemp("labels") / "run"
+    shutil.copytree(labelled_run, folder)
+    run = open_run(folder)
+    for target, permutations in (("sim.tool_y", 39), ("sim.phase", 0)):  # every episode has the same phases
+        labels = Labels.of_run(run, target)
+        train_probes(run, labels=labels, permutations=permutations, controls=("step", "state", "instruction"))
+    train_probes(run, labels=kinds(run), permutations=39, controls=("instruction",))
+    return run
+
+
+def kinds(run: Run) -> Labels:
+    """Three classes, the same for both layouts of an item."""
+    frame = pd.DataFrame({"episode_id": run.episodes["episode_id"]})
+    values = [f"kind {number // 2 % 3}" for number in range(len(frame))]
+    return Labels.read(frame.assign(**{"a/b: <i>": values}), "a/b: <i>")
+
+
+def test_the_layer_curve_has_the_best_site_of_a_layer_its_own_null_and_the_best_control(run: Run) -> None:
+    results = load_label_results(run, target="sim.tool_y")
+    curve = results.curves["mean"]
+    display = LabelCurveDisplay.from_results(results, "expert")
+    excess = curve.metric - curve.null.mean(axis=1)
+    rows = [row for row, site in enumerate(curve.sites) if site.stream == "expert"]
+    best = max(rows, key=lambda row: excess[row])
+    assert display.layers.tolist() == [0]
+    assert display.iterations.tolist() == [curve.sites[best].iteration]
+    assert display.score == pytest.approx(curve.metric[best])
+    assert display.chance == pytest.approx(curve.null[best].mean())
+    assert [*display.null_low, *display.null_high] == pytest.approx(np.percentile(curve.null[best], [2.5, 97.5]))
+    assert np.isnan(display.low).all(), "a site that was chosen has no interval of its own"
+    state = max(results.controls.scores, key=lambda one: one.score)
+    assert display.control == (state.name, state.score) == ("state", pytest.approx(1.0, abs=0.01))
+    backbone = LabelCurveDisplay.from_results(results, "backbone")
+    table = results.scores.set_index("site")
+    assert backbone.low[1] == table.loc["backbone.01.residual", "ci_low"]
+    assert not backbone.signal.any(), "the state has it too"
+    with pytest.raises(UnknownSiteError, match="probed: backbone, expert"):
+        LabelCurveDisplay.from_results(results, "vision")
+    with pytest.raises(UnknownSiteError, match="probed: mean"):
+        LabelCurveDisplay.from_results(results, "backbone", "last")
+
+
+def test_without_enough_permutations_there_is_no_band_and_without_any_no_chance(run: Run) -> None:
+    for permutations, chance in ((9, True), (0, False)):
+        train_probes(run, labels=Labels.of_run(run, "sim.tool_z"), permutations=permutations, controls=())
+        figure = label_curves(load_label_results(run, target="sim.tool_z"))
+        names = {name for axes in figure.axes for name in axes.get_legend_handles_labels()[1]}
+        assert "95 % of permuted labels" not in names
+        assert ("chance of the site" in names) == chance
+        assert "best control" not in names
+
+
+def test_scores_by_step_are_means_of_the_samples_and_their_mean_is_the_metric(run: Run) -> None:
+    results = load_label_results(run, target="sim.tool_y")
+    display = StepScoresDisplay.from_results(results, "backbone")
+    row = [str(site) for site in results.curves["mean"].sites].index(display.site)
+    frame = pd.DataFrame({"step": results.inferences, "score": results.curves["mean"].scores[row]})
+    expected = frame.groupby("step")["score"].mean()
+    assert display.steps.tolist() == expected.index.tolist() == [0, 1, 2, 3]
+    assert display.score == pytest.approx(expected.to_numpy())
+    assert display.score.mean() == pytest.approx(results.curves["mean"].metric[row]), (
+        "as many samples at each step"
+    )
+    assert list(display.controls) == ["state", "step"], "the best one, and the step"
+    for name, scores in display.controls.items():
+        (control,) = [one for one in results.controls.scores if one.name == name]
+        assert scores.mean() == pytest.approx(control.score)
+    assert (display.low < display.score).all()
+    with pytest.raises(UsageError, match="has one step"):
+        step_scores(load_label_results(run, target="a/b: <i>"))
+
+
+def test_places_behind_an_event_are_stored_and_shown_as_such(run: Run) -> None:
+    event = Labels.of_run(run, "sim.phase").equal_to("holding")
+    labels = Labels.of_run(run, "sim.cube_x")
+    results = train_probes(run, labels=labels, permutations=0, controls=("step",), align_to=event)
+    assert results.steps.tolist() == [0, 1]
+    assert results.inferences.min() == 2, "the grasp is seen at inference 2"
+    display = StepScoresDisplay.from_results(results, "expert")
+    assert display.from_event
+    assert display.steps.tolist() == [0, 1]
+    axes = display.plot().ax_
+    assert axes is not None
+    assert axes.get_xlabel() == "inferences from the event on"
+
+
+def test_a_confusion_matrix_counts_held_out_predictions(run: Run) -> None:
+    results = load_label_results(run, target="a/b: <i>")
+    display = ClassConfusionDisplay.from_results(results, "backbone")
+    row = [str(site) for site in results.curves["mean"].sites].index(display.site)
+    predicted = results.curves["mean"].predictions[row]
+    expected = pd.crosstab(results.labels, predicted).reindex(index=range(3), columns=range(3), fill_value=0)
+    np.testing.assert_array_equal(display.counts, expected.to_numpy())
+    balanced = balanced_accuracy_score(results.labels, predicted)
+    assert np.diag(display.shares).mean() == pytest.approx(balanced)
+    assert results.curves["mean"].metric[row] == pytest.approx(balanced)
+    axes = display.plot().ax_
+    assert axes is not None
+    assert [text.get_text() for text in axes.texts] == [f"{100 * share:.0f}" for share in display.shares.ravel()]
+    with pytest.raises(UsageError, match="is continuous"):
+        ClassConfusionDisplay.from_results(load_label_results(run, target="sim.tool_y"))
+
+
+def test_predicted_values_are_held_out_and_coloured_by_group(run: Run) -> None:
+    results = load_label_results(run, target="sim.tool_y")
+    display = PredictedValuesDisplay.from_results(results, "backbone")
+    assert display.site == "backbone.01.residual"
+    np.testing.assert_array_equal(display.true, results.labels)
+    assert np.corrcoef(display.true, display.predicted)[0, 1] > 0.9
+    same = results.groups[:, None] == results.groups
+    np.testing.assert_array_equal(display.groups[:, None] == display.groups, same)
+    with pytest.raises(UsageError, match="is of classes"):
+        PredictedValuesDisplay.from_results(load_label_results(run, target="sim.phase"))
+
+
+def test_every_figure_of_a_table_is_drawn_unclipped_and_says_what_it_is_of(run: Run) -> None:
+    table = label_retention_table([run], ["sim.tool_y", "sim.phase", "a/b: <i>"])
+    exhibits = label_figures([run], table)
+    assert [one.name for one in exhibits] == [
+        "run-sim.tool_y-layer-curves", "run-sim.tool_y-steps", "run-sim.tool_y-predicted",
+        "run-sim.phase-layer-curves", "run-sim.phase-steps", "run-sim.phase-confusion",
+        "run-a-b-i-layer-curves", "run-a-b-i-confusion",
+    ]  # fmt: skip
+    for exhibit in exhibits:
+        with exhibit.drawn() as figure:
+            figure.draw_without_rendering()
+            inked = figure.get_tightbbox()
+            assert min(inked.x0, inked.y0) > -0.02, exhibit.name
+            assert inked.x1 < figure.get_figwidth() + 0.02, exhibit.name
+            assert inked.y1 < figure.get_figheight() + 0.02, exhibit.name
+            assert f"target {exhibit.subject}" in figure.caption  # type: ignore[attr-defined]
+    with pytest.raises(UsageError, match="has no rows of"):
+        label_figures([run], label_retention_table([run], "sim.phase").of_target("nothing"))
+
+
+def test_names_of_files_differ_where_columns_do() -> None:
+    assert file_names(["a b", "a-b", "A-b", "../x", "…"]) == ["a-b", "a-b-2", "A-b-3", "x", "label"]
+
+
+def test_the_command_writes_figures_and_a_page_of_several_labels(run: Run, tmp_path: Path) -> None:
+    page, folder = tmp_path / "report.html", tmp_path / "figures"
+    targets = ["--target", "sim.tool_y", "--target", "a/b: <i>"]
+    done = CliRunner().invoke(
+        app, ["retention", str(run.path), *targets, "--html", str(page), "--figures", str(folder)]
+    )
+    assert done.exit_code == 0, done.output
+    assert {path.suffix for path in folder.iterdir()} == {".png", ".pdf"}
+    assert len(list(folder.iterdir())) == 10
+    text = page.read_text(encoding="utf-8")
+    assert "a/b: &lt;i&gt;" in text
+    assert "<i>" not in text, "a column's name is no markup"
+    assert str(tmp_path) not in text, "no path of this machine"
+    assert "http://" not in text.replace("http://www.w3.org", ""), "needs no network"
+    assert text.count("data:image/svg+xml,") + text.count("data:image/webp") == 5
+    assert "control state" in text
+    for wrong, message in (
+        (["--html", str(tmp_path)], "is a folder"),
+        (["--figures", str(page)], "is a file"),
+    ):
+        done = CliRunner().invoke(app, ["retention", str(run.path), *targets, *wrong])
+        assert done.exit_code == 2
+        assert message in " ".join(done.stderr.split())
+
+
+def test_the_report_of_sides_has_a_section_of_stored_labels(run: Run) -> None:
+    text = report_html([run])
+    assert '<details class="part" id="labels">' in text
+    assert "sim.tool_y" in text
+    assert text.count('href="#labels"') == 1
+
+
+@pytest.fixture
+def results(run: Run) -> LabelResults:
+    return load_label_results(run, target="sim.tool_y")
+
+
+def test_results_stored_before_scores_by_step_were_kept_show_none(results: LabelResults) -> None:
+    stored = results.controls.to_json()
+    for one in stored["scores"]:
+        del one["by_step"]
+    old = results.with_controls(type(results.controls).from_json(stored))
+    assert StepScoresDisplay.from_results(old).controls == {}
