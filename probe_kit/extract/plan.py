@@ -137,6 +137,11 @@ class RowPlan(ABC):
     def selection(self) -> dict[str, Any]:
         """What was selected, as it stands among a run's settings; no part of its identity."""
 
+    @property
+    def decoder(self) -> str | None:
+        """What makes pictures of stored videos here, with its version; None where nothing is decoded."""
+        return None
+
     @abstractmethod
     def to_json(self) -> dict[str, Any]:
         """As stored in `plan/`: `episodes` as flat columns, and `suite_parent`."""

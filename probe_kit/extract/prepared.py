@@ -70,9 +70,10 @@ class Prepared:
         }
 
     def provenance(self) -> dict[str, Any]:
-        """That of a process that plays with these settings here."""
+        """That of a process that plays with these settings here; with the decoder of recorded videos."""
         dtype: str | None = self.card.get("dtype")
-        return provenance_here(self.settings.device, dtype)
+        decoder = {} if self.plan.decoder is None else {"decoder": self.plan.decoder}
+        return provenance_here(self.settings.device, dtype) | decoder
 
     def writer(self, location: Location) -> RunWriter:
         """A writer of the run at `location`, which it begins or continues.

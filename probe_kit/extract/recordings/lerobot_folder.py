@@ -25,6 +25,8 @@ from probe_kit.hooks.checkpoints.hub import unreachable
 
 EXTRA = "datasets"
 CONVERTER = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
+IMAGE = "image"
+"""Pictures of a camera that are stored one by one."""
 MOST_FRAMES = 64
 """Chosen frames that one row holds."""
 OFF_GRID_S = 1e-4
@@ -103,7 +105,7 @@ class LeRobotFolder:
         """How pictures of a camera are stored: `image`, or the codec of its video."""
         own = self.features[feature]
         info = own.get("info") or own.get("video_info") or {}
-        return "image" if own["dtype"] == "image" else str(info.get("video.codec", "video"))
+        return IMAGE if own["dtype"] == IMAGE else str(info.get("video.codec", "video"))
 
     @cached_property
     def lengths(self) -> list[int]:

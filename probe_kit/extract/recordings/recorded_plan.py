@@ -2,12 +2,13 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from itertools import groupby
 from typing import Any, Self
 
 from probe_kit.errors import RecordingError
 from probe_kit.extract.plan import RowPlan
-from probe_kit.extract.recordings.lerobot_folder import MOST_FRAMES, LeRobotFolder, LeRobotFrames
+from probe_kit.extract.recordings.lerobot_folder import IMAGE, MOST_FRAMES, LeRobotFolder, LeRobotFrames
 from probe_kit.extract.recordings.lerobot_source import ACTION, IMAGES, STATE, LeRobotSource, Pairs
 from probe_kit.extract.run_layout import OTHER_ACTIONS
 from probe_kit.hashing import derive_seed
@@ -116,6 +117,12 @@ class RecordedPlan(RowPlan):
         """Which episodes were chosen, and whether their actions are those that the policy predicts."""
         chosen = sorted({one.source_episode for one in self.episodes})
         return {"recording": {"name": self.name, "episodes": chosen, OTHER_ACTIONS: self.other_actions}}
+
+    @property
+    def decoder(self) -> str | None:
+        """PyAV where a camera is a video: pixels of lossy videos are those of their decoder."""
+        encodings = {encoding for _, _, encoding in self.dataset["cameras"]}
+        return f"PyAV {version('av')}" if encodings - {IMAGE} else None
 
     def to_json(self) -> dict[str, Any]:
         """As stored in `plan/`."""

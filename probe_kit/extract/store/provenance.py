@@ -29,7 +29,12 @@ DIGITS = 16
 _NAMED = re.compile(rf"[0-9a-f]{{{DIGITS}}}\.json")
 _RESTORE = "Restore it from a copy, or extract the run again"
 _LIBRARIES = ("torch", "lerobot", "transformers", "timm", "pybullet", "zarr", "numcodecs", "numpy", "pillow")
-DECISIVE = ("device", "dtype", *(f"versions.{name}" for name in ("probe-kit", *_LIBRARIES[:3], "pybullet")))
+DECISIVE = (
+    "device",
+    "dtype",
+    "decoder",
+    *(f"versions.{name}" for name in ("probe-kit", *_LIBRARIES[:3], "pybullet")),
+)
 """What changes numbers. Cores, workers and threads, the interpreter and the writer's libraries do not."""
 
 

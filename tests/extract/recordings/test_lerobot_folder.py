@@ -2,7 +2,11 @@
 
 import json
 import shutil
+import socket
+import subprocess
+import sys
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -114,13 +118,13 @@ def test_states_actions_and_columns_are_the_recorded_ones(run: Run) -> None:
 
 
 def test_predictions_are_what_the_policy_acts_in_a_scene(run: Run, pi0_tiny: Pi0) -> None:
-    """Of the embedded policy, whose own units are those of the arm."""
+    """Of the embedded policy, whose own units are those of the arm. A batch of three rounds otherwise than one."""
     assert run.inputs is not None
     seed = int(run.episodes["policy_seed"].iloc[0])
     own = pi0_tiny.act(
         [observations()[0][0]], [Turn(observations()[0][0], seed, 0, None).derived_seed("inference")]
     )  # type: ignore[arg-type]
-    np.testing.assert_array_equal(run.inputs.read("prediction")[0, 0], own[0])
+    np.testing.assert_allclose(run.inputs.read("prediction")[0, 0], own[0], rtol=0, atol=1e-6)
 
 
 def test_predicted_actions_are_compared_with_recorded_ones_in_their_units(run: Run) -> None:
@@ -165,6 +169,26 @@ def test_no_thumbnails_and_no_pixels_are_kept_where_they_are_not_wanted(
     assert found.inputs is not None
     assert "pixels" not in found.inputs.kinds
     assert str(recording.parent) not in (tmp_path / "run" / "run.json").read_text(encoding="utf-8")
+
+
+def test_trap_2_episodes_asked_for_in_another_order_are_not_taken_for_each_other(
+    recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """lerobot gives `episodes=[2, 0]` back as 0, 2, and asks the hub where one of a list is not there."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the hub was asked")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    frames = LeRobotFrames(open_lerobot(LeRobotSource(str(recording))), [2, 0])
+    for episode in (2, 0):
+        written = observations()[episode]
+        np.testing.assert_array_equal(frames.pictures(episode, 1, [CAMERA])[CAMERA], written[1].image)
+        states = frames.numbers(episode, ["observation.state"])["observation.state"]
+        np.testing.assert_allclose(states, [one.state for one in written])
+    for episodes in ((7,), (7, 1)):
+        with pytest.raises(RecordingError, match="has 3 episodes, counted from 0; asked for 7"):
+            prepare(settings(recording, episodes=episodes))
 
 
 # -- selection ------------------------------------------------------------------------------------------------
@@ -354,9 +378,40 @@ def test_a_recording_as_video_says_so_and_gives_nearly_the_numbers_of_its_pictur
     kinds = [run.settings["dataset"]["cameras"][0][2] for run in (pictures, videos)]
     assert kinds[0] == "image"
     assert kinds[1] != "image"
+    (of_pictures,), (of_videos,) = (run.provenances.values() for run in (pictures, videos))
+    assert "decoder" not in of_pictures
+    assert of_videos["decoder"] == f"PyAV {version('av')}"
     ours, theirs = rows(videos)["backbone"], rows(pictures)["backbone"]
     there = np.isfinite(theirs)
     assert 0 < np.abs(ours[there] - theirs[there]).mean() < 0.1 * np.abs(theirs[there]).mean()
+
+
+def test_trap_1_videos_are_decoded_without_torchcodec_and_without_a_word(tmp_path: Path) -> None:
+    """lerobot prefers torchcodec, which installs without FFmpeg and then fails with pages of log per process."""
+    smooth = [[replace(one, image=_smooth(0, frame)) for frame, one in enumerate(observations(1)[0])]]
+    folder = write_recording(tmp_path / "video", smooth, videos=True)
+    script = (
+        "import sys\n"
+        "sys.modules['torchcodec'] = None\n"
+        "from probe_kit.extract import LeRobotSource\n"
+        "from probe_kit.extract.recordings.lerobot_folder import LeRobotFrames, open_lerobot\n"
+        f"frames = LeRobotFrames(open_lerobot(LeRobotSource({str(folder)!r})), [0])\n"
+        f"seen = frames.pictures(0, 3, [{CAMERA!r}])[{CAMERA!r}]\n"
+        "print(seen.shape, abs(int(seen[..., 2].mean()) - 60) < 10)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, encoding="utf-8", check=False)
+    assert done.stdout.splitlines() == ["(48, 64, 3) True"], done.stderr
+    assert done.stderr == ""
+
+
+def test_a_run_of_videos_is_not_continued_with_another_decoder(
+    pi0_tiny: Pi0, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_recording(tmp_path / "video", observations(2), videos=True)
+    shown(folder, tmp_path / "run", pi0_tiny, episodes=(0,))
+    monkeypatch.setattr(RecordedPlan, "decoder", "PyAV 1.0")
+    with pytest.raises(SettingsMismatchError, match=r"decoder: stored 'PyAV .+', here 'PyAV 1\.0'"):
+        shown(folder, tmp_path / "run", pi0_tiny)
 
 
 def _smooth(row: int, frame: int) -> np.ndarray:
