@@ -130,6 +130,11 @@ def golden_molmoact2() -> Path:
 
 
 @pytest.fixture(scope="session")
+def golden_groot() -> Path:
+    return _golden("groot")
+
+
+@pytest.fixture(scope="session")
 def golden_smolvla() -> Path:
     return _golden("smolvla")
 

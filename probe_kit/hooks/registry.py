@@ -24,6 +24,7 @@ FOLDERS = (
     "pi05",
     "pi0_fast",
     "molmoact2",
+    "groot",
     "smolvla",
     "openvla",
     "spatialvla",

@@ -31,6 +31,7 @@ FOLDERS = {
     "pi05": GOLDEN / "pi05" / "checkpoint",
     "pi0-fast": GOLDEN / "pi0_fast" / "checkpoint",
     "molmoact2": GOLDEN / "molmoact2" / "checkpoint",
+    "groot": GOLDEN / "groot" / "checkpoint",
     "smolvla": GOLDEN / "smolvla" / "checkpoint",
     "openvla": GOLDEN / "openvla" / "checkpoint",
     "magma": GOLDEN / "magma" / "checkpoint",
@@ -39,7 +40,7 @@ FOLDERS = {
     "internvla-m1": GOLDEN / "internvla_m1" / "checkpoint",
 }
 REFUSALS = (CheckpointError, WeightsError)
-COPIED = ("pi0-tiny", "pi0", "pi05", "pi0-fast", "molmoact2", "smolvla")
+COPIED = ("pi0-tiny", "pi0", "pi05", "pi0-fast", "molmoact2", "groot", "smolvla")
 """Act as they lie there. To the others' golden references a tokenizer or units are missing: they are made here."""
 MADE = {
     "openvla": write_openvla,

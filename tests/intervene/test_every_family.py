@@ -31,6 +31,7 @@ from probe_kit.intervene import (
 )
 from probe_kit.intervene.replay.conditions import Intervention
 from probe_kit.suite import Suite
+from tests.support.groot_checkpoints import write_groot
 from tests.support.internvla_checkpoints import write_checkpoint as write_internvla
 from tests.support.magma_checkpoints import write_checkpoint as write_magma
 from tests.support.molmoact2_checkpoints import write_molmoact2
@@ -60,6 +61,7 @@ FAMILIES = {
     "pi05": Tiny(write_pi05),
     "pi0-fast": Tiny(write_pi0_fast),
     "molmoact2": Tiny(write_molmoact2),
+    "groot": Tiny(write_groot),
     "smolvla": Tiny(golden="golden_smolvla"),
     "openvla": Tiny(write_openvla, options={"tokenizer": "bytes"}),
     "spatialvla": Tiny(write_spatialvla),

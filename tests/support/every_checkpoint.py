@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.support import (
+    groot_checkpoints,
     internvla_checkpoints,
     magma_checkpoints,
     molmoact2_checkpoints,
@@ -24,6 +25,7 @@ WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "pi05": (pi05_checkpoints.write_pi05, {}),
     "pi0-fast": (pi0_fast_checkpoints.write_pi0_fast, {}),
     "molmoact2": (molmoact2_checkpoints.write_molmoact2, {}),
+    "groot": (groot_checkpoints.write_groot, {}),
     "smolvla": (smolvla_checkpoints.write_smolvla, {}),
     "openvla": (prismatic_checkpoints.write_checkpoint, _BYTES),
     "prismatic": (prismatic_checkpoints.write_checkpoint, _BYTES),

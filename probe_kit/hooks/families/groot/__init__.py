@@ -1,0 +1,48 @@
+"""GR00T N1.7 through lerobot."""
+
+from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.sites import QUANTITIES
+from probe_kit.hooks.families.shared.capabilities import MERGED
+from probe_kit.hooks.family import Family
+
+BRIDGE = ("residual", "attention", "mlp")
+INTERVENTIONS = Interventions(
+    edits={"backbone": QUANTITIES, "bridge": BRIDGE, "expert": QUANTITIES},
+    gradients=True,
+    instead={
+        "kv": "its expert reads the end of the bridge, no keys and values of the backbone. Patch the last "
+        "`bridge` site for the whole prompt, and backbone sites for single roles",
+        "attention": "its expert attends to the end of the bridge, whose tokens have mixed. Patch `bridge` "
+        "sites of one role instead",
+        "tiles": f"{MERGED}Exchange all of `image`",
+    },
+)
+"""The expert reads the whole backbone through the bridge, also its last residual."""
+
+FAMILIES = (
+    Family(
+        "groot",
+        "GR00T N1.7 (Qwen3-VL cut behind layer 16, bridge, diffusion transformer) through lerobot",
+        None,
+        "probe_kit.hooks.families.groot.adapter:load_groot",
+        streams="backbone 17 layers, bridge 5 layers, expert 33 layers x 4 steps at the default size",
+        embodiment="as the checkpoint's statistics",
+        needs_checkpoint=True,
+        notes=(
+            "Pass a checkpoint of lerobot, or one in NVIDIA's own layout with -M embodiment=TAG. It names a "
+            "vision-language model, whose tokenizer and processor files are fetched, not its weights, or given as "
+            "-M vlm=FOLDER. No remote code. One observation per call: its bridge reads padding"
+        ),
+        verifier="probe_kit.hooks.families.groot.verify:verify_groot",
+        config_types=("groot", "Gr00tN1d7"),
+        words="probe_kit.hooks.families.groot.adapter:check_groot_words",
+        full_size="probe_kit.models.lerobot.groot:full_size_groot",
+        packages=(("diffusers", "groot"),),
+        options=(
+            Option("embodiment", str, "Tag in NVIDIA's layout, such as libero_sim.", "the only one"),
+            Option("vlm", str, "Folder or hub id of its Qwen3-VL; no weights.", "as config.json says"),
+        ),
+        interventions=INTERVENTIONS,
+    ),
+)

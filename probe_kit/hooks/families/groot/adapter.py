@@ -1,0 +1,365 @@
+"""The adapter for GR00T N1.7.
+
+Backbone: a chat with every picture, through the first layers of a Qwen3-VL. Bridge: a norm, then blocks that
+attend among all tokens of the chat. Expert: the state and the noisy actions, at every denoising step; its blocks
+attend by turns to the end of the bridge and to themselves.
+
+Source: arXiv 2503.14734 and the released GR00T N1.7, through lerobot's `GrootPolicy`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.hooks.capturing.gradients import frozen
+from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, side_files
+from probe_kit.hooks.contract.model import Tap
+from probe_kit.hooks.contract.observation import Observation, checked_picture
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.groot import BRIDGE, INTERVENTIONS
+from probe_kit.hooks.families.groot.checkpoint import GrootChoice, Places, is_nvidias, nvidias_config
+from probe_kit.hooks.families.groot.packing import PackedRow, Packing, padded_labels, read_steps
+from probe_kit.hooks.families.groot.units import BoundedUnits, action_units, state_units
+from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
+from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
+from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, LerobotPolicy
+from probe_kit.hooks.families.shared.lerobot.stacks import Stack
+from probe_kit.hooks.families.shared.qwen.tower import tower_tap
+from probe_kit.models.lerobot.groot import build_groot, flow_actions, network_config
+
+_MODEL = "_groot_model."
+_EMBEDDING = f"{_MODEL}backbone.model.model.language_model.embed_tokens.weight"
+_HEAD = f"{_MODEL}backbone.model.lm_head.weight"
+
+
+class DiffusersStack(Stack):
+    """Blocks of diffusers: what each adds is its one attention, to the prompt or itself, and its MLP."""
+
+    def tap(self, site: Site) -> Tap:
+        """As in other stacks, under diffusers' names."""
+        fires = self.iterations or 1
+        if site.layer == len(self.layers):
+            return super().tap(site)
+        block: Any = self.layers[site.layer]
+        if site.quantity == "mlp":
+            return Tap(block.ff, fires, "output")
+        if site.quantity == "attention":
+            return Tap(block.attn1, fires, "output")
+        return Tap(block.attn1.to_out[0], fires) if site.quantity == HEADS else super().tap(site)
+
+    def stream(self, name: str) -> Stream:
+        """What is stored of it."""
+        heads = int(self.layers[0].attn1.heads)  # type: ignore[union-attr, arg-type]
+        return Stream(name, len(self.layers) + 1, self.width, self.iterations, heads=heads)
+
+
+class BridgeStack(DiffusersStack):
+    """Blocks without a norm behind them; `norm` is the whole, whose output is the last residual."""
+
+    def tap(self, site: Site) -> Tap:
+        """The end is what the expert reads."""
+        return Tap(self.norm, 1, "output") if site.layer == len(self.layers) else super().tap(site)
+
+    def stream(self, name: str) -> Stream:
+        """What is stored of it."""
+        return Stream(name, len(self.layers) + 1, self.width, part="bridge", quantities=BRIDGE)
+
+
+class BackboneStack(Stack):
+    """Qwen's layers up to the cut."""
+
+    def stream(self, name: str) -> Stream:
+        """DeepStack adds pictures between its first blocks."""
+        return replace(super().stream(name), sums=False)
+
+
+class TowerStack(Stack):
+    """Qwen's vision tower, which runs over the patches of all pictures of an observation at once."""
+
+    def tap(self, site: Site) -> Tap:
+        """`norm` is the tower."""
+        return tower_tap(self.norm, site.layer, lambda patches: patches[None])
+
+    def stream(self, name: str) -> Stream:
+        """What enters each block, and the merger."""
+        return Stream(name, len(self.layers) + 1, self.width, part="vision", quantities=("residual",))
+
+
+class Groot(LerobotPolicy):
+    """A loaded GR00T N1.7. One observation per call: its bridge reads padding, which changes the actions."""
+
+    family = "groot"
+    config_type = "groot"
+    interventions = INTERVENTIONS
+    unread = (_HEAD,)
+
+    acting_stream = "expert"
+    other_roles: ClassVar[tuple[str, ...]] = ("language", "special")
+    suffix_roles = ("state", "action")
+    masked_cameras = 0
+
+    def __init__(self, network: Any, folder: Path) -> None:
+        super().__init__(network, folder)
+        names = ("backbone", "bridge", "expert") if "bridge" in self.stacks else ("backbone", "expert")
+        self.streams = {name: self.stacks[name].stream(name) for name in names}
+
+    # -- loading -----------------------------------------------------------------------------------------
+
+    @classmethod
+    def load(
+        cls,
+        checkpoint: str,
+        device: str = "cpu",
+        dtype: str | None = None,
+        random_weights: bool = False,
+        weights_seed: int = 0,
+        evaluation: Evaluation = AS_STORED,
+    ) -> Self:
+        """See `LerobotPolicy.load`. dtype: bfloat16 for lerobot's autocast around float32 weights."""
+        policy = super().load(checkpoint, device, dtype, random_weights, weights_seed, evaluation)
+        execute = min(int(policy.network._action_queue_steps), policy.chunk)
+        policy.card = replace(policy.card, chunk=policy.chunk, execute=execute, batch=1)
+        return policy
+
+    @classmethod
+    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+        """lerobot's configuration, also for NVIDIA's layout. Raises UsageError for an option that has no use."""
+        chosen = evaluation if isinstance(evaluation, GrootChoice) else GrootChoice()
+        if is_nvidias(folder):
+            config = nvidias_config(folder, chosen.embodiment)
+        elif chosen.embodiment is not None:
+            raise UsageError(
+                f"-M embodiment={chosen.embodiment} belongs to NVIDIA's layout; {folder} is lerobot's, which "
+                "names its own. Leave it out"
+            )
+        else:
+            config = super().parse_config(folder, evaluation)
+        config.vlm = chosen.vlm
+        return config
+
+    @classmethod
+    def build(cls, config: Any, folder: Path) -> nn.Module:
+        """lerobot's policy of the size that the base model's configuration has. Raises CheckpointError."""
+        if (asked := getattr(config, "dtype", None)) is not None:
+            config.use_bf16 = asked == "bfloat16"
+            config.model_params_fp32 = config.model_params_fp32 or asked == "float32"
+        config.dtype = "bfloat16" if config.use_bf16 else "float32"
+        config.places = Places.of(folder, config.base_model_path, config.vlm)
+        if (folder / config.base_model_path).is_dir():
+            config.base_model_path = str(config.places.base)
+        network: nn.Module = build_groot(
+            config, network_config(config.places.network, config, config.places.named)
+        )
+        return network
+
+    @classmethod
+    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """As lerobot stores them, also of NVIDIA's files; of the tied embeddings a file may hold either name."""
+        named = {name if name.startswith(_MODEL) else f"{_MODEL}{name}": own for name, own in tensors.items()}
+        if _HEAD in named and _EMBEDDING not in named:
+            named[_EMBEDDING] = named[_HEAD]
+        return named
+
+    def side_files(self) -> dict[str, Path]:
+        """Also those of the base model and of the vision-language model."""
+        places = self.config.places
+        return {**super().side_files(), **side_files(places.base, "base/"), **side_files(places.vlm, "vlm/")}
+
+    def further_settings(self) -> dict[str, str]:
+        """Whose statistics and weights are read."""
+        return {"embodiment": str(self.config.embodiment_tag)}
+
+    @cached_property
+    def _steps(self) -> Any:
+        return read_steps(self.folder, self.config)
+
+    def own_units(self, feature: str, kind: str) -> BoundedUnits:
+        """As lerobot's steps have them. Raises CheckpointError."""
+        del feature
+        if kind == "STATE":
+            return state_units(self._steps.pack, self._state_numbers, self._steps.source)
+        return action_units(self._steps.decode, self._action_numbers, self._steps.source)
+
+    @property
+    def predicts_relative(self) -> bool:
+        """Also by NVIDIA's statistics."""
+        return super().predicts_relative or bool(getattr(self._steps.decode, "use_relative_action", False))
+
+    # -- acting ------------------------------------------------------------------------------------------
+
+    @cached_property
+    def chunk(self) -> int:
+        """Actions of an inference that have a meaning for this embodiment."""
+        widest = torch.empty(1, self._head.action_horizon, 1)
+        length = int(self.network._resolve_prediction_horizon(widest))
+        own = (getattr(self._steps.decode, "modality_config", None) or {}).get("action", {}).get("delta_indices")
+        return min(length, len(own)) if own else length
+
+    @property
+    def _head(self) -> Any:
+        return self.network._groot_model.action_head
+
+    @property
+    def _action_numbers(self) -> int:
+        return int(self.config.output_features["action"].shape[0])
+
+    def batch(self, seen: Sequence[Observation], state: NDArray[np.float32] | None = None) -> dict[str, Tensor]:
+        """What lerobot's processors pack of one observation. state: (1, numbers) as the network reads them."""
+        (row,) = self._rows(seen, self.state(seen) if state is None else state)
+        return {name: tensor.to(self.config.device) for name, tensor in row.inputs.items()}
+
+    def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """The end of the flow from the noise of the seeds."""
+        chunk: NDArray[np.float32] = self.infer(batch, self.noise(seeds)).float().cpu().numpy()
+        return chunk
+
+    def infer(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
+        """(B, chunk, D) normalised actions from noise (B, horizon, widest action)."""
+        with torch.inference_mode():
+            return self._of_robot(flow_actions(self.network, batch, noise))
+
+    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
+        """The actions of `act`, bit for bit, with a graph of the whole flow; see the contract."""
+        self.check(seen, seeds)
+        if (reason := self._action_misfit()) is not None:
+            raise CheckpointError(reason)
+        with frozen(self.network):
+            own = self._of_robot(flow_actions(self.network, self.batch(seen), self.noise(seeds))).float()
+            units, values = self.own_units("action", "ACTION"), own.detach().cpu().numpy()
+            metres, slopes = (torch.from_numpy(of(values)).to(own.device) for of in (units.restore, units.slopes))
+            return metres + slopes * (own - own.detach())
+
+    def _of_robot(self, actions: Tensor) -> Tensor:
+        """The steps and numbers that this embodiment has."""
+        return actions[:, : self.chunk, : self._action_numbers]
+
+    def noise(self, seeds: Sequence[int]) -> Tensor:
+        """(B, horizon, widest action) float32 noise, a row per seed, the same on every device."""
+        return seeded_noise(seeds, (self._head.action_horizon, self._head.action_dim), self.config.device)
+
+    # -- the prompt --------------------------------------------------------------------------------------
+
+    @cached_property
+    def packing(self) -> Packing:
+        """lerobot's packing."""
+        return Packing(self._steps, self.config.places.vlm)
+
+    @cached_property
+    def tokenizer(self) -> Any:
+        """The vision-language model's."""
+        return self.packing.tokenizer
+
+    def _rows(self, seen: Sequence[Observation], state: NDArray[np.float32]) -> list[PackedRow]:
+        pictures = [
+            {camera: checked_picture(one.image if camera == self.cameras[0] else one.cameras[camera])
+             for camera in self.shown}
+            for one in seen
+        ]  # fmt: skip
+        rows = zip(pictures, seen, state, strict=True)
+        return [self.packing.row(shown, one.instruction, own) for shown, one, own in rows]
+
+    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """From the packing itself; the bridge has the backbone's tokens."""
+        rows = self._rows(seen, np.zeros((len(seen), self._state_numbers), np.float32))
+        prompt = [Roles.from_labels(labels) for labels in padded_labels(rows)]
+        suffix = [Roles.from_labels(self.suffix_labels())] * len(rows)
+        found = {"backbone": prompt, "bridge": prompt, "expert": suffix}
+        return {name: found[name] for name in self.streams}
+
+    def prefix_labels(self, language: Sequence[str]) -> list[str]:
+        """The packing says every position."""
+        return list(language)
+
+    def suffix_labels(self) -> list[str]:
+        """The state, then the network's whole horizon."""
+        return ["state", *["action"] * int(self._head.action_horizon)]
+
+    @classmethod
+    def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
+        """Raise InstructionError for a text without words, from configuration and tokenizer alone."""
+        text = cls.__new__(cls)  # what packs needs no network
+        text.folder = checkpoint_folder(checkpoint)
+        text.config = cls._read_config(text.folder, evaluation)
+        text.config.places = Places.of(text.folder, text.config.base_model_path, text.config.vlm)
+        text.cameras = text.shown = (next(iter(text.config.image_features)).removeprefix(IMAGES),)
+        text.token_ids(instructions)
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each instruction, as the chat holds it."""
+        size = tuple(self.config.image_features[f"{IMAGES}{self.cameras[0]}"].shape[-2:])
+        blank = {camera: np.zeros((*size, 3), np.uint8) for camera in self.shown}
+        rows = [self.packing.row(blank, text, np.zeros(self._state_numbers, np.float32)) for text in instructions]
+        return [
+            tuple(
+                one
+                for one, label in zip(row.inputs["input_ids"][0].tolist(), row.labels, strict=True)
+                if label == "language"
+            )
+            for row in rows
+        ]
+
+    # -- capture -----------------------------------------------------------------------------------------
+
+    def _show(self, cameras: tuple[str, ...]) -> None:
+        self.shown = cameras
+        self.further_streams = {"vision": self.stacks["vision"].stream("vision")}
+        prompt = (*(f"image.{camera}" for camera in cameras), *self.other_roles, PADDING)
+        self.role_names = {"backbone": prompt, "bridge": prompt, "expert": self.suffix_roles}
+        if "bridge" not in self.stacks:
+            del self.role_names["bridge"]
+
+    def _stacks(self) -> dict[str, Stack]:
+        backbone, head = self.network._groot_model.backbone, self._head
+        text, tower, dit = backbone.language_model, backbone.visual, head.model
+        steps = int(head.num_inference_timesteps)
+        stacks = {
+            # What the bridge's norm reads is the end of the backbone: Qwen's own last norm is not read.
+            "backbone": BackboneStack(text.layers, head.vlln, int(text.config.hidden_size), None),
+            "expert": DiffusersStack(dit.transformer_blocks, dit.norm_out, int(dit.inner_dim), steps, "norm1"),
+            "vision": TowerStack(tower.blocks, tower, int(backbone.model.config.vision_config.hidden_size), None),
+        }
+        if (blocks := getattr(head.vl_self_attention, "transformer_blocks", None)) is not None:
+            width = int(head.vl_self_attention.inner_dim)
+            stacks["bridge"] = BridgeStack(blocks, head.vl_self_attention, width, None, "norm1")
+        return stacks
+
+    def tap(self, site: Site) -> Tap:
+        """The first norm of the block the site enters, the norm behind the last, or what a block adds."""
+        self.stream_of(site)
+        return self.stacks[site.stream].tap(site)
+
+
+def load_groot(
+    checkpoint: str,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    embodiment: str | None = None,
+    vlm: str | None = None,
+    weights_seed: int = 0,
+) -> Groot:
+    """Load a GR00T N1.7 checkpoint of lerobot, or in NVIDIA's own layout; see `LerobotPolicy.load`.
+
+    embodiment: tag of NVIDIA's layout; None where there is one only. vlm: folder or hub id of the vision-language
+    model's configuration, tokenizer and processor, where not the one that the checkpoint names.
+    """
+    chosen = GrootChoice(embodiment=embodiment, vlm=vlm)
+    return Groot.load(checkpoint, device, dtype, random_weights, weights_seed, chosen)
+
+
+def check_groot_words(
+    checkpoint: str, instructions: Sequence[str], embodiment: str | None = None, vlm: str | None = None
+) -> None:
+    """See `Family.words`."""
+    Groot.check_words(checkpoint, instructions, GrootChoice(embodiment=embodiment, vlm=vlm))

@@ -1,0 +1,101 @@
+"""The two layouts of a GR00T checkpoint: lerobot's, and NVIDIA's own."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.groot.configuration_groot import GrootConfig, is_raw_groot_n1_7_checkpoint
+from lerobot.policies.groot.utils import stat_dim_from_entry
+
+from probe_kit._system.bounded_json import read_json_object
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES, checkpoint_folder
+from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
+from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
+from probe_kit.models.lerobot.groot import VLM
+
+_AGAIN = "Download the checkpoint again"
+_NEEDED = ("processor_config.json", "statistics.json", "embodiment_id.json")
+
+
+@dataclass(frozen=True)
+class GrootChoice(Evaluation):
+    """What the files of GR00T do not say. embodiment: of NVIDIA's layout. vlm: folder or hub id."""
+
+    embodiment: str | None = None
+    vlm: str | None = None
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where the parts of a checkpoint lie. network: content of the network's `config.json`. base, vlm: folders.
+
+    named: the vision-language model as the network's configuration is to name it.
+    """
+
+    network: Mapping[str, Any]
+    base: Path
+    vlm: Path
+    named: str
+
+    @classmethod
+    def of(cls, folder: Path, base: str, vlm: str | None) -> "Places":
+        """base: as the policy's configuration names it, a folder in the checkpoint or a hub id. vlm: another one.
+
+        Raises CheckpointError for what is not there.
+        """
+        place = inside_or_hub(folder, base)
+        content = read_json_object(place / CONFIG_FILE, CheckpointError, _AGAIN)
+        named = str(content.get("model_name", VLM))
+        files = inside_or_hub(place, vlm or named)
+        return cls(content, place, files, VLM if named.rstrip("/") == VLM else str(files))
+
+
+def inside_or_hub(folder: Path, named: str) -> Path:
+    """A folder in `folder`, one anywhere, or the small files of a hub id."""
+    inside = folder / named
+    return inside if inside.is_dir() else checkpoint_folder(named, SMALL_FILES)
+
+
+def is_nvidias(folder: Path) -> bool:
+    """Whether a folder has NVIDIA's layout."""
+    return bool(is_raw_groot_n1_7_checkpoint(folder))
+
+
+def nvidias_config(folder: Path, embodiment: str | None) -> GrootConfig:
+    """lerobot's configuration for a checkpoint in NVIDIA's layout.
+
+    embodiment: its tag; None where the files have one only. Raises CheckpointError for missing files, UsageError
+    for a tag that they do not have.
+    """
+    content = {name: read_json_object(folder / name, CheckpointError, _AGAIN) for name in _NEEDED}
+    modalities = content["processor_config.json"].get("processor_kwargs", {}).get("modality_configs", {})
+    statistics = content["statistics.json"]
+    tags = sorted(set(modalities) & set(statistics) & set(content["embodiment_id.json"]))
+    tag = tags[0] if embodiment is None and len(tags) == 1 else embodiment
+    if tag is None or tag not in tags:
+        asked = "no embodiment was chosen" if embodiment is None else f"there is no embodiment {embodiment!r}"
+        raise UsageError(f"{folder}: {asked}. Choose with -M embodiment=TAG; it has {', '.join(tags) or 'none'}")
+    network = read_json_object(folder / CONFIG_FILE, CheckpointError, _AGAIN)
+    widths = {
+        feature: sum(stat_dim_from_entry(statistics[tag].get(feature, {}).get(key, {})) for key in own)
+        for feature in ("state", "action")
+        for own in [modalities[tag].get(feature, {}).get("modality_keys", [])]
+    }
+    if not all(widths.values()):
+        raise CheckpointError(f"{folder}: statistics.json has no numbers for state or action of {tag!r}. {_AGAIN}")
+    cameras = modalities[tag].get("video", {}).get("modality_keys", [])
+    return GrootConfig(
+        device="cpu",
+        base_model_path=str(folder),
+        embodiment_tag=tag,
+        max_state_dim=network.get("max_state_dim", 132),
+        max_action_dim=network.get("max_action_dim", 132),
+        input_features={
+            **{f"{IMAGES}{camera}": PolicyFeature(FeatureType.VISUAL, (3, 256, 256)) for camera in cameras},
+            STATE: PolicyFeature(FeatureType.STATE, (widths["state"],)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (widths["action"],))},
+    )
