@@ -135,6 +135,11 @@ def golden_groot() -> Path:
 
 
 @pytest.fixture(scope="session")
+def golden_xvla() -> Path:
+    return _golden("xvla")
+
+
+@pytest.fixture(scope="session")
 def golden_smolvla() -> Path:
     return _golden("smolvla")
 

@@ -25,6 +25,7 @@ FOLDERS = (
     "pi0_fast",
     "molmoact2",
     "groot",
+    "xvla",
     "smolvla",
     "openvla",
     "spatialvla",

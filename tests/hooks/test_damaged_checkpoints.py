@@ -32,6 +32,7 @@ FOLDERS = {
     "pi0-fast": GOLDEN / "pi0_fast" / "checkpoint",
     "molmoact2": GOLDEN / "molmoact2" / "checkpoint",
     "groot": GOLDEN / "groot" / "checkpoint",
+    "xvla": GOLDEN / "xvla" / "checkpoint",
     "smolvla": GOLDEN / "smolvla" / "checkpoint",
     "openvla": GOLDEN / "openvla" / "checkpoint",
     "magma": GOLDEN / "magma" / "checkpoint",
@@ -40,7 +41,7 @@ FOLDERS = {
     "internvla-m1": GOLDEN / "internvla_m1" / "checkpoint",
 }
 REFUSALS = (CheckpointError, WeightsError)
-COPIED = ("pi0-tiny", "pi0", "pi05", "pi0-fast", "molmoact2", "groot", "smolvla")
+COPIED = ("pi0-tiny", "pi0", "pi05", "pi0-fast", "molmoact2", "groot", "xvla", "smolvla")
 """Act as they lie there. To the others' golden references a tokenizer or units are missing: they are made here."""
 MADE = {
     "openvla": write_openvla,

@@ -40,6 +40,7 @@ from tests.support.pi05_checkpoints import write_pi05
 from tests.support.prismatic_checkpoints import write_checkpoint as write_openvla
 from tests.support.spatialvla_checkpoints import write_checkpoint as write_spatialvla
 from tests.support.xiaomi_checkpoints import write_checkpoint as write_xiaomi
+from tests.support.xvla_checkpoints import write_xvla
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:the model put out tokens")]
 ITEMS = 6
@@ -62,6 +63,7 @@ FAMILIES = {
     "pi0-fast": Tiny(write_pi0_fast),
     "molmoact2": Tiny(write_molmoact2),
     "groot": Tiny(write_groot),
+    "xvla": Tiny(write_xvla),
     "smolvla": Tiny(golden="golden_smolvla"),
     "openvla": Tiny(write_openvla, options={"tokenizer": "bytes"}),
     "spatialvla": Tiny(write_spatialvla),

@@ -17,6 +17,7 @@ from tests.support import (
     spatialvla_checkpoints,
     vlm_checkpoints,
     xiaomi_checkpoints,
+    xvla_checkpoints,
 )
 
 _BYTES = {"tokenizer": "bytes"}
@@ -26,6 +27,7 @@ WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "pi0-fast": (pi0_fast_checkpoints.write_pi0_fast, {}),
     "molmoact2": (molmoact2_checkpoints.write_molmoact2, {}),
     "groot": (groot_checkpoints.write_groot, {}),
+    "xvla": (xvla_checkpoints.write_xvla, {}),
     "smolvla": (smolvla_checkpoints.write_smolvla, {}),
     "openvla": (prismatic_checkpoints.write_checkpoint, _BYTES),
     "prismatic": (prismatic_checkpoints.write_checkpoint, _BYTES),

@@ -1,0 +1,45 @@
+"""X-VLA through lerobot."""
+
+from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.families.shared.capabilities import MERGED
+from probe_kit.hooks.family import Family
+
+BLOCK = ("residual", "attention", "mlp")
+INTERVENTIONS = Interventions(
+    edits={"backbone": BLOCK, "expert": BLOCK},
+    gradients=True,
+    instead={
+        "kv": "its expert reads the end of the backbone as tokens of its own, no keys and values. Patch the last "
+        "`backbone` site for the whole, and roles of `expert` sites for single pictures and words",
+        "attention": "its expert attends to the prompt's tokens inside its own sequence. Patch `expert` sites of "
+        "one role instead",
+        "tiles": f"{MERGED}Exchange all of `image`",
+    },
+)
+"""All cameras but the first reach the expert past the backbone."""
+
+FAMILIES = (
+    Family(
+        "xvla",
+        "X-VLA (Florence-2 encoder, soft-prompted transformer) through lerobot",
+        None,
+        "probe_kit.hooks.families.xvla.adapter:load_xvla",
+        streams="backbone 13 layers, expert 25 layers x 10 steps with Florence-2 large",
+        embodiment="as the checkpoint's action space; the released ones are absolute poses",
+        needs_checkpoint=True,
+        notes=(
+            "Pass a checkpoint in lerobot's layout. Its configuration holds Florence-2's; the tokenizer "
+            "facebook/bart-large is fetched where no tokenizer.json lies beside it. -M domain=N chooses the soft "
+            "prompts of another robot. Absolute poses cannot act here: --no-act"
+        ),
+        verifier="probe_kit.hooks.families.xvla.verify:verify_xvla",
+        config_types=("xvla",),
+        words="probe_kit.hooks.families.xvla.adapter:check_xvla_words",
+        full_size="probe_kit.models.lerobot.xvla:full_size_xvla",
+        options=(
+            Option("domain", int, "Number of the robot's soft prompts.", "as policy_preprocessor.json says"),
+        ),
+        interventions=INTERVENTIONS,
+    ),
+)

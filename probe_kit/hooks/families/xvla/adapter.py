@@ -1,0 +1,299 @@
+"""The adapter for X-VLA.
+
+Backbone: Florence-2's encoder over the first camera's picture and the text. Expert: one sequence of the noisy
+actions, the end of the backbone, the further cameras and the robot's soft prompts, at every denoising step; all
+attend to all. Florence-2 norms behind each addition, so nothing in the backbone's stream only adds.
+
+Source: arXiv 2510.10274, through lerobot's `XVLAPolicy`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from lerobot.utils.constants import IMAGENET_STATS
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from probe_kit.errors import CheckpointError, ObservationError, UsageError
+from probe_kit.hooks.capturing.gradients import frozen
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, side_files
+from probe_kit.hooks.contract.model import Tap
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
+from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
+from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE, LerobotPolicy
+from probe_kit.hooks.families.shared.lerobot.stacks import Stack
+from probe_kit.hooks.families.xvla import BLOCK, INTERVENTIONS
+from probe_kit.hooks.families.xvla.steps import XvlaSteps, read_steps
+from probe_kit.models.lerobot.xvla import build_xvla, current_xvla_keys, denoised_actions
+
+SOFT_PROMPT = "soft_prompt"
+"""The role of the robot's learned tokens."""
+
+
+@dataclass(frozen=True)
+class XvlaChoice(Evaluation):
+    """What the files of X-VLA may not say. domain: the robot's number."""
+
+    domain: int | None = None
+
+
+class PostNormStack(Stack):
+    """Blocks that norm behind each addition: `residual` is the normed stream; `norm` is the last block."""
+
+    def tap(self, site: Site) -> Tap:
+        """The input of a block; behind the last, its output."""
+        if site.layer == len(self.layers):
+            return Tap(self.norm, 1, "output")
+        block: Any = self.layers[site.layer]
+        if site.quantity == "mlp":
+            return Tap(block.fc2, 1, "output")
+        if site.quantity in ("attention", HEADS):
+            return Tap(block.self_attn.out_proj, 1, "output" if site.quantity == "attention" else "input")
+        return Tap(block, 1)
+
+    def stream(self, name: str) -> Stream:
+        """What is stored of it."""
+        heads = int(self.layers[0].self_attn.num_heads)  # type: ignore[union-attr, arg-type]
+        return Stream(name, len(self.layers) + 1, self.width, quantities=BLOCK, sums=False, heads=heads)
+
+
+class SoftPromptedStack(Stack):
+    """The expert's whole sequence; `norm` is the last block, as the norm behind it reads the actions alone."""
+
+    def tap(self, site: Site) -> Tap:
+        """The first norm of a block; behind the last, its output."""
+        fires = self.iterations or 1
+        if site.layer == len(self.layers):
+            return Tap(self.norm, fires, "output")
+        block: Any = self.layers[site.layer]
+        if site.quantity in ("attention", "mlp"):
+            return Tap(block.attn if site.quantity == "attention" else block.mlp, fires, "output")
+        return Tap(block.attn.proj if site.quantity == HEADS else block.norm1, fires)
+
+    def stream(self, name: str) -> Stream:
+        """What is stored of it."""
+        heads = int(self.layers[0].attn.num_heads)  # type: ignore[union-attr, arg-type]
+        return Stream(name, len(self.layers) + 1, self.width, self.iterations, quantities=BLOCK, heads=heads)
+
+
+class Xvla(LerobotPolicy):
+    """A loaded X-VLA."""
+
+    family = "xvla"
+    config_type = "xvla"
+    interventions = INTERVENTIONS
+
+    acting_stream = "expert"
+    other_roles: ClassVar[tuple[str, ...]] = ("language", "special")
+    suffix_roles = ("action", SOFT_PROMPT)
+
+    # -- loading -----------------------------------------------------------------------------------------
+
+    @classmethod
+    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+        """lerobot's configuration, with what the processor files say."""
+        config = super().parse_config(folder, evaluation)
+        if config.type == cls.config_type:
+            config.steps = read_steps(folder, evaluation.domain if isinstance(evaluation, XvlaChoice) else None)
+            config.tokenizer_max_length = config.steps.length or config.tokenizer_max_length
+        return config
+
+    @classmethod
+    def build(cls, config: Any, folder: Path) -> nn.Module:
+        """lerobot's policy. Raises CheckpointError for a state that it would cut, UsageError for no such robot."""
+        numbers = config.robot_state_feature.shape[0] if config.robot_state_feature else 0
+        if config.use_proprio and numbers > config.max_state_dim:
+            raise CheckpointError(
+                f"{folder} has a state of {numbers} numbers and reads {config.max_state_dim}: lerobot leaves out "
+                "the rest. Take the original configuration"
+            )
+        if not 0 <= config.steps.domain < config.num_domains:
+            raise UsageError(
+                f"-M domain={config.steps.domain}: {folder} has the robots 0 to {config.num_domains - 1}"
+            )
+        network: nn.Module = build_xvla(config)
+        return network
+
+    @classmethod
+    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Also those of files with Florence-2 in its authors' layout."""
+        return current_xvla_keys(tensors)
+
+    @property
+    def steps(self) -> XvlaSteps:
+        """What the processor files say besides units."""
+        found: XvlaSteps = self.config.steps
+        return found
+
+    def further_settings(self) -> dict[str, str]:
+        """Whose soft prompts are read."""
+        return {"domain": str(self.steps.domain)}
+
+    def side_files(self) -> dict[str, Path]:
+        """Also the tokenizer, where it is another folder's."""
+        place = self._tokenizer_folder
+        return {**super().side_files(), **({} if place == self.folder else side_files(place, "tokenizer/"))}
+
+    @property
+    def _tokenizer_folder(self) -> Path:
+        named = self.steps.tokenizer or self.config.tokenizer_name
+        inside = (self.folder / "tokenizer.json").is_file()
+        return self.folder if inside else checkpoint_folder(named, SMALL_FILES)
+
+    @cached_property
+    def tokenizer(self) -> Any:
+        """Of the folder itself, or the one it names."""
+        from transformers import AutoTokenizer
+
+        return AutoTokenizer.from_pretrained(str(self._tokenizer_folder), trust_remote_code=False)
+
+    def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
+        """The instructions as they are."""
+        del state
+        return list(instructions)
+
+    # -- acting ------------------------------------------------------------------------------------------
+
+    def batch(self, seen: Sequence[Observation], state: NDArray[np.float32] | None = None) -> dict[str, Tensor]:
+        """In lerobot's keys, as its processors leave them. state: (B, numbers) as the network reads them."""
+        batch = super().batch(seen, state)
+        mean, deviation = (torch.tensor(IMAGENET_STATS[name]).view(3, 1, 1) for name in ("mean", "std"))
+        for camera in self.shown:
+            picture = batch[f"{IMAGES}{camera}"]
+            expected = tuple(self.config.image_features[f"{IMAGES}{camera}"].shape[-2:])
+            if self.config.resize_imgs_with_padding is None and tuple(picture.shape[-2:]) != expected:
+                raise ObservationError(
+                    f"the picture of {camera} is {tuple(picture.shape[-2:])}; this checkpoint resizes nothing and "
+                    f"expects {expected}"
+                )
+            if self.steps.imagenet:
+                batch[f"{IMAGES}{camera}"] = (picture - mean.to(picture)) / deviation.to(picture)
+        if not self.config.use_proprio:
+            del batch[STATE]
+        batch["domain_id"] = torch.full((len(seen),), self.steps.domain, device=self.config.device)
+        return batch
+
+    def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
+        """The end of the denoising from the noise of the seeds."""
+        chunk: NDArray[np.float32] = self.infer(batch, self.noise(seeds)).float().cpu().numpy()
+        return chunk
+
+    def infer(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
+        """(B, chunk, D) actions from noise (B, chunk, widest action)."""
+        with torch.inference_mode():
+            return denoised_actions(self.network, batch, noise)
+
+    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
+        """The actions of `act`, bit for bit, with a graph of the whole denoising; see the contract."""
+        self.check(seen, seeds)
+        if (reason := self._action_misfit()) is not None:
+            raise CheckpointError(reason)
+        with frozen(self.network):
+            own = denoised_actions(self.network, self.batch(seen), self.noise(seeds)).float()
+            metres = torch.from_numpy(self.action_units.restore(own.detach().cpu().numpy())).to(own.device)
+            slope = torch.from_numpy(self.action_units.slope(own.shape[-1])).to(own.device)
+            return metres + slope * (own - own.detach())
+
+    def noise(self, seeds: Sequence[int]) -> Tensor:
+        """(B, chunk, widest action) float32 noise, a row per seed, the same on every device."""
+        return seeded_noise(seeds, (self.config.chunk_size, self.network.model.dim_action), self.config.device)
+
+    # -- the sequences -----------------------------------------------------------------------------------
+
+    @property
+    def masked_cameras(self) -> int:
+        """Views without a picture, whose zeros the expert attends to: their role is `special`."""
+        return int(self.config.num_image_views) - len(self.shown)
+
+    @cached_property
+    def tokens_per_camera(self) -> int:
+        """The mean of a picture, then its patches."""
+        first = self.config.image_features[f"{IMAGES}{self.cameras[0]}"].shape[-2:]
+        vision = self.network.model.vlm.config.vision_config
+        sides: list[int] = []
+        for side in self.config.resize_imgs_with_padding or first:
+            for patch, stride, padding in zip(
+                vision.patch_size, vision.patch_stride, vision.patch_padding, strict=True
+            ):
+                side = (side + 2 * padding - patch) // stride + 1
+            sides.append(side)
+        return 1 + sides[0] * sides[1]
+
+    def text_labels(self, ids: Sequence[int], valid: Sequence[bool]) -> list[str]:
+        """Padding is `special`: the network attends to it."""
+        labels = super().text_labels(ids, valid)
+        return ["special" if label == PADDING else label for label in labels]
+
+    def prefix_labels(self, language: Sequence[str]) -> list[str]:
+        """The first camera's picture, then the text."""
+        return [*[f"image.{self.shown[0]}"] * self.tokens_per_camera, *language]
+
+    def suffix_labels(self) -> list[str]:
+        """The chunk; what follows depends on the text."""
+        return ["action"] * int(self.config.chunk_size)
+
+    def packed_roles(self, tokens: Tensor, mask: Tensor) -> dict[str, list[Roles]]:
+        """The backbone's tokens once more in the expert, between actions, further cameras and soft prompts."""
+        prompts = [
+            self.prefix_labels(self.text_labels(row, valid))
+            for row, valid in zip(tokens.tolist(), mask.tolist(), strict=True)
+        ]
+        further = [f"image.{camera}" for camera in self.shown[1:]] + ["special"] * self.masked_cameras
+        views = [label for label in further for _ in range(self.tokens_per_camera)]
+        ends = [*views, *[SOFT_PROMPT] * int(self.config.len_soft_prompts)]
+        return {
+            "backbone": [Roles.from_labels(prompt) for prompt in prompts],
+            "expert": [Roles.from_labels([*self.suffix_labels(), *prompt, *ends]) for prompt in prompts],
+        }
+
+    def _show(self, cameras: tuple[str, ...]) -> None:
+        self.shown, self.further_streams = cameras, {}
+        views = tuple(f"image.{camera}" for camera in cameras)
+        self.role_names = {
+            "backbone": (views[0], *self.other_roles),
+            "expert": ("action", *views, *self.other_roles, SOFT_PROMPT),
+        }
+
+    def _stacks(self) -> dict[str, Stack]:
+        encoder, expert = self.network.model.vlm.language_model.encoder, self.network.model.transformer
+        steps = max(1, int(self.config.num_denoising_steps))
+        width = int(encoder.config.d_model)
+        return {
+            "backbone": PostNormStack(encoder.layers, encoder.layers[-1], width, None),
+            "expert": SoftPromptedStack(expert.blocks, expert.blocks[-1], int(expert.hidden_size), steps, "norm1"),
+        }
+
+    def tap(self, site: Site) -> Tap:
+        """See the stacks."""
+        self.stream_of(site)
+        return self.stacks[site.stream].tap(site)
+
+
+def load_xvla(
+    checkpoint: str,
+    device: str = "cpu",
+    dtype: str | None = None,
+    random_weights: bool = False,
+    *,
+    domain: int | None = None,
+    weights_seed: int = 0,
+) -> Xvla:
+    """Load a lerobot X-VLA checkpoint; see `LerobotPolicy.load`.
+
+    domain: number of the robot's soft prompts; None for the one that the processor files name.
+    """
+    return Xvla.load(checkpoint, device, dtype, random_weights, weights_seed, XvlaChoice(domain=domain))
+
+
+def check_xvla_words(checkpoint: str, instructions: Sequence[str], domain: int | None = None) -> None:
+    """See `Family.words`."""
+    Xvla.check_words(checkpoint, instructions, XvlaChoice(domain=domain) if domain is not None else AS_STORED)

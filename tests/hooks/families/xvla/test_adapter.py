@@ -1,0 +1,304 @@
+"""X-VLA keeps the contract, and gives the actions of lerobot's own loading, processors and sampling."""
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies.xvla.modeling_xvla import XVLAPolicy
+from lerobot.processor import PolicyProcessorPipeline
+from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
+from safetensors.torch import load_file, save_file
+
+from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError, WeightsError
+from probe_kit.hooks import Observation, Site, capture, edit
+from probe_kit.hooks.families.xvla.adapter import Xvla, check_xvla_words, load_xvla
+from probe_kit.hooks.testing import AdapterContract
+from probe_kit.models.lerobot import xvla as network
+from tests.support.xvla_checkpoints import CHUNK, DOMAIN, DOMAINS, TEXT, to_authors_layout, write_xvla
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_xvla(tmp_path_factory.mktemp("xvla"))
+
+
+@pytest.fixture(scope="module")
+def xvla(folder: Path) -> Xvla:
+    return load_xvla(str(folder))
+
+
+@pytest.fixture
+def seen(xvla: Xvla) -> list[Observation]:
+    (one,) = AdapterContract.examples(xvla, "Put the cube on the star")
+    picture = np.random.default_rng(0).integers(0, 256, (48, 80, 3), np.uint8)
+    return [replace(one, image=picture, state=np.linspace(-0.2, 0.7, 8, dtype=np.float32))]
+
+
+class TestXvla(AdapterContract):
+    family = "xvla"
+
+    @pytest.fixture(scope="class")
+    def checkpoint(self, folder: Path) -> Path:
+        return folder
+
+    @pytest.fixture
+    def policy(self, xvla: Xvla) -> Xvla:
+        return xvla
+
+    @pytest.fixture
+    def other_options(self) -> Mapping[str, Any]:
+        return {"domain": 1}
+
+
+def lerobots(folder: Path) -> tuple[XVLAPolicy, Any, Any]:
+    """lerobot's own policy and saved processors."""
+    before = PolicyProcessorPipeline.from_pretrained(
+        folder, "policy_preprocessor.json", overrides={"tokenizer_processor": {"tokenizer_name": str(folder)}}
+    )
+    behind: Any = PolicyProcessorPipeline.from_pretrained(
+        folder,
+        "policy_postprocessor.json",
+        to_transition=policy_action_to_transition,
+        to_output=transition_to_policy_action,
+    )
+    return XVLAPolicy.from_pretrained(str(folder)), before, behind
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_actions_are_those_of_lerobots_own_loading_processors_and_sampling_bit_for_bit(
+    folder: Path, tmp_path: Path, seen: list[Observation], dtype: str
+) -> None:
+    """From the raw picture and state to metres, with noise that lerobot draws itself of the same seed."""
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    text = (tmp_path / "config.json").read_text(encoding="utf-8")
+    (tmp_path / "config.json").write_text(text.replace('"float32"', f'"{dtype}"'), encoding="utf-8")
+    ours = load_xvla(str(tmp_path))
+    assert ours.card.dtype == dtype
+    policy, before, behind = lerobots(tmp_path)
+    (one,) = seen
+    packed = before(
+        {
+            "observation.images.image": torch.from_numpy(one.image).permute(2, 0, 1),
+            "observation.state": torch.from_numpy(np.asarray(one.state, np.float32)),
+            "task": one.instruction,
+        }
+    )
+    own = ours.batch(seen)
+    for name in ("observation.images.image", "observation.language.tokens", "domain_id"):
+        torch.testing.assert_close(own[name], packed[name], rtol=0, atol=0)
+    torch.testing.assert_close(own["observation.state"], packed["observation.state"], rtol=0, atol=1e-6)
+    torch.manual_seed(7)
+    theirs = policy.predict_action_chunk({**packed, "observation.state": own["observation.state"]})
+    torch.manual_seed(7)
+    drawn = torch.randn(1, CHUNK, 9, dtype=torch.float32 if dtype == "float32" else torch.bfloat16)
+    torch.testing.assert_close(ours.infer(own, drawn), theirs, rtol=0, atol=0)
+    metres = behind(theirs.float()).numpy()
+    assert metres.shape == (1, CHUNK, 7)
+    np.testing.assert_allclose(ours.action_units.restore(theirs.float().numpy()), metres, atol=1e-6)
+    if dtype == "float32":
+        np.testing.assert_allclose(ours.act(seen, [7]), metres, atol=1e-6)
+    assert theirs.abs().max() > 0.1
+
+
+def test_select_action_of_lerobot_gives_the_first_actions(
+    folder: Path, xvla: Xvla, seen: list[Observation]
+) -> None:
+    policy, _, behind = lerobots(folder)
+    torch.manual_seed(3)
+    actions = [behind(policy.select_action(xvla.batch(seen))).numpy() for _ in range(2)]
+    np.testing.assert_allclose(xvla.act(seen, [3])[:, :2], np.stack(actions, 1), atol=1e-6)
+
+
+def test_lerobot_ignores_the_noise_that_it_is_given_and_the_adapter_does_not(
+    folder: Path, xvla: Xvla, seen: list[Observation]
+) -> None:
+    policy, _, _ = lerobots(folder)
+    batch, chunks = xvla.batch(seen), []
+    for seed in (0, 1):
+        torch.manual_seed(5)
+        chunks.append(policy.predict_action_chunk(batch, noise=xvla.noise([seed])))
+    assert torch.equal(*chunks)
+    assert not torch.equal(*(xvla.infer(batch, xvla.noise([seed])) for seed in (0, 1)))
+
+
+def test_files_of_2025_have_florence_in_its_authors_layout(
+    folder: Path, tmp_path: Path, xvla: Xvla, seen: list[Observation]
+) -> None:
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    to_authors_layout(tmp_path)
+    assert "model.vlm.image_projection" in load_file(tmp_path / "model.safetensors")
+    np.testing.assert_array_equal(load_xvla(str(tmp_path)).act(seen, [0]), xvla.act(seen, [0]))
+
+
+@pytest.mark.parametrize(
+    ("name", "missing"),
+    [("encoder.embed_tokens", False), ("language_model.shared", False), ("soft_prompt_hub", True)],
+)
+def test_weights_must_be_whole_but_tied_embeddings_may_have_either_name(
+    folder: Path, tmp_path: Path, xvla: Xvla, seen: list[Observation], name: str, missing: bool
+) -> None:
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    tensors = network.current_xvla_keys(load_file(tmp_path / "model.safetensors"))
+    kept = {key: own.clone() for key, own in tensors.items() if name not in key}
+    assert len(kept) == len(tensors) - 1
+    save_file(kept, tmp_path / "model.safetensors")
+    if missing:
+        with pytest.raises(WeightsError, match=name):
+            load_xvla(str(tmp_path))
+    else:
+        np.testing.assert_array_equal(load_xvla(str(tmp_path)).act(seen, [0]), xvla.act(seen, [0]))
+
+
+def test_the_expert_reads_the_end_of_the_backbone_as_tokens_of_its_own(
+    xvla: Xvla, seen: list[Observation]
+) -> None:
+    """Zeros there change what enters the expert at the prompt's positions, and nowhere else."""
+    first, end = Site("expert", 0, iteration=0), xvla.streams["backbone"].sites()[-1]
+    with capture(xvla, [first]) as plain:
+        xvla.act(seen, [0])
+    with edit(xvla, {end: torch.zeros_like}), capture(xvla, [first]) as changed:
+        xvla.act(seen, [0])
+    moved = (plain[first] != changed[first]).any(-1)[0].numpy()
+    roles = xvla.roles(seen)
+    begin = CHUNK
+    expected = np.zeros(len(moved), bool)
+    expected[begin : begin + xvla.tokens_per_camera + TEXT] = True
+    np.testing.assert_array_equal(moved, expected)
+    names = ("image.image", "language")
+    for name in names:
+        assert roles["backbone"][0].mask(name).sum() == roles["expert"][0].mask(name).sum() > 0
+
+
+def test_what_a_block_adds_makes_the_next_residual_of_the_expert(xvla: Xvla, seen: list[Observation]) -> None:
+    stream = xvla.streams["expert"]
+    parts = [site for name in stream.quantities for site in stream.sites(name)]
+    with capture(xvla, parts) as cache:
+        xvla.act(seen, [0])
+    for site in stream.sites("mlp"):
+        added = sum(cache[replace(site, quantity=name)] for name in stream.quantities)
+        behind = cache[replace(site, layer=site.layer + 1, quantity="residual")]
+        torch.testing.assert_close(added, behind, rtol=0, atol=1e-5)
+
+
+def test_each_layer_of_the_backbone_norms_what_it_adds(xvla: Xvla, seen: list[Observation]) -> None:
+    """As BART: the norm of the normed sum and the MLP's part."""
+    stream = xvla.streams["backbone"]
+    with capture(xvla, [site for name in stream.quantities for site in stream.sites(name)]) as cache:
+        xvla.act(seen, [0])
+    for site in stream.sites("mlp"):
+        layer = xvla.network.model.vlm.language_model.encoder.layers[site.layer]
+        entered, attended, added = (cache[replace(site, quantity=name)] for name in stream.quantities)
+        with torch.inference_mode():
+            made = layer.final_layer_norm(layer.self_attn_layer_norm(entered + attended) + added)
+        behind = cache[replace(site, layer=site.layer + 1, quantity="residual")]
+        torch.testing.assert_close(made, behind, rtol=0, atol=1e-5)
+
+
+def test_further_cameras_reach_the_expert_past_the_backbone(tmp_path: Path, seen: list[Observation]) -> None:
+    folder = write_xvla(tmp_path, cameras=("image", "wrist"), views=3)
+    policy = load_xvla(str(folder)).showing(["image", "wrist"])
+    one = replace(seen[0], cameras={"wrist": seen[0].image[:, ::-1].copy()})
+    other = replace(one, cameras={"wrist": seen[0].image})
+    roles = policy.roles([one])
+    assert roles["expert"][0].mask("image.wrist").sum() == policy.tokens_per_camera
+    assert "image.wrist" not in {span.role for span in roles["backbone"][0].spans}
+    masked = roles["expert"][0].mask("special").sum() - roles["backbone"][0].mask("special").sum()
+    assert masked == policy.tokens_per_camera
+    end, first = policy.streams["backbone"].sites()[-1], Site("expert", 0, iteration=0)
+    tapes = []
+    for own in (one, other):
+        with capture(policy, [end, first]) as cache:
+            policy.act([own], [0])
+        tapes.append(cache)
+    assert torch.equal(tapes[0][end], tapes[1][end])
+    moved = (tapes[0][first] != tapes[1][first]).any(-1)[0].numpy()
+    np.testing.assert_array_equal(moved, roles["expert"][0].mask("image.wrist"))
+
+
+def test_the_robot_is_read_from_the_files_and_may_be_chosen(
+    folder: Path, tmp_path: Path, xvla: Xvla, seen: list[Observation]
+) -> None:
+    assert xvla.card.settings["domain"] == str(DOMAIN)
+    assert not np.array_equal(load_xvla(str(folder), domain=1).act(seen, [0]), xvla.act(seen, [0]))
+    with pytest.raises(UsageError, match=f"0 to {DOMAINS - 1}"):
+        load_xvla(str(folder), domain=DOMAINS)
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    file = tmp_path / "policy_preprocessor.json"
+    content = json.loads(file.read_text(encoding="utf-8"))
+    content["steps"] = [one for one in content["steps"] if one["registry_name"] != "xvla_add_domain_id"]
+    file.write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(CheckpointError, match="names no robot"):
+        load_xvla(str(tmp_path))
+    np.testing.assert_array_equal(load_xvla(str(tmp_path), domain=DOMAIN).act(seen, [0]), xvla.act(seen, [0]))
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("policy_postprocessor.json", '"device_processor"', '"xvla_rotation_6d_to_axis_angle"', "rotation_6d"),
+        ("policy_preprocessor.json", '"right"', '"left"', "pads its text"),
+        ("config.json", '"max_state_dim": 10', '"max_state_dim": 5', "leaves out"),
+    ],
+)
+def test_files_that_would_change_numbers_in_silence_are_refused(
+    folder: Path, tmp_path: Path, file: str, old: str, new: str, message: str
+) -> None:
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    text = (tmp_path / file).read_text(encoding="utf-8")
+    assert old in text
+    (tmp_path / file).write_text(text.replace(old, new), encoding="utf-8")
+    with pytest.raises(CheckpointError, match=message):
+        load_xvla(str(tmp_path))
+
+
+def test_a_text_that_does_not_fit_is_refused_where_lerobot_cuts_it(xvla: Xvla, seen: list[Observation]) -> None:
+    long = "put the cube on " + "the red shape " * 5
+    with pytest.raises(InstructionError, match=f"reads {TEXT}"):
+        xvla.act([replace(seen[0], instruction=long)], [0])
+    check_xvla_words(str(xvla.folder), ["put the cube on the star"])
+    with pytest.raises(InstructionError, match=f"reads {TEXT}"):
+        check_xvla_words(str(xvla.folder), [long])
+
+
+def test_a_picture_of_another_size_is_refused_where_nothing_resizes(
+    folder: Path, tmp_path: Path, seen: list[Observation]
+) -> None:
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    content = json.loads((tmp_path / "config.json").read_text(encoding="utf-8"))
+    content |= {"resize_imgs_with_padding": None, "max_len_seq": 160}
+    content["input_features"]["observation.images.image"]["shape"] = [3, 64, 96]
+    (tmp_path / "config.json").write_text(json.dumps(content), encoding="utf-8")
+    policy = load_xvla(str(tmp_path))
+    with pytest.raises(ObservationError, match="resizes nothing"):
+        policy.act(seen, [0])
+    fitting = replace(seen[0], image=np.zeros((64, 96, 3), np.uint8))
+    with capture(policy, policy.sites()) as cache:
+        policy.act([fitting], [0])
+    (roles,) = policy.roles([fitting])["expert"]
+    assert cache["expert.00.residual@0"].shape[1] == roles.spans[-1].stop
+
+
+def test_absolute_poses_are_captured_and_not_carried_out(tmp_path: Path, seen: list[Observation]) -> None:
+    """The released action space: two arms with 6D rotations, 20 numbers."""
+    folder = write_xvla(tmp_path)
+    content = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    content["action_mode"], content["max_state_dim"] = "ee6d", 20
+    content["output_features"]["action"]["shape"] = [20]
+    (folder / "config.json").write_text(json.dumps(content), encoding="utf-8")
+    policy = load_xvla(str(folder), random_weights=True)
+    assert "20 dimensions" in str(policy.embodiment_mismatch())
+    assert policy.infer_without_acting(seen, [0]).shape == (1, CHUNK, 20)
+
+
+@pytest.mark.slow  # seconds for a network of 0.9 billion parameters, on the meta device
+def test_florence_large_has_the_layers_that_the_family_names() -> None:
+    policy = network.full_size_xvla()
+    assert len(policy.model.vlm.language_model.encoder.layers) == 12
+    assert len(policy.model.transformer.blocks) == 24
+    assert sum(own.numel() for own in policy.parameters()) == 879_851_096
