@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from probe_kit.extract.run_layout import COMMITS
+from probe_kit.extract.run_layout import COMMITS, FAILED
 from probe_kit.view.catalogue import Catalogue
 
 
@@ -29,12 +29,13 @@ class Follower:
         return bool(self._keys)
 
     def poll(self) -> list[Growth]:
-        """List the commits of every unfinished run, and read new ones only."""
+        """List commits and failures of every unfinished run, and read new commits only."""
         return [self._poll(key) for key in self._keys]
 
     def _poll(self, key: str) -> Growth:
         run = self._catalogue.runs[key].run
-        if not self._is_finished(key) and len(run.location.keys(COMMITS)) > len(run.commits()):
+        known = {COMMITS: len(run.commits()), FAILED: len(run.failed)}
+        if not self._is_finished(key) and any(len(run.location.keys(where)) != n for where, n in known.items()):
             run = run.grown()
             self._catalogue.replace(key, run)
         return Growth(key, len(run.commits()), run.planned, len(run.failed))

@@ -144,12 +144,12 @@ class _Pages:
         return StreamingResponse(self._events(request), media_type="text/event-stream")
 
     async def _events(self, request: Request) -> AsyncIterator[str]:
-        sent: dict[str, int] = {}
+        sent: dict[str, Growth] = {}
         yield ": following\n\n"
         while not await request.is_disconnected():
             for growth in await run_in_threadpool(self._poll):
-                if sent.get(growth.run) != growth.committed:
-                    sent[growth.run] = growth.committed
+                if sent.get(growth.run) != growth:
+                    sent[growth.run] = growth
                     yield f"data: {json.dumps(vars(growth))}\n\n"
             await asyncio.sleep(self._tick_s)
 

@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.view.frozen_probes import FrozenProbes, Values, count_inferences
 
+UNREAD = "unread"
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
 
@@ -85,6 +87,10 @@ class ViewedRun:
     def answers(self) -> bool:
         """Whether the model was asked and did not act."""
         return ask_of(self.run) is not None
+
+    def outcome_word(self, outcome: Any) -> Any:
+        """The outcome as the page names it: that of a VLM whose answer no rule could read is `unread`, not `oob`."""
+        return UNREAD if self.answers and outcome == "oob" else outcome
 
     @cached_property
     def rows(self) -> dict[str, RetentionRow]:

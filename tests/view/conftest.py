@@ -32,7 +32,13 @@ FILMED, FILM_STEPS = 2, 9
 SHORTENED, LOST_WORDS = 5, 2
 """An episode whose prompt was cut, and how many words at the end of its instruction were lost."""
 HOSTILE = "</script><img src=x onerror=alert(1)>"
-"""A label that a page may not obey."""
+"""A label, and part of an instruction, that a page may not obey."""
+TURNED = "\u202egnp.exe"
+"""Text that would turn the rest of its line round."""
+MISREAD = 1, 7
+"""Seed of the run, and the episode in it, whose backbone holds the wrong side."""
+INFERENCES = (0, 1, 4)
+"""Control steps of the filmed episode's inferences, of which the last is not captured."""
 
 
 @pytest.fixture(scope="module")
@@ -95,9 +101,12 @@ def write_run(where: Path, suite: Suite, seed: int) -> Run:
             shape = (CALLS, *stream.lead, len(stream.views), stream.width)
             pooled[stream.name] = draw.normal(size=shape).astype(np.float32)
         sign = 1 if plan.episodes[number].episode.side_correct == "left" else -1
+        if (seed, number) == MISREAD:
+            sign = -sign
         pooled["backbone"][0, -1, :, 0] = 3 * sign + draw.normal(size=2) / 2
         roles = [*record.roles, *record.roles]
-        writer.write(replace(record, arrays={"pooled": pooled}, roles=roles, control_steps=(0, 1)))
+        steps = INFERENCES if number == FILMED else INFERENCES[:CALLS]
+        writer.write(replace(record, arrays={"pooled": pooled}, roles=roles, control_steps=steps))
     seal(where)
     intervene_on_little_run(open_run(where))
     for call in range(CALLS):
@@ -105,11 +114,18 @@ def write_run(where: Path, suite: Suite, seed: int) -> Run:
     return open_run(where)
 
 
+def hostile(suite: Suite) -> Suite:
+    """The suite, whose first item has text in its instruction and concept that a page may not obey."""
+    words = f"Put the cube on {HOSTILE} {TURNED}"
+    first = replace(suite.items[0], instruction=words, target_concept=HOSTILE)
+    return replace(suite, items=(first, *suite.items[1:]))
+
+
 @pytest.fixture(scope="module")
 def runs(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> list[Run]:
     """Two runs of the same seeds, whose probes were fitted to both inferences; tests that use them are slow."""
     folder = tmp_path_factory.mktemp("runs")
-    suite = small_suite.select(["color"])
+    suite = hostile(small_suite.select(["color"]))
     found = [write_run(folder / name, suite, seed) for seed, name in enumerate(("a", "b"))]
     label_run(folder / "b", HOSTILE)
     return [found[0], open_run(folder / "b")]

@@ -3,6 +3,7 @@
 import json
 import shutil
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
@@ -14,17 +15,19 @@ import pytest
 from PIL import Image
 
 from probe_kit.extract import Run, open_run
+from probe_kit.extract.store.format.commits import write_failure
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import decode_frames, read_sheet, read_thumbnail
 from probe_kit.intervene.store.answers import stored_interventions
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
+from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.view import write_viewer
 from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.payloads.coding import code_words, pack_log_odds, payload_script
 from tests.support.browser import CHROMIUM, WHY_SKIPPED, Browser, Page
 from tests.support.little_run import episode, little_plan, little_writer
-from tests.view.conftest import FILM_STEPS, FILMED, HOSTILE, LOST_WORDS, SHORTENED
+from tests.view.conftest import CALLS, FILM_STEPS, FILMED, HOSTILE, INFERENCES, LOST_WORDS, SHORTENED, TURNED
 from tests.view.payload_reader import log_odds, read_payload
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=WHY_SKIPPED)]
@@ -115,9 +118,11 @@ def test_a_site_without_signal_is_not_counted(page: Page, address: str) -> None:
 
 def test_scrubbing_by_key_slider_and_drag_agree(page: Page, address: str, runs: list[Run]) -> None:
     page.open(f"{address}#/episodes?ep=0&t=0")
-    last = runs[0].trajectory(0).steps
+    last, toward_correct = runs[0].trajectory(0).steps, centimetres_toward_the_correct(runs[0], 0)
 
     def state() -> tuple[int, str, str, float]:
+        step = int(page.read("document.querySelector('.scrub input').value"))
+        assert value_at_cursor(page, "Arm") == signed(toward_correct[step])
         return (
             int(page.read("Number(new URLSearchParams(location.hash.split('?')[1]).get('t'))")),
             text(page, ".scrub output"),
@@ -140,6 +145,48 @@ def test_scrubbing_by_key_slider_and_drag_agree(page: Page, address: str, runs: 
     page.drag("[data-series=Arm] svg[role=img]", 0.99)
     assert state() == by_end
     assert by_end[3] > by_key[3] > start[3]
+
+
+def centimetres_toward_the_correct(run: Run, number: int) -> np.ndarray:
+    """(T + 1,) how far the tool is from the middle between the pictures, along the line to the correct one."""
+    path, side = run.trajectory(number), run.episodes["side_correct"].iloc[number]
+    left, right = (tile[0, :2].astype(float) for tile in (path.tile_left, path.tile_right))
+    correct, other = (left, right) if side == "left" else (right, left)
+    unit = (correct - other) / np.linalg.norm(correct - other)
+    return 100 * (path.tool[:, :2].astype(float) - (correct + other) / 2) @ unit
+
+
+def value_at_cursor(page: Page, series: str, key: int = 1) -> str:
+    """What the heading of a chart says of its line number `key` at the cursor."""
+    return text(page, f"[data-series={series}] .key:nth-child({key}) output")
+
+
+def signed(value: float) -> str:
+    return f"{value:+.1f}".replace("-", "−")
+
+
+def test_log_odds_hold_until_the_next_inference_and_are_those_of_both_probes(
+    page: Page, address: str, runs: list[Run]
+) -> None:
+    position = runs[0].episodes["episode"].tolist().index(FILMED)
+    toward = 1 if runs[0].episodes["side_correct"].iloc[position] == "left" else -1
+    stored = []
+    for call, results in load_results_by_call(runs[0], load_results(runs[0])).items():
+        curve = results.curves["color", "mean"]
+        if call == 0:
+            site = curve.best("backbone")
+        at = curve.episodes.tolist().index(runs[0].episodes["episode_id"].iloc[position])
+        stored.append(signed(toward * curve.decisions[site, at]))
+    for step in range(FILM_STEPS):
+        page.open(f"{address}#/episodes?ep={FILMED}&t={step}")
+        call = sum(start <= step for start in INFERENCES) - 1
+        assert value_at_cursor(page, "Probe", 2) == (stored[call] if call < CALLS else "–")
+        if call != 1:
+            assert value_at_cursor(page, "Probe") == (stored[0] if call == 0 else "–")
+    names = page.read("[...document.querySelectorAll('[data-series=Probe] .key')].map(key => key.innerText)")
+    assert [name.partition(", ")[2].split("\n")[0].strip(" –") for name in names[:2]] == [
+        "probe of inference 0", "refitted",
+    ]  # fmt: skip
 
 
 def test_the_frame_that_is_shown_is_the_stored_one(page: Page, address: str, runs: list[Run]) -> None:
@@ -189,7 +236,9 @@ def median_of(pixels: np.ndarray, share: slice) -> np.ndarray:
 
 def test_every_cell_of_a_map_shows_its_stored_scores(page: Page, address: str, runs: list[Run]) -> None:
     page.open(f"{address}#/map?category=color")
-    scores = load_results(runs[0]).scores.query("view == 'mean'")
+    results = load_results(runs[0])
+    curve, scores = results.curves["color", "mean"], results.scores.query("view == 'mean'")
+    permuted = {str(site): np.quantile(curve.null[place], 0.95) for place, site in enumerate(curve.sites)}
     for row in scores.to_dict("records"):
         page.hover(f".mapwrap [data-site='{row['site']}']")
         read = text(page, "dl.readout")
@@ -197,6 +246,7 @@ def test_every_cell_of_a_map_shows_its_stored_scores(page: Page, address: str, r
         assert f"{share} [{low}, {high}]" in read
         assert f"{row['p']:.3f}" in read
         assert f"{row['p_fwe']:.3f}" in read
+        assert f"{100 * permuted[row['site']]:.1f}" in read
         assert ("no signal shown" in read) == (not row["signal"])
 
 
@@ -283,11 +333,38 @@ def responses_of(run: Run) -> dict[str, str]:
     return said
 
 
+def test_runs_differ_in_log_odds_only_where_both_have_signal(page: Page, address: str, runs: list[Run]) -> None:
+    curves = [load_results(run).curves["color", "mean"] for run in runs]
+    assert [results.scores.query("view == 'mean' and signal")["stream"].unique().tolist()
+            for results in map(load_results, runs)] == [["backbone"]] * 2  # fmt: skip
+    signs = []
+    for run, curve in zip(runs, curves, strict=True):
+        of = dict(zip(curve.episodes.tolist(), curve.decisions[curve.best("backbone")] > 0, strict=True))
+        signs.append([of[name] for name in run.episodes["episode_id"]])
+    differ = [one != other for one, other in zip(*signs, strict=True)]
+    for number in sorted({differ.index(True), differ.index(False), 0, FILMED}):
+        page.open(f"{address}#/compare?ep={number}")
+        said = "the log-odds differ in sign at inference 0, step 0" in text(page, ".sentence")
+        assert said == differ[number], number
+        assert text(page, "[data-series=Probe] .key").startswith("A backbone.")
+    page.open(f"{address}#/compare?ep={differ.index(True)}&site=expert.00.residual@0")
+    assert "log-odds" not in text(page, ".sentence")
+    assert "No log-odds are compared" in text(page, ".compare")
+
+
 def test_hostile_text_is_text(page: Page, address: str) -> None:
-    page.open(f"{address}#/overview?run=b")
-    named = page.read("document.querySelector('.run select').selectedOptions[0].textContent")
-    assert HOSTILE in named
-    assert page.read("document.querySelectorAll('img').length") == 0
+    for place in ("overview?run=b", "episodes?ep=0", "questions", "compare?ep=0", "map"):
+        page.open(f"{address}#/{place}")
+        named = page.read("document.querySelector('.run').textContent")
+        assert HOSTILE in named
+        own = page.read("document.documentElement.outerHTML")
+        assert page.read("document.querySelectorAll('img, #app script').length") == 0
+        assert TURNED[0] not in own, place
+    page.open(f"{address}#/episodes?ep=0")
+    assert text(page, ".episode h2") == f"“Put the cube on {HOSTILE} {TURNED.replace(TURNED[0], '\ufffd')}”"
+    assert page.read("document.querySelector('.plan .what').textContent + document.title").count("<img") <= 2
+    page.open(f"{address}#/questions")
+    assert HOSTILE in text(page, "tbody")
 
 
 @pytest.mark.parametrize(
@@ -513,6 +590,12 @@ def test_a_served_page_shows_episodes_that_are_committed_while_it_is_open(
         assert text(page, ".live") == "3 of 6 episodes so far"
         page.open(f"{opened.partition('?')[0]}#/episodes?layout=original&ep=2&t=1")
         before = [text(page, selector) for selector in ("h2", ".scrub output", "output.count")]
+        page.wait("document.querySelector('[role=status]').textContent.startsWith('3 of 6')")
+        page.read(
+            "window.spoken = []; new MutationObserver(found => window.spoken.push(...found)).observe("
+            "document.querySelector('[role=status]'), {characterData: true, childList: true, subtree: true})"
+        )
+        began = time.monotonic()
         assert before[2] == "2 of 3"
         for number in (3, 4):
             writer.write(episode(plan, number))
@@ -520,6 +603,10 @@ def test_a_served_page_shows_episodes_that_are_committed_while_it_is_open(
         page.wait("document.querySelector('output.count').innerText === '3 of 5'")
         after = [text(page, selector) for selector in ("h2", ".scrub output")]
         assert after == before[:2]
+        write_failure(open_run(tmp_path / "run", allow_partial=True).root, 5, "the arm broke", "")
+        page.wait("document.querySelector('.live').innerText.endsWith(', 1 failed')")
+        seconds = time.monotonic() - began
+        assert page.read("window.spoken.length") <= 1 + seconds // 10, "a screen reader is told rarely"
         assert page.read("document.querySelector('.list [aria-selected=true] small').textContent").startswith("2 ")
         page.open("about:blank")
     assert browser.complaints == []

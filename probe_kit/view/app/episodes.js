@@ -74,9 +74,9 @@ function EpisodeList({ run, shown, one: chosen, value }) {
   return html`<div class="list" ref=${box} onScroll=${(e) => setTop(e.currentTarget.scrollTop)} role="listbox" aria-label="Episodes" tabindex="0"><div style=${{ height: `${shown.length * ROW}px` }}>
     ${shown.slice(from, to).map((one, k) => {
       const { log_odds, signal } = value(one), read = says(log_odds, signal);
-      return html`<a key=${one.number} role="option" aria-selected=${one === chosen} aria-setsize=${shown.length} aria-posinset=${from + k + 1} class="item" style=${{ transform: `translateY(${(from + k) * ROW}px)` }} href=${link({ ep: one.number, t: 0 })}>
+      return html`<a key=${one.number} title=${one.instruction} role="option" aria-selected=${one === chosen} aria-setsize=${shown.length} aria-posinset=${from + k + 1} class="item" style=${{ transform: `translateY(${(from + k) * ROW}px)` }} href=${link({ ep: one.number, t: 0 })}>
         <span class=${`sign ${one.outcome}`} aria-label=${OUTCOMES[one.outcome] ?? one.outcome}>${SIGNS[one.outcome] ?? "○"}</span><span class="what"><b><${Text}>${one.instruction ?? one.id}<//></b><small>${one.number} · ${titleOf(run, one.category)} · ${one.layout}</small></span>
-        <span class=${`odds ${read === "right" ? "up" : read === "wrong" ? "down" : ""}`} title=${read ? "" : "no signal shown at this site"}>${signal ? signed(log_odds) : "–"}</span></a>`;
+        ${run.sites.length > 0 && html`<span class=${`odds ${read === "right" ? "up" : read === "wrong" ? "down" : ""}`} title=${read ? "" : "no signal shown at this site"}>${signal ? signed(log_odds) : "–"}</span>`}</a>`;
     })}</div></div>`;
 }
 function Episodes({ run, list, place }) {
@@ -98,7 +98,7 @@ function Episodes({ run, list, place }) {
     if (e.key === "/") { e.preventDefault(); document.querySelector("input[name=words]").focus(); }
   });
   return html`<div class="episodes"><${Filters} run=${run} list=${list} shown=${shown} place=${place} />
-    <div class="split"><aside><p class="listhead">${run.sites.length ? `log-odds at ${named >= 0 ? short(place.site) : "the category's best site with signal"}` : "this run has no probes"}</p><${EpisodeList} run=${run} shown=${shown} one=${one} value=${value} /></aside>
+    <div class="split"><aside><p class="listhead">${run.sites.length ? `log-odds at ${named >= 0 ? short(place.site) : "the best site with signal"}` : "this run has no probes"}</p><${EpisodeList} run=${run} shown=${shown} one=${one} value=${value} /></aside>
     ${one ? html`<${Episode} key=${`${run.key} ${one.number}`} run=${run} one=${one} place=${place} near=${[1, -1].map((by) => shown[shown.indexOf(one) + by]).filter(Boolean)} />`
       : html`<p class="empty">No episode is left. <a href=${link(Object.fromEntries(FILTERS.map((name) => [name, undefined])))}>Clear the filters</a></p>`}</div></div>`;
 }
@@ -182,6 +182,11 @@ function signalAt(map, site, call) {
   const own = call ? map.refitted[call] : map;
   return (own ?? map).signal[site];
 }
+/* Log-odds of a site over steps: each holds until the next inference, and none is known from the first that was not captured. */
+function heldValues(episode, values, site, sites) {
+  const y = episode.inferences.map((_, k) => (k < values.length / sites ? values[k * sites + site] : NaN));
+  return { x: episode.inferences, y };
+}
 function NetworkNow({ run, one, episode, map, now, place }) {
   const n = run.sites.length, { call, calls } = inferenceAt(run, episode, now), site = siteOf(run, place, one.category);
   if (!calls) return html`<div class="now"><p class="empty">No inference of this episode was captured.</p></div>`;
@@ -204,11 +209,11 @@ function Charts({ run, one, episode, map, now, last, step, place }) {
   const commanded = floats(trajectory.commanded), executed = floats(trajectory.executed), opening = floats(trajectory.opening);
   const marks = ["first lateral move", "release"].filter((name) => episode.events[name] != null).map((name) => ({ name, x: episode.events[name] }));
   const reach = Math.max(12, ...tool.map(Math.abs)) * 1.08, best = categoryOf(run, one.category)?.best;
-  const shown = map && episode.log_odds ? [...new Set([best?.backbone?.site, siteOf(run, place, one.category)])].filter((i) => i != null) : [];
+  const chosen = siteNamed(run, place.site);
+  const shown = map && episode.log_odds ? [...new Set([best?.backbone?.site, chosen >= 0 ? chosen : best?.action?.site])].filter((i) => i != null) : [];
   const lines = shown.flatMap((site) => {
     const part = run.streams.find((s) => s.name === run.sites[site].stream)?.part === "backbone" ? "backbone" : "expert", name = short(run.sites[site].name);
-    const of = (packed) => { const v = logOdds(packed); return Array.from({ length: v.length / n }, (_, k) => v[k * n + site]); };
-    const line = (packed, words, kind) => ({ name: words, x: episode.inferences.slice(0, of(packed).length), y: of(packed), kind: `${part} ${kind}`, hold: true, dots: true, weak: (k) => !signalAt(map, site, k) });
+    const line = (packed, words, kind) => ({ name: words, ...heldValues(episode, logOdds(packed), site, n), kind: `${part} ${kind}`, hold: true, dots: true, weak: (k) => !signalAt(map, site, k) });
     return [line(episode.log_odds, episode.refitted ? `${name}, probe of inference 0` : name, ""), ...(episode.refitted ? [line(episode.refitted, `${name}, refitted`, "refitted")] : [])];
   });
   const top = useMemo(() => {

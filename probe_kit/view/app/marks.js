@@ -35,8 +35,8 @@ function Series({ title, unit, lines, steps, now, onNow, low, high, height = 150
   const path = (line) => {
     let d = "", pen = "M";
     line.y.forEach((v, i) => {
-      if (Number.isNaN(v)) { pen = "M"; return; }
       if (line.hold && pen === "L") d += `H${X(line.x[i]).toFixed(1)}`;
+      if (Number.isNaN(v)) { pen = "M"; return; }
       d += `${pen}${X(line.x[i]).toFixed(1)} ${Y(v).toFixed(1)}`;
       pen = "L";
     });

@@ -29,11 +29,22 @@ function useGrowth(known) {
   }, [known]);
   return grown;
 }
+/* What a screen reader is told of a run that grows: one message in ten seconds at most. */
+const BETWEEN_MS = 10_000;
+function useSpoken(text) {
+  const [spoken, set] = useState(""), last = useRef(0);
+  useEffect(() => {
+    const timer = setTimeout(() => { last.current = Date.now(); set(text); }, Math.max(0, last.current + BETWEEN_MS - Date.now()));
+    return () => clearTimeout(timer);
+  }, [text]);
+  return spoken;
+}
 function App() {
   const place = usePlace(), [[index], trouble] = useLoaded("index"), help = useRef(null);
   const known = index?.schema === SCHEMA && index.runs.length > 0, key = known ? (index.runs.find((r) => r.key === place.run) ?? index.runs[0]).key : null;
   const grown = useGrowth(known)[key];
   const [[run, episodes], lost] = useLoaded(key && `${key}/run`, key && `${key}/episodes`);
+  const failed = grown?.failed ?? run?.failed, live = run && run.committed < run.planned ? `${run.committed} of ${run.planned} episodes so far${failed ? `, ${failed} failed` : ""}` : "", spoken = useSpoken(live);
   useKeys((e) => {
     if (e.key === "?") help.current?.showModal();
     const view = Object.keys(VIEWS)[Number(e.key) - 1];
@@ -46,7 +57,7 @@ function App() {
   const list = listOf(run.key), View = VIEW[place.view];
   return html`<header class="bar"><a class="brand" href="#/overview">probe_kit</a>
       <label class="run"><span class="sr">Run</span><select value=${run.key} onChange=${(e) => go({ ...CLEARED, run: e.target.value })}>${index.runs.map((r) => html`<option value=${r.key}>${r.label} (${r.key}, ${r.episodes})</option>`)}</select></label>
-      ${run.committed < run.planned && html`<span class="live" role="status">${grown && html`<i></i>`}${run.committed} of ${run.planned} episodes so far${run.failed ? `, ${run.failed} failed` : ""}</span>`}
+      ${live && html`<span class="live">${grown && html`<i></i>`}${live}</span>`}<span class="sr" role="status">${spoken}</span>
       ${run.random_weights && html`<span class="random">RANDOM WEIGHTS</span>`}
       <nav aria-label="Views">${Object.entries(VIEWS).map(([view, words]) => html`<a href=${link({ view })} aria-current=${view === place.view ? "page" : null}>${view === "map" ? html`<span class="wide-only">${words}</span><span class="narrow-only">Map</span>` : words}</a>`)}</nav>
       <button type="button" class="plain" onClick=${toggleTheme} aria-label="Light or dark">◐</button><button type="button" class="plain" onClick=${() => help.current.showModal()} aria-label="Keys">?</button></header>

@@ -53,7 +53,7 @@ const signed = (v, digits = 1) => (v == null || Number.isNaN(v) ? "–" : `${v >
 const Text = ({ children }) => html`<bdi>${children}</bdi>`;
 const numbered = (number) => String(number).padStart(5, "0");
 const SIGNS = { correct: "✓", wrong: "✗" };
-const OUTCOMES = { correct: "correct", wrong: "wrong", oob: "outside", capture_only: "did not act" };
+const OUTCOMES = { correct: "correct", wrong: "wrong", oob: "outside", capture_only: "did not act", unread: "no answer read" };
 const Outcome = ({ outcome }) => html`<span class=${`outcome ${SIGNS[outcome] ? outcome : ""}`}><span aria-hidden="true">${SIGNS[outcome] ?? "○"}</span> ${OUTCOMES[outcome] ?? outcome}</span>`;
 const short = (site) => site.replace(".residual", "");
 function nice(run, site) {
@@ -65,8 +65,9 @@ const categoryOf = (run, name) => run.categories.find((c) => c.name === name);
 const titleOf = (run, name) => categoryOf(run, name)?.title ?? name;
 const probed = (run) => run.categories.filter((c) => c.best.backbone || c.best.action).map((c) => c.name);
 const siteNamed = (run, name) => run.sites.findIndex((s) => s.name === name);
-/* The site that is shown: the chosen one, or the best of the action, or of the backbone. */
+/* The site that is shown: the chosen one, or the best of the action or of the backbone, whichever has signal first. */
 function siteOf(run, place, category) {
-  const chosen = siteNamed(run, place.site), best = categoryOf(run, category)?.best;
-  return chosen >= 0 ? chosen : best?.action?.site ?? best?.backbone?.site ?? 0;
+  const chosen = siteNamed(run, place.site), best = categoryOf(run, category)?.best ?? {};
+  const named = [best.action, best.backbone].filter(Boolean);
+  return chosen >= 0 ? chosen : (named.find((own) => own.signal) ?? named[0])?.site ?? 0;
 }

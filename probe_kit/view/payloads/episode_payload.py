@@ -12,14 +12,21 @@ from probe_kit.env.scoring.rules import RULES, judge, rule_of
 from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.extract.run_layout import CAPTURE_ONLY, FRAME_COLUMNS
 from probe_kit.extract.store.thumbnails import read_sheet
+from probe_kit.retention.behaviour.vlm_answers import SCORES
 from probe_kit.view.frozen_probes import toward
 from probe_kit.view.payloads.coding import pack_floats, pack_log_odds
 from probe_kit.view.viewed_run import ViewedRun
 
 _STILL = 1e-4
 """Metres a tile may move and still be drawn where it began."""
-_ANSWERS = ("question", "answer", "said", "parse", "outcome_text", "outcome_logits", "outcome_debiased")
-"""Columns of a VLM run that say what was asked and answered."""
+_ANSWERS = {
+    "question": "question",
+    "text": "answer",
+    "option read": "said",
+    "parsing rule": "parse",
+    **{f"outcome, {score}": outcome for score, (outcome, _) in SCORES.items()},
+}
+"""By heading, columns of a VLM run that say what was asked and answered."""
 
 
 def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
@@ -47,8 +54,14 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
         "outcomes": {} if trajectory is None else _outcomes(viewed, trajectory, row),
         "lost_words": _lost_words(row),
         "instruction_tokens": len(run.instruction_ids(position) or ()),
-        "answers": {name: str(row[name]) for name in _ANSWERS if name in row and viewed.answers},
+        "answers": _answers(viewed, row),
     }
+
+
+def _answers(viewed: ViewedRun, row: dict[str, Any]) -> dict[str, str]:
+    """What a VLM was asked and said, by heading; none of a policy."""
+    found = {heading: row.get(column) for heading, column in _ANSWERS.items()} if viewed.answers else {}
+    return {heading: str(viewed.outcome_word(value)) for heading, value in found.items() if value is not None}
 
 
 def _lost_words(row: dict[str, Any]) -> int:

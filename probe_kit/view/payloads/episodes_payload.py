@@ -19,7 +19,6 @@ _WORDS = {
     "distractor": "distractor_concept",
     "side_correct": "side_correct",
     "side_placed": "side_placed",
-    "outcome": "outcome",
     "ending": "truncation_reason",
 }
 """Coded columns by the column of `run.episodes`; None where the run has no such column."""
@@ -43,6 +42,7 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
             name: code_words([_word(value) for value in episodes[column]] if column in episodes else none)
             for name, column in _WORDS.items()
         },
+        "outcome": code_words([viewed.outcome_word(_word(value)) for value in episodes["outcome"]]),
         "steps": [None if value is None else int(value) for value in episodes.get("steps", none)],
         "distance": [rounded(value, 3) for value in episodes.get("distance_correct", none)],
         "seeds": [
