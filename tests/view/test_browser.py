@@ -27,7 +27,7 @@ from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.payloads.coding import code_words, pack_log_odds, payload_script
 from tests.support.browser import CHROMIUM, WHY_SKIPPED, Browser, Page
 from tests.support.little_run import episode, little_plan, little_writer
-from tests.view.conftest import CALLS, FILM_STEPS, FILMED, HOSTILE, INFERENCES, LOST_WORDS, SHORTENED, TURNED
+from tests.view.conftest import CALLS, FILM_STEPS, FILMED, HOSTILE, INFERENCES, LOST_WORDS, MISREAD, SHORTENED, TURNED
 from tests.view.payload_reader import log_odds, read_payload
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=WHY_SKIPPED)]
@@ -176,13 +176,16 @@ def test_log_odds_hold_until_the_next_inference_and_are_those_of_both_probes(
         if call == 0:
             site = curve.best("backbone")
         at = curve.episodes.tolist().index(runs[0].episodes["episode_id"].iloc[position])
-        stored.append(signed(toward * curve.decisions[site, at]))
+        stored.append(toward * curve.decisions[site, at])
     for step in range(FILM_STEPS):
         page.open(f"{address}#/episodes?ep={FILMED}&t={step}")
         call = sum(start <= step for start in INFERENCES) - 1
-        assert value_at_cursor(page, "Probe", 2) == (stored[call] if call < CALLS else "–")
-        if call != 1:
-            assert value_at_cursor(page, "Probe") == (stored[0] if call == 0 else "–")
+        frozen, refitted = value_at_cursor(page, "Probe"), value_at_cursor(page, "Probe", 2)
+        if call == CALLS:
+            assert frozen == refitted == "–"
+            continue
+        assert float(refitted.replace("−", "-")) == pytest.approx(stored[call], abs=0.053)
+        assert frozen == refitted if call == 0 else frozen != "–"
     names = page.read("[...document.querySelectorAll('[data-series=Probe] .key')].map(key => key.innerText)")
     assert [name.partition(", ")[2].split("\n")[0].strip(" –") for name in names[:2]] == [
         "probe of inference 0", "refitted",
@@ -342,12 +345,13 @@ def test_runs_differ_in_log_odds_only_where_both_have_signal(page: Page, address
         of = dict(zip(curve.episodes.tolist(), curve.decisions[curve.best("backbone")] > 0, strict=True))
         signs.append([of[name] for name in run.episodes["episode_id"]])
     differ = [one != other for one, other in zip(*signs, strict=True)]
-    for number in sorted({differ.index(True), differ.index(False), 0, FILMED}):
+    assert differ[MISREAD[1]]
+    for number in (0, FILMED, MISREAD[1]):
         page.open(f"{address}#/compare?ep={number}")
         said = "the log-odds differ in sign at inference 0, step 0" in text(page, ".sentence")
         assert said == differ[number], number
         assert text(page, "[data-series=Probe] .key").startswith("A backbone.")
-    page.open(f"{address}#/compare?ep={differ.index(True)}&site=expert.00.residual@0")
+    page.open(f"{address}#/compare?ep={MISREAD[1]}&site=expert.00.residual@0")
     assert "log-odds" not in text(page, ".sentence")
     assert "No log-odds are compared" in text(page, ".compare")
 
