@@ -17,6 +17,7 @@ from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.extract import Run, open_run
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.kinds.image_swap.effects import stored_image_swaps
 from probe_kit.intervene.store.answers import stored_interventions
@@ -27,7 +28,7 @@ from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_directions import read_directions
 from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.payloads.coding import pack_floats, pack_log_odds, payload_script
-from tests.support.little_run import episode, little_plan, little_writer
+from tests.support.little_run import certify, episode, little_plan, little_settings, little_writer
 from tests.view.payload_reader import floats, log_odds, read_payload, words
 
 
@@ -287,3 +288,26 @@ def test_later_inferences_are_read_by_the_fold_that_tests_the_item_and_by_probes
             stored = [sign * own[call].decisions[place, own[call].episodes.tolist().index(curve.episodes[at])]
                       for call in range(2)]  # fmt: skip
             np.testing.assert_allclose(refitted[:, place], stored, atol=0.003)
+
+
+def test_a_model_that_was_asked_is_shown_with_question_and_answers_in_words(
+    small_suite: Suite, tmp_path: Path
+) -> None:
+    plan = little_plan(small_suite.select(["color"]), 0, 2)
+    settings = {**little_settings(), "ask": {"prompt": "p2", "picture": "frame", "picture_size": "80x60", "object": "target"}}
+    writer = RunWriter(locate(tmp_path / "run"), plan, settings)
+    certify(writer)
+    asked = {"question": "Which one?\nA left\nB right", "answer": "Neither <b>", "said": "none", "parse": "none"}
+    outcomes = {"outcome": "oob", "outcome_logits": "correct", "outcome_debiased": "wrong"}
+    sides = {"side_placed": "none", "side_logits": "left", "side_debiased": "right"}
+    measured = {"parse_tier": "none", "letter_bias": 0.1, "content": 1.0, "margin": 1.0, "option_mass": 0.9}
+    marks = {"near_tie": False, "side_word": False}
+    for number in range(2):
+        record = episode(plan, number)
+        writer.write(replace(record, outcome={**record.outcome, **asked, **outcomes, **sides, **measured, **marks}))
+    catalogue = Catalogue([open_run(tmp_path / "run", allow_partial=True)])
+    assert payload(catalogue, "run/e/00000")["answers"] == {
+        "question": asked["question"], "text": "Neither <b>", "option read": "none", "parsing rule": "none",
+        "outcome, text": "unread", "outcome, logits": "correct", "outcome, order-balanced": "wrong",
+    }  # fmt: skip
+    assert words(payload(catalogue, "run/episodes")["outcome"]) == ["unread", "unread"]

@@ -31,10 +31,10 @@ function comparedSites(runs, maps, place, category) {
   const part = ["action", "backbone"].find((name) => best.every((own) => own?.[name]?.signal));
   return part ? best.map((own) => own[part].site) : null;
 }
-/* Of one site in one episode: its log-odds by inference, and whether it has signal there. */
+/* Of one site in one episode: its log-odds by inference, whether it has signal there, and whether that was tested at this inference. */
 function readingAt(run, episode, map, site) {
   const { x, y } = heldValues(episode, logOdds(episode.log_odds), site, run.sites.length);
-  return y.map((value, k) => ({ value, step: x[k], signal: signalAt(map, site, k) }));
+  return y.map((value, k) => ({ value, step: x[k], signal: signalAt(map, site, k), tested: k === 0 || k in map.refitted }));
 }
 function Pair({ run, b, pair, place }) {
   const name = (r, one) => `${r.key}/e/${numbered(one.number)}`, mapOf = (r, one) => probed(r).includes(one.category) && `${r.key}/map/${one.category}`;
@@ -43,7 +43,7 @@ function Pair({ run, b, pair, place }) {
   if (!x || !y || maps.includes(undefined)) return html`<p class="loading">Loading …</p>`;
   const acted = x.trajectory && y.trajectory;
   const title = html`“<${Text}>${pair.a.instruction ?? pair.a.id}<//>”`;
-  if (!acted) return html`<section class="panel"><h2>${title}</h2><div class="pair"><div><h3>A <${Outcome} outcome=${pair.a.outcome} /></h3><${Film} run=${run.key} one=${pair.a} frames=${x.frames} now=${1} steps=${1} /></div><div><h3>B <${Outcome} outcome=${pair.b.outcome} /></h3><${Film} run=${b.key} one=${pair.b} frames=${y.frames} now=${1} steps=${1} /></div></div></section>`;
+  if (!acted) return html`<section class="panel"><h2>${title}</h2><div class="pair"><div><h3>A <${Outcome} outcome=${pair.a.outcome} /></h3><${Film} run=${run.key} one=${pair.a} frames=${x.frames} now=${pair.a.steps ?? 1} steps=${pair.a.steps ?? 1} /></div><div><h3>B <${Outcome} outcome=${pair.b.outcome} /></h3><${Film} run=${b.key} one=${pair.b} frames=${y.frames} now=${pair.b.steps ?? 1} steps=${pair.b.steps ?? 1} /></div></div></section>`;
   const s = floats(x.trajectory.tool), t = floats(y.trajectory.tool), common = Math.min(x.trajectory.frames, y.trajectory.frames), last = Math.max(x.trajectory.frames, y.trajectory.frames) - 1;
   const apart = Array.from({ length: common }, (_, i) => 100 * Math.hypot(s[3 * i] - t[3 * i], s[3 * i + 1] - t[3 * i + 1], s[3 * i + 2] - t[3 * i + 2]));
   const now = Math.max(0, Math.min(last, Math.floor(Number(place.t)) || 0)), step = (v) => go({ t: v }, true);
@@ -64,12 +64,12 @@ function Pair({ run, b, pair, place }) {
 }
 /* What differs first, in the order of the steps: network, commanded action, tools. */
 function differences(x, y, apart, readings) {
-  const found = [], tools = apart.findIndex((v) => v > APART_CM), u = floats(x.trajectory.commanded), v = floats(y.trajectory.commanded);
-  if (tools >= 0) found.push({ kind: "tools", step: tools, words: `the tools part by 5 mm at step ${tools}` });
-  const at = u.findIndex((value, i) => i < v.length && Math.abs(value - v[i]) > OTHER_ACTION);
-  if (at >= 0) found.push({ kind: "action", step: Math.floor(at / 3) + 1, words: `the commanded actions differ from step ${Math.floor(at / 3) + 1}` });
-  const [p, q] = readings ?? [[], []], sign = (r) => (r?.signal && r.value ? Math.sign(r.value) : 0);
+  const found = [], [p, q] = readings ?? [[], []], sign = (r) => (r?.signal && r.tested && r.value ? Math.sign(r.value) : 0);
   const k = p.findIndex((r, i) => sign(r) * sign(q[i]) < 0);
   if (k >= 0) found.push({ kind: "network", step: p[k].step, words: `the log-odds differ in sign at inference ${k}, step ${p[k].step}` });
+  const u = floats(x.trajectory.commanded), v = floats(y.trajectory.commanded), at = u.findIndex((value, i) => i < v.length && Math.abs(value - v[i]) > OTHER_ACTION);
+  if (at >= 0) found.push({ kind: "action", step: Math.floor(at / 3) + 1, words: `the commanded actions differ from step ${Math.floor(at / 3) + 1}` });
+  const tools = apart.findIndex((far) => far > APART_CM);
+  if (tools >= 0) found.push({ kind: "tools", step: tools, words: `the tools part by 5 mm at step ${tools}` });
   return found.sort((f, g) => f.step - g.step);
 }

@@ -227,6 +227,6 @@ function Charts({ run, one, episode, map, now, last, step, place }) {
     <${Series} title="Arm" unit="cm toward the correct picture" steps=${last} now=${now} onNow=${step} low=${-reach} high=${reach} height=${140} marks=${marks} lines=${[{ name: "tool", x: frames, y: tool, kind: "arm" }]} />
     <${Series} title="Sideways action" unit="cm per step toward the correct picture" steps=${last} now=${now} onNow=${step} low=${-5} high=${5} height=${110} digits=${2} lines=${[{ name: "commanded", x: acts, y: acts.map((i) => along(commanded, i - 1)), kind: "asked" }, { name: "executed", x: acts, y: acts.map((i) => along(executed, i - 1)), kind: "done" }]} />
     <${Series} title="Gripper" unit="share open" steps=${last} now=${now} onNow=${step} low=${0} high=${1.05} height=${90} zero=${false} sign=${false} digits=${2} lines=${[{ name: "opening", x: frames, y: [...opening], kind: "arm" }]} />
-    ${shown.length > 0 && html`<p class="note">A probe of inference 0 meets other activations once the arm has moved: chance there does not mean that the answer is gone. Hollow dots: no signal shown at that inference.</p>`}
+    ${shown.length > 0 && html`<p class="note">A probe of inference 0 meets other activations once the arm has moved: chance there does not mean that the answer is gone. Hollow dots: no signal shown ${episode.refitted || run.captured_calls < 2 ? "at that inference" : html`at inference 0; <code>train --call all</code> tests the later ones`}.</p>`}
   </div>`;
 }

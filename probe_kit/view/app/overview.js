@@ -40,6 +40,6 @@ function Overview({ run, list }) {
 }
 function Card({ run, one }) {
   const [[episode]] = useLoaded(`${run}/e/${numbered(one.number)}`);
-  return html`<a class="card" href=${link({ view: "episodes", ep: one.number, t: 0, category: one.category, case: "backbone.right-wrong" })}>${episode ? html`<${Film} run=${run} one=${one} frames=${episode.frames} now=${1} steps=${1} bare />` : html`<div class="film none"></div>`}
+  return html`<a class="card" href=${link({ view: "episodes", ep: one.number, t: 0, category: one.category, case: "backbone.right-wrong" })}>${episode ? html`<${Film} run=${run} one=${one} frames=${episode.frames} now=${one.steps ?? 1} steps=${one.steps ?? 1} bare />` : html`<div class="film none"></div>`}
     <span><${Text}>${one.instruction}<//></span><small><${Outcome} outcome=${one.outcome} /> · backbone ${signed(one.backbone)}</small></a>`;
 }

@@ -132,6 +132,35 @@ def test_all_frames_are_those_that_the_environment_draws_in_the_same_episode(
     env.close()
 
 
+@pytest.mark.slow
+def test_all_frames_of_a_policy_are_those_that_its_stored_actions_lead_to(
+    film_settings: ExtractSettings, tmp_path: Path
+) -> None:
+    settings = replace(film_settings, model="pi0-tiny", items=2, captured_calls="all", later_views="mean")
+    filmed = extract_run(settings, tmp_path / "film")
+    bare = extract_run(replace(settings, frames="none"), tmp_path / "bare")
+    assert filmed.captured_calls == 2
+    assert filmed.reached(1).all()
+    for site in filmed.sites("expert"):
+        for call in range(2):
+            assert np.array_equal(filmed.column(site, "mean", call), bare.column(site, "mean", call))
+    assert film_settings.suite is not None
+    items = {item.item_id: item for item in load_suite(film_settings.suite).items}
+    env = Act2AnswerEnv(settings.scene)
+    for position, row in enumerate(filmed.episodes.to_dict("records")):
+        sheet = read_sheet(filmed.location, int(row["episode"]))
+        assert sheet is not None
+        assert sheet.count == row["steps"] + 1
+        options = {"item": items[row["item_id"]], "layout": row["layout"]}
+        env.reset(seed=int(row["scene_seed"]), options=options)
+        actions = filmed.trajectory(position).commanded
+        for step, frame in enumerate(decode_frames(sheet.content, sheet.count)):
+            if step:
+                env.advance(actions[step - 1])
+            assert np.abs(shrink_to_film(env.render()).astype(int) - frame).mean() < 4, step
+    env.close()
+
+
 def shrink_to_film(frame: np.ndarray) -> np.ndarray:
     """A frame as all are kept, each pixel the mean of those it covers."""
     height, width = frame.shape[:2]
