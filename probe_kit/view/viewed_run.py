@@ -89,7 +89,7 @@ class ViewedRun:
         return ask_of(self.run) is not None
 
     def outcome_word(self, outcome: Any) -> Any:
-        """The outcome as the page names it: that of a VLM whose answer no rule could read is `unread`, not `oob`."""
+        """The outcome as the page names it: `unread` where no rule could read the answer of a VLM, not `oob`."""
         return UNREAD if self.answers and outcome == "oob" else outcome
 
     @cached_property

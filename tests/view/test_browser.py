@@ -27,7 +27,17 @@ from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.payloads.coding import code_words, pack_log_odds, payload_script
 from tests.support.browser import CHROMIUM, WHY_SKIPPED, Browser, Page
 from tests.support.little_run import episode, little_plan, little_writer
-from tests.view.conftest import CALLS, FILM_STEPS, FILMED, HOSTILE, INFERENCES, LOST_WORDS, MISREAD, SHORTENED, TURNED
+from tests.view.conftest import (
+    CALLS,
+    FILM_STEPS,
+    FILMED,
+    HOSTILE,
+    INFERENCES,
+    LOST_WORDS,
+    MISREAD,
+    SHORTENED,
+    TURNED,
+)
 from tests.view.payload_reader import log_odds, read_payload
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=WHY_SKIPPED)]

@@ -28,6 +28,7 @@ from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_directions import read_directions
 from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.payloads.coding import pack_floats, pack_log_odds, payload_script
+from tests.retention.asked_runs import ASK
 from tests.support.little_run import certify, episode, little_plan, little_settings, little_writer
 from tests.view.payload_reader import floats, log_odds, read_payload, words
 
@@ -294,7 +295,7 @@ def test_a_model_that_was_asked_is_shown_with_question_and_answers_in_words(
     small_suite: Suite, tmp_path: Path
 ) -> None:
     plan = little_plan(small_suite.select(["color"]), 0, 2)
-    settings = {**little_settings(), "ask": {"prompt": "p2", "picture": "frame", "picture_size": "80x60", "object": "target"}}
+    settings = {**little_settings(), "ask": ASK}
     writer = RunWriter(locate(tmp_path / "run"), plan, settings)
     certify(writer)
     asked = {"question": "Which one?\nA left\nB right", "answer": "Neither <b>", "said": "none", "parse": "none"}
@@ -304,7 +305,8 @@ def test_a_model_that_was_asked_is_shown_with_question_and_answers_in_words(
     marks = {"near_tie": False, "side_word": False}
     for number in range(2):
         record = episode(plan, number)
-        writer.write(replace(record, outcome={**record.outcome, **asked, **outcomes, **sides, **measured, **marks}))
+        said = {**asked, **outcomes, **sides, **measured, **marks}
+        writer.write(replace(record, outcome={**record.outcome, **said}))
     catalogue = Catalogue([open_run(tmp_path / "run", allow_partial=True)])
     assert payload(catalogue, "run/e/00000")["answers"] == {
         "question": asked["question"], "text": "Neither <b>", "option read": "none", "parsing rule": "none",

@@ -223,7 +223,7 @@ function Charts({ run, one, episode, map, now, last, step, place }) {
   }, [map, shown.join()]);
   return html`<div class="charts">
     ${lines.length > 0 ? html`<${Series} title="Probe" unit="log-odds toward the correct side" steps=${last} now=${now} onNow=${step} low=${-top} high=${top} height=${170} marks=${marks} above="correct side" below="wrong side" lines=${lines} />`
-      : html`<p class="empty">No probes: <code>probe-kit train RUN</code> fits them.</p>`}
+      : html`<p class="empty">${noProbes(run)}</p>`}
     <${Series} title="Arm" unit="cm toward the correct picture" steps=${last} now=${now} onNow=${step} low=${-reach} high=${reach} height=${140} marks=${marks} lines=${[{ name: "tool", x: frames, y: tool, kind: "arm" }]} />
     <${Series} title="Sideways action" unit="cm per step toward the correct picture" steps=${last} now=${now} onNow=${step} low=${-5} high=${5} height=${110} digits=${2} lines=${[{ name: "commanded", x: acts, y: acts.map((i) => along(commanded, i - 1)), kind: "asked" }, { name: "executed", x: acts, y: acts.map((i) => along(executed, i - 1)), kind: "done" }]} />
     <${Series} title="Gripper" unit="share open" steps=${last} now=${now} onNow=${step} low=${0} high=${1.05} height=${90} zero=${false} sign=${false} digits=${2} lines=${[{ name: "opening", x: frames, y: [...opening], kind: "arm" }]} />

@@ -14,7 +14,7 @@ function Maps({ run, list, place }) {
   }, [map, site, list]);
   const shades = useMemo(() => all.map((own) => own && ((i) => ({ ...shadeOf(own, run.chance)(i), words: own.cells[i][0] }))), all);
   const summary = (own, i) => `${own.signal.filter(Boolean).length} of ${own.signal.length} sites with signal; ${nice(run, run.sites[i])}: ${own.cells[i][0]}`;
-  if (!names.length) return html`<p class="empty">${run.answers ? "This model was asked and no stream of it was probed." : html`This run has no probes. <code>probe-kit train RUN</code> fits them.`}</p>`;
+  if (!names.length) return html`<p class="empty">${run.answers ? "This model was asked and no stream of it was probed." : noProbes(run)}</p>`;
   if (trouble) return html`<p class="trouble" role="alert">${trouble}</p>`;
   if (!map) return html`<p class="loading">Loading …</p>`;
   const read = hover ?? site, signal = map.signal[site], crowded = run.sites.length > 80;
