@@ -58,12 +58,12 @@ def address(request: pytest.FixtureRequest, runs: list[Run], index: Path) -> Ite
 
 
 @contextmanager
-def served(runs: list[Run]) -> Iterator[str]:
+def served(runs: list[Run], probes_of: Run | None = None) -> Iterator[str]:
     """The address that opens the page of a server."""
     pytest.importorskip("starlette", reason="the server of the viewer is not installed (starlette, uvicorn)")
     from probe_kit.view.server import ViewerServer
 
-    server = ViewerServer(Catalogue(runs))
+    server = ViewerServer(Catalogue(runs, probes_of))
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     try:
@@ -588,7 +588,7 @@ def test_a_damaged_payload_is_named(browser: Browser, runs: list[Run], tmp_path:
 
 
 def test_a_served_page_shows_episodes_that_are_committed_while_it_is_open(
-    browser: Browser, small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    browser: Browser, small_suite: Suite, little_runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("starlette", reason="the server of the viewer is not installed (starlette, uvicorn)")
     monkeypatch.setattr("probe_kit.view.server.TICK_S", 0.05)
@@ -597,12 +597,13 @@ def test_a_served_page_shows_episodes_that_are_committed_while_it_is_open(
     writer = little_writer(locate(tmp_path / "run"), plan)
     for number in range(3):
         writer.write(episode(plan, number))
-    with served([open_run(tmp_path / "run", allow_partial=True)]) as opened:
+    with served([open_run(tmp_path / "run", allow_partial=True)], open_run(little_runs / "run")) as opened:
         page = browser.page()
         page.open(opened)
         assert page.read("location.search") == ""
         assert text(page, ".live") == "3 of 6 episodes so far"
         page.open(f"{opened.partition('?')[0]}#/episodes?layout=original&ep=2&t=1")
+        page.wait("document.querySelector('.episode .sitemap')")
         before = [text(page, selector) for selector in ("h2", ".scrub output", "output.count")]
         page.wait("document.querySelector('[role=status]').textContent.startsWith('3 of 6')")
         page.read(
@@ -615,8 +616,10 @@ def test_a_served_page_shows_episodes_that_are_committed_while_it_is_open(
             writer.write(episode(plan, number))
         page.wait("document.querySelector('.live').innerText.startsWith('5 of 6')")
         page.wait("document.querySelector('output.count').innerText === '3 of 5'")
+        assert text(page, ".run option").endswith("(run, 5)")
         after = [text(page, selector) for selector in ("h2", ".scrub output")]
         assert after == before[:2]
+        assert page.read("document.querySelectorAll('.episode .sitemap, [data-series=Probe]').length") == 2
         write_failure(open_run(tmp_path / "run", allow_partial=True).root, 5, "the arm broke", "")
         page.wait("document.querySelector('.live').innerText.endsWith(', 1 failed')")
         seconds = time.monotonic() - began

@@ -20,8 +20,8 @@ function useGrowth(known) {
     events.onmessage = async (event) => {
       const now = JSON.parse(event.data), shown = store.get(`${now.run}/run`);
       if (shown && shown.committed !== now.committed) {
-        for (const name of [...store.keys()].filter((one) => one.startsWith(`${now.run}/map/`))) store.delete(name);
-        await Promise.all([load(`${now.run}/run`, true), load(`${now.run}/episodes`, true)]);
+        const maps = [...store.keys()].filter((name) => name.startsWith(`${now.run}/map/`));
+        await Promise.all([`${now.run}/run`, `${now.run}/episodes`, ...maps].map((name) => load(name, true)));
       }
       set((before) => ({ ...before, [now.run]: now }));
     };
@@ -56,7 +56,7 @@ function App() {
   if (!run || !episodes) { const named = index?.runs.find((r) => r.key === key); return html`<p class="loading">Loading ${named ? html`<${Text}>${named.label}<//>, ${named.episodes.toLocaleString("en")} episodes` : "the run"} …</p>`; }
   const list = listOf(run.key), View = VIEW[place.view];
   return html`<header class="bar"><a class="brand" href="#/overview">probe_kit</a>
-      <label class="run"><span class="sr">Run</span><select value=${run.key} onChange=${(e) => go({ ...CLEARED, run: e.target.value })}>${index.runs.map((r) => html`<option value=${r.key}>${r.label} (${r.key}, ${r.episodes})</option>`)}</select></label>
+      <label class="run"><span class="sr">Run</span><select value=${run.key} onChange=${(e) => go({ ...CLEARED, run: e.target.value })}>${index.runs.map((r) => html`<option value=${r.key}>${r.label} (${r.key}, ${store.get(`${r.key}/run`)?.committed ?? r.episodes})</option>`)}</select></label>
       ${live && html`<span class="live">${grown && html`<i></i>`}${live}</span>`}<span class="sr" role="status">${spoken}</span>
       ${run.random_weights && html`<span class="random">RANDOM WEIGHTS</span>`}
       <nav aria-label="Views">${Object.entries(VIEWS).map(([view, words]) => html`<a href=${link({ view })} aria-current=${view === place.view ? "page" : null}>${view === "map" ? html`<span class="wide-only">${words}</span><span class="narrow-only">Map</span>` : words}</a>`)}</nav>
