@@ -1,7 +1,8 @@
-"""Make the table of `docs/own-data.md`: `python scripts/own_data_page.py FOLDER` (some minutes on two cores).
+"""Make the tables and the figure of `docs/own-data.md`: `python scripts/own_data_page.py FOLDER`.
 
 FOLDER gets a run of `pi0-tiny` in scenes, the same frames as a LeRobotDataset that lerobot writes, a run on it,
-and a table with a binary, a class and a continuous label, which are the state of the simulation.
+and a table with a binary, a class and a continuous label, which are the state of the simulation. All figures and
+the report of these labels go to FOLDER too.
 """
 
 import argparse
@@ -17,10 +18,15 @@ import probe_kit as pk
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
 from probe_kit.hooks import Observation
 from probe_kit.hooks.contract.sites import label_of
+from probe_kit.retention import LabelRetentionTable, label_retention_table
+from probe_kit.retention.displays import save_figures
+from probe_kit.retention.displays.labels import label_curves, label_figures
+from probe_kit.retention.report import write_label_report
 from probe_kit.train import LabelResults
 from probe_kit.train.labels.builtin_columns import label_frame
 
 PAGE = Path(__file__).parents[1] / "docs" / "own-data.md"
+FIGURE, FIGURE_DPI = PAGE.with_name("own-data.png"), 110
 CAMERA, FPS, ITEMS, PERMUTATIONS = "observation.images.top", 1, 20, 200
 LABELS = ("left", "where", "distance")
 """Columns of the table: whether the correct picture lies left, where the cube is, and how far from it."""
@@ -46,7 +52,11 @@ def main() -> None:
         )
         for name in LABELS
     ]
-    filled = table_of(run, results)
+    retained = label_retention_table([run], LABELS)
+    list(save_figures(label_figures([run], retained), folder / "figures"))
+    write_label_report([run], folder / "report.html", retained)
+    label_curves(results[0]).savefig(FIGURE, dpi=FIGURE_DPI)
+    filled = f"{table_of(run, results)}\n\n{retention_of(retained)}"
     page = _BLOCK.sub(lambda block: f"{block[1]}\n{filled}\n\n{block[2]}", PAGE.read_text(encoding="utf-8"))
     PAGE.write_text(page, encoding="utf-8")
 
@@ -131,6 +141,17 @@ def table_of(run: pk.Run, results: list[LabelResults]) -> str:
         "The score is balanced accuracy, or R² for `distance`."
     )
     return "\n".join(rows) + f"\n\n{note}"
+
+
+def retention_of(table: LabelRetentionTable) -> str:
+    """Retention of every label, as Markdown."""
+    rows = ["| label | metric | backbone above chance | action above chance | retention |", "|---" * 5 + "|"]
+    for row in table.rows:
+        own = row.retention
+        above = [f"{peak.above:.2f} [{peak.ci[0]:.2f}, {peak.ci[1]:.2f}]" for peak in (own.backbone, own.action)]
+        value = f"{own.value:.2f} [{own.ci[0]:.2f}, {own.ci[1]:.2f}]" if own.defined else own.note
+        rows.append(f"| `{own.target}` | {own.metric} | {above[0]} | {above[1]} | {value} |")
+    return "\n".join(rows)
 
 
 if __name__ == "__main__":

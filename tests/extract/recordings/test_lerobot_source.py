@@ -1,11 +1,12 @@
 """What can be chosen of recordings, and what is refused before anything is read."""
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
 
-from probe_kit.errors import RecordingError, UsageError
+from probe_kit.errors import MissingExtraError, RecordingError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, prepare
 from probe_kit.extract.recordings.lerobot_folder import open_lerobot, resolved_commit
 from probe_kit.extract.recordings.lerobot_source import read_episodes, read_every
@@ -128,6 +129,17 @@ def test_an_older_format_is_refused_with_the_converter(tmp_path: Path) -> None:
     with pytest.raises(
         RecordingError, match=r"format v2\.1; this version reads v3\.0.*convert_dataset_v21_to_v30"
     ):
+        open_lerobot(LeRobotSource(str(tmp_path)))
+
+
+@pytest.mark.parametrize("missing", ["datasets", "av"])
+def test_trap_8_without_the_extra_it_is_named_with_its_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3.0"}', encoding="utf-8")
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(MissingExtraError, match=r"\[datasets\]"):
         open_lerobot(LeRobotSource(str(tmp_path)))
 
 

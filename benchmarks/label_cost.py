@@ -1,0 +1,63 @@
+"""Processor time of a label's probe at one site, with its label permutations.
+
+    python benchmarks/label_cost.py [--task continuous] [--permutations 200]
+
+Features are drawn: 1,720 samples of 43 groups, of the width of `pi0-tiny` (96) and of pi0 (2,048). Folds, choice
+of the penalty and exchanges of groups are those of `probe-kit train --labels`. One process; `OMP_NUM_THREADS` sets
+its threads.
+"""
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from probe_kit.train import ArrayRun, Labels
+from probe_kit.train.choices import TASKS
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.labels.label_problem import LabelProblem, label_problem
+from probe_kit.train.labels.labelled_samples import LabelledSamples
+
+GROUPS, EPISODES, FRAMES = 43, 4, 10
+WIDTHS = (96, 2048)
+
+
+def problem_of(task: str, permutations: int) -> LabelProblem:
+    """A label of every frame: a wandering quantity, its terciles or its halves."""
+    draw = np.random.default_rng(0)
+    group, episode, frame = (axis.ravel() for axis in np.indices((GROUPS, EPISODES, FRAMES)))
+    values = draw.normal(size=(GROUPS * EPISODES, FRAMES)).cumsum(axis=1).ravel()
+    levels = {"continuous": [], "classes": [1 / 3, 2 / 3], "binary": [0.5]}[task]
+    if levels:
+        values = np.digitize(values, np.quantile(values, levels)).astype(float)
+    rows = group * EPISODES + episode
+    names = np.array([f"e{number}" for number in range(GROUPS * EPISODES)])
+    table = pd.DataFrame({"episode_id": names[rows], "inference": frame, "y": values})
+    episodes = pd.DataFrame({"episode_id": names, "group_id": np.repeat(np.arange(GROUPS), EPISODES).astype(str)})
+    run = ArrayRun(Path("nowhere"), "none", "none", episodes, {})
+    samples = LabelledSamples(rows, frame, values, group.astype(str), np.full(rows.size, "all"), FRAMES, {})
+    return label_problem(run, Labels.read(table, "y", task), samples, permutations, 0)  # type: ignore[arg-type]
+
+
+def main() -> None:
+    """Fit, and print seconds of processor and of the clock by width."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="continuous", choices=TASKS)
+    parser.add_argument("--permutations", type=int, default=200)
+    options = parser.parse_args()
+    problem = problem_of(options.task, options.permutations)
+    for width in WIDTHS:
+        features = np.random.default_rng(1).normal(size=(len(problem.columns), width)).astype(np.float32)
+        processor, clock = time.process_time(), time.perf_counter()
+        problem.probe(Samples.pooled(features))
+        processor, clock = time.process_time() - processor, time.perf_counter() - clock
+        print(
+            f"{options.task}, {len(problem.columns)} x {width}, {options.permutations} permutations: "
+            f"{processor:.1f} CPU-s, {clock:.1f} s"
+        )
+
+
+if __name__ == "__main__":
+    main()
