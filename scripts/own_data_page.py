@@ -19,8 +19,7 @@ from probe_kit.extract.rollout.controllers import PolicyController, Turn
 from probe_kit.hooks import Observation
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention import LabelRetentionTable, label_retention_table
-from probe_kit.retention.displays import save_figures
-from probe_kit.retention.displays.labels import label_curves, label_figures
+from probe_kit.retention.displays import label_curves, label_figures, save_figures
 from probe_kit.retention.report import write_label_report
 from probe_kit.train import LabelResults
 from probe_kit.train.labels.builtin_columns import label_frame

@@ -1,7 +1,7 @@
 """Figures in scikit-learn's display idiom: numbers as attributes, `plot(ax=None)` draws and returns the display.
 
 Without `ax` a display makes its own figure, with a legend and a caption that names model, weights and suite.
-`collect_figures` makes all figures that fit a table of runs.
+`collect_figures` makes all figures that fit a table of runs, `label_figures` those of a table of labels.
 """
 
 from probe_kit.retention.displays.attention import AttentionDisplay, attention_curve
@@ -19,6 +19,17 @@ from probe_kit.retention.displays.heat_table import (
 from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, iteration_maps
 from probe_kit.retention.displays.knowledge_action import KnowledgeActionDisplay
 from probe_kit.retention.displays.known_used import KnownUsedDisplay
+from probe_kit.retention.displays.labels import (
+    ClassConfusionDisplay,
+    LabelCurveDisplay,
+    PredictedValuesDisplay,
+    StepScoresDisplay,
+    class_confusions,
+    label_curves,
+    label_figures,
+    predicted_values,
+    step_scores,
+)
 from probe_kit.retention.displays.layer_curves import LayerCurveDisplay, layer_curve
 from probe_kit.retention.displays.model_depth import ModelDepthDisplay, model_depths
 from probe_kit.retention.displays.outcome_rules import OutcomeRulesDisplay
@@ -31,35 +42,44 @@ from probe_kit.retention.displays.site_effect_curve import SiteEffectDisplay, si
 __all__ = [
     "AttentionDisplay",
     "CallCurveDisplay",
+    "ClassConfusionDisplay",
     "DoseResponseDisplay",
     "FinalPositionsDisplay",
     "HeatTableDisplay",
     "IterationMapDisplay",
     "KnowledgeActionDisplay",
     "KnownUsedDisplay",
+    "LabelCurveDisplay",
     "LayerCurveDisplay",
     "ModelDepthDisplay",
     "OutcomeRulesDisplay",
     "PairedLayoutsDisplay",
+    "PredictedValuesDisplay",
     "ProvenanceLine",
     "ReportFigure",
     "RetentionTableDisplay",
     "RoleCurvesDisplay",
     "SideTableDisplay",
     "SiteEffectDisplay",
+    "StepScoresDisplay",
     "SuccessTableDisplay",
     "aligned_curves",
     "attention_curve",
     "call_curves",
+    "class_confusions",
     "collect_figures",
     "curves_side_by_side",
     "dose_response",
     "final_positions",
     "iteration_maps",
+    "label_curves",
+    "label_figures",
     "layer_curve",
     "maps_side_by_side",
     "model_depths",
+    "predicted_values",
     "role_curves",
     "save_figures",
     "site_effect_curve",
+    "step_scores",
 ]
