@@ -26,7 +26,7 @@ from starlette.responses import PlainTextResponse, RedirectResponse, Response, S
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from probe_kit.errors import ProbeKitError
+from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.view.catalogue import INDEX_PAYLOAD, Catalogue
 from probe_kit.view.follower import Follower, Growth
 from probe_kit.view.page_files import INDEX, page_files
@@ -186,14 +186,27 @@ def _application(pages: _Pages, port: int, token: str) -> Starlette:
     )
 
 
+def _opened(port: int) -> socket.socket:
+    """A socket that listens at a port of this machine, and of no other."""
+    found = socket.socket()
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        found.bind((HOST, port))
+        found.listen()
+    except OSError as error:
+        found.close()
+        raise UsageError(f"port {port} of {HOST}: {error.strerror}. Give another one, or none") from error
+    return found
+
+
 class ViewerServer:
-    """A server on loopback whose socket is open from the first moment. port: 0 for any free one."""
+    """A server on loopback whose socket is open from the first moment.
+
+    port: 0 for any free one. Raises UsageError if it cannot be opened, for example because it is in use.
+    """
 
     def __init__(self, catalogue: Catalogue, port: int = 0) -> None:
-        self._socket = socket.socket()
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        self._socket.bind((HOST, port))
-        self._socket.listen()
+        self._socket = _opened(port)
         self.port: int = self._socket.getsockname()[1]
         self._token = secrets.token_urlsafe(16)
         self._pages = _Pages(catalogue, TICK_S)

@@ -4,13 +4,16 @@ import gzip
 import http.client
 import json
 import re
+import socket
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
 from probe_kit.extract import Run, open_run, seal
 from probe_kit.extract.store.format import commits
 from probe_kit.extract.store.format.root import Root
@@ -110,6 +113,40 @@ def test_only_the_page_itself_is_answered(
         found, _, content = server.ask(path, method, **headers)
         assert found == (204 if status == 200 and path == "/follow" else status)
         assert status == 200 or b"put(" not in content
+
+
+def test_a_port_that_is_in_use_is_refused_by_number(server: Client, little_runs: Path) -> None:
+    command = ["view", str(little_runs / "run"), "--no-browser", "--port", str(server.port)]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 2
+    assert f"port {server.port} of 127.0.0.1: Address already in use" in done.stderr
+
+
+def test_no_other_address_than_that_of_loopback_is_opened(server: Client) -> None:
+    with pytest.raises(OSError):  # noqa: PT011 - refused, or no such address
+        socket.create_connection(("127.0.0.2", server.port), timeout=10)
+
+
+@pytest.mark.parametrize(
+    "request_text",
+    [
+        "GET /data/index.js HTTP/1.0\r\n\r\n",
+        "GET /data/index.js HTTP/1.1\r\nHost: evil.example\r\nHost: {host}\r\nCookie: {cookie}\r\n\r\n",
+        "GET http://evil.example/data/index.js HTTP/1.1\r\nHost: evil.example\r\nCookie: {cookie}\r\n\r\n",
+        "GET /data/index.js HTTP/1.1\r\nHost: {host}\r\nCookie: {cookie}x; a=\x01\r\n\r\n",
+        "GET /data/index.js HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Key: x3JJHMbDL1EzLkh9GBhXDw==\r\nSec-WebSocket-Version: 13\r\n\r\n",
+        "TRACE / HTTP/1.1\r\nHost: {host}\r\nCookie: {cookie}\r\n\r\n",
+    ],
+    ids=["no host", "two hosts", "absolute address", "wrong cookie", "websocket", "trace"],
+)
+def test_a_request_that_no_browser_makes_of_the_page_gets_nothing(server: Client, request_text: str) -> None:
+    sent = request_text.format(host=f"127.0.0.1:{server.port}", cookie=server.cookie)
+    with socket.create_connection(("127.0.0.1", server.port), timeout=60) as connection:
+        connection.sendall(sent.encode("latin-1"))
+        answer = connection.recv(4096)
+    assert re.match(rb"HTTP/1.1 40[03] ", answer)
+    assert b"put(" not in answer
 
 
 def test_a_wrong_token_admits_nothing(server: Client) -> None:
