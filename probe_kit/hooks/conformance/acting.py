@@ -39,6 +39,21 @@ def actions_have_the_contracts_shape_and_come_from_the_seed_alone(subject: Polic
 
 
 @check(
+    "Another seed gives another chunk where noise enters an inference, and the same one where none does.",
+    "Pass the noise of the row's seed to the network, and set `draws_noise`. Some packages ignore given noise.",
+)
+def another_seed_gives_another_chunk_where_noise_is_drawn(subject: PolicySubject) -> None:
+    policy = subject.policy
+    if policy.draws_noise is None:
+        raise SkipTest(f"{policy.card.family} does not say whether noise enters an inference (`draws_noise`)")
+    first, other = (subject.run_row(subject.one[0], seed) for seed in (5, 6))
+    if policy.draws_noise:
+        require(not np.array_equal(first, other), "the same actions of two seeds", "others: the noise is ignored")
+    else:
+        require_bits(other, first, "actions of another seed", "those of the first, or `draws_noise = True`")
+
+
+@check(
     "An inference without acting is that of acting, bit for bit at every site.",
     "Let `infer_without_acting` call what `act` calls, with the same inputs.",
 )

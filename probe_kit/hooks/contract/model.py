@@ -221,9 +221,11 @@ class Policy(Model):
     interventions: what of the interventions it supports; a family says the same before it is loaded.
     flagged: (B,) rows of the last `act` in which the network put out something that is no action; what the row
     then does is the family's. None for a family that cannot tell.
+    draws_noise: whether noise of the seed enters every inference, as in a flow; None if undeclared.
     """
 
     interventions: ClassVar[Interventions] = ALL_EDITS
+    draws_noise: ClassVar[bool | None] = None
     flagged: NDArray[np.bool_] | None = None
 
     def embodiment_mismatch(self) -> str | None:

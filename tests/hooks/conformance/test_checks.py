@@ -130,6 +130,19 @@ class Drawing(EncoderPolicy):
         return super().act(seen, torch.randint(2**31, (len(seeds),)).tolist())
 
 
+class Constant(EncoderPolicy):
+    """One noise for every seed."""
+
+    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+        return super().act(seen, [0] * len(seeds))
+
+
+class Seedless(EncoderPolicy):
+    """Declares that no noise is drawn."""
+
+    draws_noise = False
+
+
 class Doubling(EncoderPolicy):
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         return super().act(seen, seeds).astype(np.float64)  # type: ignore[return-value]
@@ -180,6 +193,8 @@ class Otherwise(EncoderPolicy):
             "actions_have_the_contracts_shape_and_come_from_the_seed_alone",
             "actions of the same seeds differ",
         ),
+        (Constant, "another_seed_gives_another_chunk_where_noise_is_drawn", "the same actions of two seeds"),
+        (Seedless, "another_seed_gives_another_chunk_where_noise_is_drawn", "actions of another seed differ"),
         (Doubling, "actions_have_the_contracts_shape_and_come_from_the_seed_alone", "float64"),
         (Mixing, "a_batch_equals_its_rows_one_by_one", "numbers of row 0 in a batch are off by"),
         (Boasting, "the_end_of_an_unread_stream_is_a_control", "differ from those without"),

@@ -53,6 +53,7 @@ class EncoderVLA(nn.Module):
 
 
 class EncoderPolicy(Policy):
+    draws_noise = True
     streams = {
         "backbone": Stream("backbone", BLOCKS + 1, WIDTH),
         "expert": Stream("expert", BLOCKS + 1, WIDTH, STEPS),

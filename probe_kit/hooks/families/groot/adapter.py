@@ -101,6 +101,7 @@ class Groot(LerobotPolicy):
     family = "groot"
     config_type = "groot"
     interventions = INTERVENTIONS
+    draws_noise = True
     unread = (_HEAD,)
 
     acting_stream = "expert"

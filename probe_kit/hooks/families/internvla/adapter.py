@@ -54,6 +54,7 @@ class InternVLA(QwenVLA):
     """A loaded InternVLA-M1. One observation per call: its queries read padding, which changes the actions."""
 
     interventions = INTERVENTIONS
+    draws_noise = True
     fast_pictures: ClassVar[bool] = True
 
     def __init__(

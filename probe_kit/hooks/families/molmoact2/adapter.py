@@ -101,6 +101,7 @@ class MolmoAct2(LerobotPolicy):
     family = "molmoact2"
     config_type = "molmoact2"
     interventions = LAYERWISE
+    draws_noise = True
     unread = ("model.lm_head.weight",)
 
     acting_stream = "expert"

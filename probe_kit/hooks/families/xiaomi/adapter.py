@@ -60,6 +60,7 @@ class Xiaomi(QwenVLA):
     """A loaded Xiaomi-Robotics-R0."""
 
     interventions = INTERVENTIONS
+    draws_noise = True
     fast_pictures: ClassVar[bool] = False
     state_numbers = ARM_NUMBERS
 

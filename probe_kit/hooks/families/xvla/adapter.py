@@ -91,6 +91,7 @@ class Xvla(LerobotPolicy):
     family = "xvla"
     config_type = "xvla"
     interventions = INTERVENTIONS
+    draws_noise = True
 
     acting_stream = "expert"
     other_roles: ClassVar[tuple[str, ...]] = ("language", "special")

@@ -26,6 +26,7 @@ class LerobotFlow(LerobotPolicy):
     """A lerobot flow-matching policy behind the Policy contract."""
 
     interventions = FLOW
+    draws_noise = True
     acting_stream = "expert"
 
     def __init__(self, network: Any, folder: Path) -> None:
