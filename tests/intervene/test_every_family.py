@@ -1,10 +1,5 @@
 """The same analysis on a tiny checkpoint of every family that acts: every kind runs, or is refused by name."""
 
-import json
-import shutil
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,46 +26,11 @@ from probe_kit.intervene import (
 )
 from probe_kit.intervene.replay.conditions import Intervention
 from probe_kit.suite import Suite
-from tests.support.groot_checkpoints import write_groot
-from tests.support.internvla_checkpoints import write_checkpoint as write_internvla
-from tests.support.magma_checkpoints import write_checkpoint as write_magma
-from tests.support.molmoact2_checkpoints import write_molmoact2
-from tests.support.pi0_fast_checkpoints import write_pi0_fast
-from tests.support.pi05_checkpoints import write_pi05
-from tests.support.prismatic_checkpoints import write_checkpoint as write_openvla
-from tests.support.spatialvla_checkpoints import write_checkpoint as write_spatialvla
-from tests.support.xiaomi_checkpoints import write_checkpoint as write_xiaomi
-from tests.support.xvla_checkpoints import write_xvla
+from tests.support.acting_checkpoints import FAMILIES
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:the model put out tokens")]
 ITEMS = 6
 COMMON: dict[str, Any] = {"categories": ("color",), "items": ITEMS}
-
-
-@dataclass(frozen=True)
-class Tiny:
-    """How a family's tiny checkpoint is made: written, or one of the golden references, or the embedded one."""
-
-    write: Callable[[Path], Path] | None = None
-    golden: str = ""
-    options: dict[str, Any] = field(default_factory=dict)
-
-
-FAMILIES = {
-    "pi0-tiny": Tiny(),
-    "pi0": Tiny(golden="golden_pi0"),
-    "pi05": Tiny(write_pi05),
-    "pi0-fast": Tiny(write_pi0_fast),
-    "molmoact2": Tiny(write_molmoact2),
-    "groot": Tiny(write_groot),
-    "xvla": Tiny(write_xvla),
-    "smolvla": Tiny(golden="golden_smolvla"),
-    "openvla": Tiny(write_openvla, options={"tokenizer": "bytes"}),
-    "spatialvla": Tiny(write_spatialvla),
-    "magma": Tiny(write_magma),
-    "xiaomi-r0": Tiny(write_xiaomi),
-    "internvla-m1": Tiny(write_internvla),
-}
 
 
 def test_every_family_that_acts_is_here() -> None:
@@ -83,34 +43,13 @@ def made(
     request: pytest.FixtureRequest, small_suite: Suite, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Run, ReplaySource]:
     tiny = FAMILIES[request.param]
-    checkpoint = None
-    if tiny.golden:
-        golden = tmp_path_factory.mktemp("golden") / "copy"
-        checkpoint = str(knowing(request.getfixturevalue(tiny.golden), small_suite, golden) / "checkpoint")
-    elif tiny.write is not None:
-        checkpoint = str(tiny.write(tmp_path_factory.mktemp("checkpoint")))
+    checkpoint = tiny.made(small_suite, tmp_path_factory.mktemp("checkpoint"))
     settings = ExtractSettings(
         request.param, checkpoint, suite=small_suite.folder, items=ITEMS, categories=("color",), frames="none",
         scene=SceneSpec(max_steps=2), options=tiny.options, env_workers=0,
     )  # fmt: skip
     run = extract_run(settings, tmp_path_factory.mktemp("families") / request.param)
     return run, ReplaySource(small_suite.folder, checkpoint, tiny.options)
-
-
-def knowing(golden: Path, suite: Suite, copy: Path) -> Path:
-    """A reference whose tokenizer has the suite's words in the place of others."""
-    shutil.copytree(golden, copy)
-    (file,) = copy.rglob("tokenizer.json")
-    tokenizer = json.loads(file.read_text(encoding="utf-8"))
-    vocabulary, special = tokenizer["model"]["vocab"], {own["content"] for own in tokenizer["added_tokens"]}
-    intervention = dict.fromkeys(word for item in suite.items for word in item.instruction.split())
-    spare = [word for word in vocabulary if word not in special | {"\n", *intervention}]
-    missing = [word for word in intervention if word not in vocabulary]
-    assert len(missing) <= len(spare)
-    for word, other in zip(missing, spare, strict=False):
-        vocabulary[word] = vocabulary.pop(other)
-    file.write_text(json.dumps(tokenizer), encoding="utf-8")
-    return copy
 
 
 def asked_of(run: Run, kind: str) -> Intervention:
