@@ -196,6 +196,11 @@ class Groot(LerobotPolicy):
         """Also by NVIDIA's statistics."""
         return super().predicts_relative or bool(getattr(self._steps.decode, "use_relative_action", False))
 
+    def _notes(self) -> tuple[str, ...]:
+        frames = int(self._steps.pack.video_horizon or 1)
+        video = f"reads {frames} frames of a video: the one picture is given {frames} times, as lerobot does"
+        return (*super()._notes(), *((video,) if frames > 1 else ()))
+
     # -- acting ------------------------------------------------------------------------------------------
 
     @cached_property

@@ -212,6 +212,22 @@ def test_two_cameras_are_told_apart_in_the_checkpoints_order(tmp_path: Path, see
     assert np.isfinite(policy.act([one], [0])).all()
 
 
+def test_a_checkpoint_that_reads_a_video_says_that_its_frame_is_repeated(
+    folder: Path, tmp_path: Path, groot: Groot, seen: list[Observation]
+) -> None:
+    assert not any("video" in note for note in groot.card.notes)
+    shutil.copytree(folder / "base", tmp_path, dirs_exist_ok=True)
+    file = tmp_path / "processor_config.json"
+    content = json.loads(file.read_text(encoding="utf-8"))
+    content["processor_kwargs"]["modality_configs"][TAG]["video"]["delta_indices"] = [-5, 0]
+    file.write_text(json.dumps(content), encoding="utf-8")
+    policy = load_groot(str(tmp_path), embodiment=TAG)
+    assert any("given 2 times" in note for note in policy.card.notes)
+    (roles,) = policy.roles(seen)["backbone"]
+    assert roles.mask("image.image").sum() == 2 * groot.roles(seen)["backbone"][0].mask("image.image").sum()
+    assert np.isfinite(policy.act(seen, [0])).all()
+
+
 def test_units_are_the_quantiles_clamped_and_libero_closes_by_sign(groot: Groot) -> None:
     np.testing.assert_array_equal(groot.state_units.normalise(HIGH[None] + 3), np.ones((1, 8), np.float32))
     ends = groot.action_units.restore(np.stack([np.full(7, -2), np.full(7, 2)]).astype(np.float32))
