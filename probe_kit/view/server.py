@@ -187,7 +187,7 @@ def _application(pages: _Pages, port: int, token: str) -> Starlette:
 
 
 def _opened(port: int) -> socket.socket:
-    """A socket that listens at a port of this machine, and of no other."""
+    """An open socket at a port of the loopback address."""
     found = socket.socket()
     found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:

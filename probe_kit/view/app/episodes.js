@@ -164,7 +164,7 @@ function Facts({ run, one, episode }) {
   const rules = Object.entries(episode.outcomes);
   return html`<p class="facts"><${Outcome} outcome=${one.outcome} /> <span>correct: <b>${one.side_correct}</b></span> <span>${run.answers ? "answered" : "placed"}: <b>${one.side_placed ?? "none"}</b></span> <span>${titleOf(run, one.category)}</span> <span>${one.layout}</span>
     ${one.distance != null && html`<span>${(100 * one.distance).toFixed(1)} cm from the correct picture</span>`}
-    ${one.ending && html`<span>ended by: ${one.ending}</span>`}
+    ${one.ending && html`<span>ended by ${ENDINGS[one.ending] ?? one.ending}</span>`}
     ${rules.map(([rule, outcome]) => html`<span class="soft" title=${run.rules[rule]}>${rule}: ${OUTCOMES[outcome] ?? outcome}</span>`)}
     ${episode.instruction_tokens > 0 && html`<span class="soft">instruction: ${episode.instruction_tokens} tokens</span>`}
     ${episode.lost_words > 0 && html`<span class="lost">${episode.lost_words} ${episode.lost_words === 1 ? "word" : "words"} did not reach the model: its prompt is cut</span>`}

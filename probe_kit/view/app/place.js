@@ -54,6 +54,7 @@ const Text = ({ children }) => html`<bdi>${children}</bdi>`;
 const numbered = (number) => String(number).padStart(5, "0");
 const SIGNS = { correct: "✓", wrong: "✗" };
 const OUTCOMES = { correct: "correct", wrong: "wrong", oob: "outside", capture_only: "did not act", unread: "no answer read" };
+const ENDINGS = { max_steps: "the limit of steps", cube_fell: "the cube's fall", non_finite: "a simulator that broke" };
 const Outcome = ({ outcome }) => html`<span class=${`outcome ${SIGNS[outcome] ? outcome : ""}`}><span aria-hidden="true">${SIGNS[outcome] ?? "○"}</span> ${OUTCOMES[outcome] ?? outcome}</span>`;
 const short = (site) => site.replace(".residual", "");
 function nice(run, site) {
