@@ -33,8 +33,10 @@ if TYPE_CHECKING:
 
 _NOTE = (
     "above chance: score of a site chosen on half of the groups, on the other half, minus its mean score with "
-    "permuted labels; 95 % intervals over groups"
+    "permuted labels; 95 % intervals over groups; ✓: signal, above chance and every control that was run"
 )
+_SIGNAL = " ✓"
+"""Behind a score above chance and every control that was run."""
 _NAMED = 8
 """Labels of a run that a sentence names."""
 
@@ -101,6 +103,28 @@ class LabelRetentionTable:
             ),
             (("", 2 + 2 * several), ("backbone", 4), ("action", 4), ("", 1)),
             names=2 + 2 * several,
+            means=False,
+        )  # fmt: skip
+
+    @property
+    def summary(self) -> TextTable:
+        """The table without sites and chance; runs and views where there are several."""
+        named = {
+            "label": [row.retention.target for row in self.rows],
+            "run": [row.run for row in self.rows],
+            "view": [row.retention.view for row in self.rows],
+        }
+        shown = [name for name, cells in named.items() if name == "label" or len(set(cells)) > 1]
+        return TextTable(
+            "Labels, and what reaches the action",
+            _NOTE,
+            (*shown, "metric", "backbone above chance", "action above chance", "retention"),
+            tuple(
+                (*(named[name][place] for name in shown), row.retention.metric, _above(row.retention.backbone),
+                 _above(row.retention.action), _value(row.retention).partition(" (")[0])
+                for place, row in enumerate(self.rows)
+            ),
+            names=len(shown),
             means=False,
         )  # fmt: skip
 
@@ -233,10 +257,16 @@ def _corrected(rows: Sequence[LabelRow], results: Mapping[tuple[str, str], Label
 
 
 def _peak(peak: LabelPeak) -> tuple[str, str, str, str]:
-    score = f"{number(peak.score)}{' ✓' * peak.has_signal}"
+    score = f"{number(peak.score)}{_SIGNAL * peak.has_signal}"
     chance = "–" if peak.chance != peak.chance else number(peak.chance)
-    above = "–" if peak.chance != peak.chance else with_limits(number(peak.above), peak.ci, number)
-    return peak.site, score, chance, above
+    return peak.site, score, chance, _above(peak).removesuffix(_SIGNAL)
+
+
+def _above(peak: LabelPeak) -> str:
+    """Score above chance with its interval, marked where there is signal."""
+    if peak.chance != peak.chance:
+        return "–"
+    return with_limits(number(peak.above), peak.ci, number) + _SIGNAL * peak.has_signal
 
 
 def _value(found: LabelRetention) -> str:

@@ -31,7 +31,7 @@ def label_report_html(runs: Sequence[RunReader], table: LabelRetentionTable) -> 
     names = full_names(runs)
     places = tuple(place for run in runs for place in (run.location.address, str(run.location)))
     sections = label_sections(runs, table, names, places)
-    summary = plain_tables([table.text])
+    summary = plain_tables([table.summary])
     sentence, bibtex = citation(runs)
     return render(
         "labels.html.jinja",

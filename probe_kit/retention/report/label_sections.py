@@ -89,7 +89,7 @@ def stored_label_sections(
 
 def _measured(results: LabelResults) -> str:
     own = results.settings
-    classes = f" of {len(results.classes)} classes" if results.classes else ""
+    classes = f" of {len(results.classes)} classes" if own.task == "classes" else ""
     return f"A {_TASKS[own.task]} label{classes}; the score is {METRICS[own.task]}."
 
 
