@@ -1,8 +1,9 @@
 """A label in a page: its row of the retention table, its figures, its best sites beside their controls."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from probe_kit.errors import NoProbesError
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.displays.labels import label_figures
 from probe_kit.retention.formats.html import HtmlTable, plain_tables
@@ -11,7 +12,7 @@ from probe_kit.retention.report.pictures import Picture, arranged
 from probe_kit.train.choices import Task
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.labels.label_results import METRICS, LabelResults
-from probe_kit.train.labels.label_store import stored_targets
+from probe_kit.train.labels.label_store import load_label_results, stored_targets
 from probe_kit.train.labels.label_summary import label_sentences, label_table
 
 
@@ -20,13 +21,14 @@ class LabelSection:
     """One label. run: its name, empty where the section is of all runs. measured: task and metric.
 
     retention, sentences: its rows of the retention table, and what they say. pictures: by kind, see `arranged`.
-    probes: best sites and controls, a table per run. notes: what the probes say, and what was left out.
+    probes: best sites and controls, a table per run. notes: what the probes say, and what was left out. Of a run
+    without backbone or action there is no retention, and a sentence says so.
     """
 
     target: str
     run: str
     measured: str
-    retention: HtmlTable
+    retention: HtmlTable | None
     sentences: tuple[str, ...]
     pictures: list[list[Picture]]
     probes: tuple[HtmlTable, ...]
@@ -35,7 +37,7 @@ class LabelSection:
     @property
     def tables(self) -> tuple[HtmlTable, ...]:
         """All of them."""
-        return self.retention, *self.probes
+        return self.probes if self.retention is None else (self.retention, *self.probes)
 
 
 def label_sections(
@@ -81,10 +83,22 @@ def stored_label_sections(
     """A section per run and label column of which the run has probes; none for other runs."""
     found = []
     for run, name in zip(runs, names, strict=True):
-        if targets := stored_targets(run):
-            table = label_retention_table([run], targets)
-            found += label_sections([run], table, [name], places, name if len(runs) > 1 else "")
+        of_one = name if len(runs) > 1 else ""
+        for target in stored_targets(run):
+            try:
+                table = label_retention_table([run], target)
+            except NoProbesError as error:
+                found.append(_without_retention(load_label_results(run, target=target), of_one, str(error)))
+            else:
+                found += label_sections([run], replace(table, tried={}), [name], places, of_one)
     return found
+
+
+def _without_retention(results: LabelResults, of_one: str, reason: str) -> LabelSection:
+    return LabelSection(
+        results.settings.target, of_one, _measured(results), None, (f"{reason}.",), [],
+        (_probes_table(results, "Best sites and controls"),), tuple(label_sentences(results)),
+    )  # fmt: skip
 
 
 def _measured(results: LabelResults) -> str:

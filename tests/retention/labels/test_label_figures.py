@@ -12,7 +12,7 @@ from sklearn.metrics import balanced_accuracy_score
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.errors import UnknownSiteError, UsageError
+from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
 from probe_kit.extract import Run, open_run
 from probe_kit.retention import label_retention_table
 from probe_kit.retention.displays.labels import (
@@ -27,6 +27,7 @@ from probe_kit.retention.displays.labels import (
 from probe_kit.retention.displays.labels.figures import file_names
 from probe_kit.retention.report import report_html
 from probe_kit.train import LabelResults, Labels, load_label_results, train_probes
+from tests.support.recorded_run import write_recorded_run
 
 
 @pytest.fixture(autouse=True)
@@ -223,3 +224,22 @@ def test_results_stored_before_scores_by_step_were_kept_show_none(results: Label
         del one["by_step"]
     old = results.with_controls(type(results.controls).from_json(stored))
     assert StepScoresDisplay.from_results(old).controls == {}
+
+
+def test_a_label_of_a_run_without_an_action_has_a_section_that_says_so(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise NoProbesError("no site of the action was probed, so there is no retention")
+
+    monkeypatch.setattr("probe_kit.retention.report.label_sections.label_retention_table", refuse)
+    text = report_html([run])
+    assert "no site of the action was probed" in text
+    assert "sim.tool_y" in text
+
+
+def test_a_run_of_recordings_without_an_action_stream_is_refused_by_name(tmp_path: Path) -> None:
+    run = write_recorded_run(tmp_path / "run")
+    train_probes(run, labels=Labels.of_run(run, "dataset.state.y"), permutations=0, controls=())
+    with pytest.raises(NoProbesError, match="no site of the action"):
+        label_retention_table([run], "dataset.state.y")
