@@ -73,7 +73,7 @@ def write_study(folder: Path) -> None:
 def study(folder: Path, *command: str) -> str:
     """What `probe-kit study` prints of the study in `folder`."""
     whole = (sys.executable, "-m", "probe_kit", "study", *command)
-    return subprocess.run(whole, cwd=folder, check=True, stdout=subprocess.PIPE, text=True).stdout
+    return subprocess.run(whole, cwd=folder, check=True, stdout=subprocess.PIPE, encoding="utf-8").stdout
 
 
 def one_row_each(table: str) -> str:

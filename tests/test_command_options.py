@@ -38,7 +38,7 @@ from probe_kit.hooks.contract.protocol import ROTATIONS, ProtocolName
 from probe_kit.hooks.family import Dtype
 from probe_kit.intervene.kinds.registry import KINDS
 from probe_kit.retention.behaviour.vlm_answers import SCORES
-from probe_kit.retention.choices import AnswerScore, Section, TableFormat
+from probe_kit.retention.choices import AnswerScore, Family, Section, TableFormat
 from probe_kit.scene_names import ArmName, Rendering, RuleName, SceneName
 from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
@@ -90,6 +90,7 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("export", "--format"): FORMATS,
     ("retention", "--format"): get_args(TableFormat),
     ("retention", "--details"): (*get_args(Section), "all"),
+    ("retention", "--family"): get_args(Family),
     ("retention", "--rule"): RULES,
     ("retention", "--score"): SCORES,
     ("stages", "--score"): SCORES,

@@ -46,7 +46,7 @@ def write_xvla(
     from probe_kit.models.initialisation import initialise
     from probe_kit.models.lerobot.xvla import build_xvla
 
-    write_text(folder)
+    write_bart_tokenizer(folder)
     config = XVLAConfig(
         input_features={
             **{f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, (3, 48, 80)) for name in cameras},
@@ -83,7 +83,7 @@ def write_xvla(
     return folder
 
 
-def write_text(folder: Path) -> None:
+def write_bart_tokenizer(folder: Path) -> None:
     """A tokenizer of bytes that puts every text between two marks, as BART's does."""
     write_tokenizer(folder, SPECIAL)
     tokenizer = Tokenizer.from_file(str(folder / "tokenizer.json"))

@@ -139,7 +139,7 @@ def test_trap_8_without_the_extra_it_is_named_with_its_command(
     (tmp_path / "meta").mkdir()
     (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3.0"}', encoding="utf-8")
     monkeypatch.setitem(sys.modules, missing, None)
-    with pytest.raises(MissingExtraError, match=r"\[datasets\]"):
+    with pytest.raises(MissingExtraError, match=r"\[datasets\]|--extra datasets"):
         open_lerobot(LeRobotSource(str(tmp_path)))
 
 
