@@ -10,7 +10,7 @@ Named = Literal["left", "right", "center"]
 _SIDE_OF: dict[str, Named] = {
     "left": "left", "right": "right", "center": "center", "centre": "center", "middle": "center",
 }  # fmt: skip
-_SIDE = re.compile(r"\b(left|right|cent(?:er|re)|middle)(?:most)?\b", re.IGNORECASE)
+_SIDE = re.compile(r"\b(left|right|cent(?:er|re)|middle)(?:most|hand)?\b", re.IGNORECASE)
 _LETTER = re.compile(r"(?<![\w'])([AB])(?![\w'])")
 _CLAUSE = re.compile(
     r"[.,;:!\n]+|[^.,;:!\n]*\?+"
@@ -19,15 +19,25 @@ _CLAUSE = re.compile(
     re.IGNORECASE,
 )
 _DENIAL = re.compile(
-    r"\b(?:not|no|never|nowhere|neither|nor|without|except|avoid|cannot|isnt|wrong|incorrect|false"
+    r"\b(?:not|no|never|nowhere|neither|nor|without|except|avoid|cannot|isnt|wrong|incorrect|false|hardly|barely"
+    r"|unlikely|doubt|doubtful|exclud(?:e|ed|ing)|reject(?:ed|ing)?|discard(?:ed|ing)?|eliminat(?:e|ed|ing)"
+    r"|(?:rule|rules|ruled|ruling)\s+out|far\s+from|least"
     r"|(?:rather|other)\s+than|instead\s+of|opposite\s+of|(?:everything|anything|all)\s+but)\b|n't\b",
     re.IGNORECASE,
 )
 _DENIED_BEHIND = re.compile(
     r"\s+(?:(?:one|side|picture|image|tile|option|answer)\s+)?"
-    r"(?:(?:is|are|was|were|would\s+be|seems|looks)\s+(?:not|wrong|incorrect|false)\b|(?:is|was|are|were)n't\b)",
+    r"(?:(?:is|are|was|were|would\s+be|can\s+be|seems|looks)\s+"
+    r"(?:not|hardly|barely|wrong|incorrect|false|unlikely|excluded|rejected|eliminated|ruled\s+out)\b"
+    r"|(?:is|was|are|were|does|do|did|ca)n't\b|(?:does|do|did|can)\s+not\b|cannot\b"
+    r"|(?:lacks|fails|misses)\b|(?:has|shows|contains|depicts)\s+(?:no|neither)\b)",
     re.IGNORECASE,
 )
+_DENIED_LABEL = re.compile(
+    r"\b(wrong|incorrect|false)((?:\s+(?:one|side|picture|image|tile|option|answer|choice|letter))?)\s*:",
+    re.IGNORECASE,
+)
+"""In front of what is denied: its colon ends no clause."""
 _NO_DENIAL = re.compile(
     r"\b(?:no\s+(?:doubt|problem|question|worries)|without\s+(?:a\s+|any\s+)?doubt|not\s+only)\b", re.IGNORECASE
 )
@@ -35,19 +45,23 @@ _NO_DENIAL = re.compile(
 _ADVERBIAL = r"(?:now|here|there|next|away|beside|between|behind|above|below|under|in|on|at|after|before|beneath)"
 _RIGHT_IS_NO_SIDE = re.compile(
     r"\b(?:that(?:'s|\s+is)|you(?:'re|\s+are)|all|quite)\s+right\b"
-    r"|\bright\s+(?:answer|option|choice|letter|one|decision|place)\b"
+    r"|\bright\s+(?:answer|option|choice|letter|decision|place)\b|\bis\s+the\s+right\s+one\b"
     rf"|(?<!the\s)(?<!your\s)(?<!upper\s)(?<!lower\s)(?<!bottom\s)(?<!top\s)(?<!far\s)\bright\s+{_ADVERBIAL}\b"
-    r"|\b(?:[ab]|it|this|which|answer)\s+(?:is|seems|looks|sounds)\s+right\b(?!\s+(?:side|picture|image|tile))"
+    r"|\b[ab]\s+(?:is|seems|looks|sounds)\s+right\b(?!\s+(?:side|picture|image|tile))"
     r"|\b(?:seems|looks|sounds)\s+right\b",
     re.IGNORECASE,
 )
 """Praise, truth and adverbs."""
+_RIGHT_MAY_BE_A_SIDE = re.compile(
+    r"\b(?:it|this|which|answer)\s+is\s+right\b(?!\s+(?:side|picture|image|tile))|\bright\s+one\b", re.IGNORECASE
+)
+"""Truth or a side: it names no side, and beside the other side nothing is clear."""
 _PRAISE = re.compile(r"\s*right\s*[,:!.]", re.IGNORECASE)
 """In front of a side; in front of a letter it may be the side."""
 _LEFT_IS_NO_SIDE = re.compile(
-    r"\b(?:has|have|had)\s+left\b|\bnothing\s+left\b|\bleft\s+(?:over|out|behind)\b", re.IGNORECASE
+    r"\b(?:has|have|had)\s+left\b|\bnothing\s+left\b|\bleft\s+(?:over(?!\s+(?:the\s+)?right)|out|behind)\b",
+    re.IGNORECASE,
 )
-_OPTION = re.compile(r"\b(?:option|answer|choice|letter|picture|image|tile)\s+$", re.IGNORECASE)
 _VERB = re.compile(
     r"\s+(?:is|isn't|was|or|and|not|as|seems?|looks?|appears?|shows?|has|matches|contains|depicts|fits|would"
     r"|left|right|cent(?:er|re)|middle)\b",
@@ -57,18 +71,23 @@ _VERB = re.compile(
 
 @dataclass
 class Mentions:
-    """What is named, and what is named and denied. letters: `A` and `B`; sides: `left`, `right`, `center`."""
+    """What is named, and what is named and denied. letters: `A` and `B`; sides: `left`, `right`, `center`.
+
+    has_unclear_right: whether a `right` is truth or a side.
+    """
 
     letters: set[str] = field(default_factory=set)
     denied_letters: set[str] = field(default_factory=set)
     sides: set[Named] = field(default_factory=set)
     denied_sides: set[Named] = field(default_factory=set)
+    has_unclear_right: bool = False
 
 
 def mentions_of(text: str) -> Mentions:
     """All of a text, clause by clause: a denial reaches to the end of its clause. Questions are left out."""
     found = Mentions()
     for clause in _clauses(text):
+        found.has_unclear_right |= bool(_RIGHT_MAY_BE_A_SIDE.search(_blanked(_RIGHT_IS_NO_SIDE, clause)))
         for side, is_denied in _sides(clause):
             (found.denied_sides if is_denied else found.sides).add(side)
         for letter, is_denied in _letters(clause):
@@ -77,7 +96,7 @@ def mentions_of(text: str) -> Mentions:
 
 
 def _clauses(text: str) -> Iterator[str]:
-    plain = _NO_DENIAL.sub(" ", text)
+    plain = _DENIED_LABEL.sub(r"\1\2", _NO_DENIAL.sub(" ", text))
     praise = _PRAISE.match(plain)
     if praise is not None and _SIDE.search(plain, praise.end()):
         plain = plain[praise.end() :]
@@ -85,17 +104,21 @@ def _clauses(text: str) -> Iterator[str]:
 
 
 def _sides(clause: str) -> Iterator[tuple[Named, bool]]:
-    clean = _blanked(_LEFT_IS_NO_SIDE, _blanked(_RIGHT_IS_NO_SIDE, clause))
+    clean = clause
+    for pattern in (_RIGHT_IS_NO_SIDE, _RIGHT_MAY_BE_A_SIDE, _LEFT_IS_NO_SIDE):
+        clean = _blanked(pattern, clean)
     for found in _SIDE.finditer(clean):
         yield _SIDE_OF[found[1].lower()], _is_denied(clean, found)
 
 
 def _letters(clause: str) -> Iterator[tuple[str, bool]]:
-    """Upper case alone; `A` in front of a noun is an article."""
-    for found in _LETTER.finditer(clause):
-        behind = clause[found.end() :]
-        is_article = found[1] == "A" and re.match(r"\s+(?:[^\W\d_]{2}|[a-z])", behind) and not _VERB.match(behind)
-        if not is_article or _OPTION.search(clause[: found.start()]):
+    """Upper case alone; `A` in front of a noun is an article if it begins a clause without another letter."""
+    letters = list(_LETTER.finditer(clause))
+    is_alone = all(found[1] == "A" for found in letters)
+    for found in letters:
+        before, behind = clause[: found.start()], clause[found.end() :]
+        is_before_noun = re.match(r"\s+(?:[^\W\d_]{2}|[a-z])", behind) and not _VERB.match(behind)
+        if not (found[1] == "A" and is_alone and is_before_noun and not before.strip()):
             yield found[1], _is_denied(clause, found)
 
 

@@ -22,6 +22,8 @@ _THOUGHT = re.compile(r"<think>.*?</think>", re.DOTALL)
 _SPECIAL = re.compile(r"<\|[^<>|]*\|>|</?(?:s|bos|eos|pad|unk|end_of_turn|start_of_turn|loc\d+)>")
 _INVISIBLE = re.compile("[\u200b-\u200f\u2060\ufeff]")
 _MARKUP = re.compile(r"\\boxed|[*_`$\\{}\[\]()<>#\"\u201c\u201d]|(?<!\w)'|'(?!\w)")
+_BRACKETED = re.compile(r"(?<![\w'])([AB])\s*\)")
+"""A letter in front of a bracket is an option, not an article."""
 _REASON = re.compile(r"\b(?:because|since|due\s+to|as\s+it)\b.*", re.IGNORECASE | re.DOTALL)
 
 _LEAD = r"(?:(?:the|my)\s+)?(?:(?:correct|right|best|final)\s+)?(?:answer|option|choice|letter)\s*(?:is\b)?[\s:]*"
@@ -39,11 +41,13 @@ _JUST_YES, _JUST_NO = re.compile(r"\W*yes\W*", re.IGNORECASE), re.compile(r"\W*n
 _NO = re.compile(
     r"^\W*(?:no|nope|none|nothing|never)\b(?!\s+(?:problem|doubt|worries|question))"
     r"|^\W*(?:it\s+is\s+|it's\s+)?not\s+(?:visible|present|there|seen|shown)\b"
-    r"|\bthere\s+(?:(?:is|are)\s+(?:no|not)|(?:is|are)n't)\b|\bunable\s+to\s+(?:see|find)\b"
+    r"|\bthere\s+(?:(?:is|are)\s+(?:no|not)|(?:is|are)n't)\b(?!\s+(?:any\s+|a\s+)?(?:problem|doubt|question))|\bunable\s+to\s+(?:see|find)\b"
     r"|\b(?:(?:do|does|can|could|did)(?:\s+not|n't|not)|can't)\s+(?:\w+\s+)?(?:see|find|show|contain|have|depict|appear)\b"
     r"|\b(?:is|are)(?:\s+not|n't)\s+(?:\w+\s+)?(?:visible|present|there|seen|shown)\b",
     re.IGNORECASE,
 )
+_NOT_THAT = re.compile(r"\bnot\s+that\b", re.IGNORECASE)
+"""It's not that I can't see it: two denials."""
 _REFUSAL = re.compile(
     r"\b(?:sorry|cannot|can\s+not|can't|unable|not\s+sure|unsure|don't\s+know|do\s+not\s+know|not\s+able|unclear"
     r"|not\s+certain|uncertain|impossible)\b",
@@ -69,7 +73,9 @@ def read_answer(text: str, template: Template, order: Order = "original") -> Ans
     strict = _strictly(plain, options)
     if strict is not None:
         return strict
-    if template.yes_or_no and _NO.search(plain):
+    if template.yes_or_no and _NO.search(plain) and not _NOT_THAT.search(plain):
+        if _YES.match(plain):
+            return Answer("none", "contradicts itself")
         return Answer("no", "said no", "strict" if _JUST_NO.fullmatch(plain) else "clause")
     answer = _by_clauses(plain, options)
     if template.yes_or_no and answer.rule in ("unparsable", "denied") and _YES.match(plain):
@@ -82,6 +88,7 @@ def read_answer(text: str, template: Template, order: Order = "original") -> Ans
 def _stripped(text: str) -> str:
     """Without thoughts, special tokens, markup, reasons and spaces around it; nothing of an unfinished thought."""
     plain = _SPECIAL.sub("", _THOUGHT.sub("", unicodedata.normalize("NFKC", text))).partition("<think>")[0]
+    plain = _BRACKETED.sub(r"\1:", plain)
     plain = _MARKUP.sub(" ", _INVISIBLE.sub("", plain).replace("\u2019", "'"))
     return _REASON.sub("", plain).strip()
 
@@ -114,6 +121,8 @@ def _by_clauses(plain: str, options: Mapping[str, Side]) -> Answer:
         return Answer("none", "several sides")
     if found.sides:
         (side,) = found.sides
+        if found.has_unclear_right and side != "right":
+            return Answer("none", "several sides")
         return Answer(side, "center" if side == "center" else "side word", "clause")
     return Answer("none", "denied" if found.denied_sides else "unparsable")
 

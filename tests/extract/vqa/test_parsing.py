@@ -5,6 +5,10 @@ import pytest
 from probe_kit.extract.vqa.parsing import Said, read_answer
 from probe_kit.extract.vqa.templates import P1, SEEN, Order, Template
 from tests.extract.vqa.answer_cases import (
+    AFTER_AUDIT,
+    AUDIT_LETTERED,
+    AUDIT_SEEN,
+    AUDIT_UNREAD,
     HELD_OUT,
     LATER_LETTERED,
     LATER_SEEN,
@@ -99,6 +103,9 @@ TABLES: dict[str, tuple[Cases, Template, Order]] = {
     "held out": (HELD_OUT, P1, "original"),
     "later, lettered": (LATER_LETTERED, P1, "original"),
     "later, seen": (LATER_SEEN, SEEN, "original"),
+    "audit, lettered": (AUDIT_LETTERED, P1, "original"),
+    "audit, seen": (AUDIT_SEEN, SEEN, "original"),
+    "after the audit": (AFTER_AUDIT, P1, "original"),
 }
 UNREAD = {
     "made, lettered": {"Right: A"},
@@ -118,7 +125,8 @@ def test_what_a_person_reads_is_read_or_left_unreadable_and_never_inverted(name:
         for text in texts
         if (found := read_answer(text, template, order)).said != said
     }
-    assert wrong == dict.fromkeys(UNREAD.get(name, ()), "none")
+    every = {text for texts in cases.values() for text in texts}
+    assert wrong == dict.fromkeys(UNREAD.get(name, AUDIT_UNREAD & every), "none")
 
 
 def test_a_side_that_is_read_has_a_tier_and_nothing_else_has() -> None:
