@@ -5,7 +5,7 @@ The truth beside each is the mechanism in `wirings`.
 
 import pytest
 
-from probe_kit.intervene import UseVerdict
+from probe_kit.intervene import JointPlaces, UseVerdict
 from tests.intervene.test_wirings import VERDICTS
 from tests.intervene.wired_run import concluded
 from tests.intervene.wirings import WIRINGS, WiredSession
@@ -42,10 +42,24 @@ TRUTHS = {
     ),
     "opposite": (
         "passes at backbone.01, backbone.02; read at kv.02 language; carried by mean-difference at backbone.01 "
-        "language, mean-difference at backbone.02 language",
+        "language, backbone.02 language",
         "the readable copy is read (backbone.01 language, backbone.02 language)",
     ),
-    "half": (ONE_BLOCK, OPEN),  # a second property of the pictures decides whether the answer is read
+    "half": (
+        "passes at backbone.01; read jointly at kv.00 image + kv.01 language (alone: kv.01 language 0.50)",
+        OPEN,  # a second property of the pictures, which block 0 holds, decides whether the answer is read
+    ),
+    "norms": (ONE_BLOCK, NO_COPY),
+    "shared": (
+        "passes at backbone.01; carried by mean-difference at backbone.01 language; read jointly at kv.01 "
+        "language + kv.01 state (alone: kv.01 language 0.55)",
+        IS_READ,
+    ),
+    "beside": ("all cells of kv carry 0.40 of it", OPEN),
+    "opposing": ("opposed at kv.01 language; all cells of kv carry -2.00 of it", OPEN),
+    "balance": (f"{ALONG}; opposed at kv.02 language", IS_READ),
+    "behind": ("read at kv.00 image", ELSEWHERE),
+    "either": UNUSED,
 }
 
 
@@ -61,6 +75,24 @@ def test_every_wiring_has_a_truth() -> None:
 @pytest.mark.parametrize("name", WIRINGS)
 def test_behaviour_place_and_tie_are_true_of_the_wiring(name: str, found: dict[str, UseVerdict]) -> None:
     assert (found[name].verdict, found[name].place, found[name].tie) == (VERDICTS[name], *TRUTHS[name])
+
+
+def test_a_later_search_of_a_part_does_not_replace_that_of_all_kv(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    """The end of the backbone is unread: the verdict said *past backbone*."""
+    part = JointPlaces(sites=("backbone.03",), roles=("image", "language", "state"))
+    folder = tmp_path_factory.mktemp("part")
+    found = concluded(WiredSession(), ["blocks", "constant"], folder, further=(part,))
+    assert (found["blocks"].place, found["blocks"].tie) == TRUTHS["blocks"]
+
+
+def test_a_direction_that_carries_it_is_no_missing_copy(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Nine permutations show nothing. The sentence had *carried by* beside *no readable copy found*."""
+    folder = tmp_path_factory.mktemp("few")
+    found = concluded(WiredSession(), ["copied", "constant"], folder, permutations=9)["copied"]
+    said = "probes find no copy beyond chance, but a linear direction carries it (backbone.01 language)"
+    assert (found.place, found.tie) == (ALONG, said)
 
 
 def test_an_answer_read_at_one_iteration_of_ten_is_found(tmp_path_factory: pytest.TempPathFactory) -> None:

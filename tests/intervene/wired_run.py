@@ -54,11 +54,16 @@ def intervene(session: WiredSession, run: ArrayRun, asked: Intervention) -> None
 
 
 def concluded(
-    session: WiredSession, names: Sequence[str], folder: Path, view: str = "mean:language"
+    session: WiredSession,
+    names: Sequence[str],
+    folder: Path,
+    view: str = "mean:language",
+    permutations: int = 199,
+    further: Sequence[Intervention] = (),
 ) -> dict[str, UseVerdict]:
-    """By wiring the verdict with place and tie, from probes of one view and all interventions."""
+    """By wiring the verdict with place and tie, from probes of one view, all interventions and further ones."""
     run = wired_run(session, names, folder)
-    train_probes(run, views=(view,), permutations=199, controls=())
+    train_probes(run, views=(view,), permutations=permutations, controls=())
     role = view.partition(":")[2] or ALL
     sites = tuple(f"backbone.{layer:02d}" for layer in range(1, BLOCKS + 1))
     for asked in (
@@ -66,6 +71,7 @@ def concluded(
         Interchange(sites=("backbone.*", "kv.*"), roles=ROLES),
         Interchange(sites=sites, roles=(role,), direction="mean-difference", controls=1),
         JointPlaces(roles=ROLES[1:]),
+        *further,
     ):
         intervene(session, run, asked)
     return verdicts_of(run)

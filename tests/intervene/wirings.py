@@ -66,7 +66,8 @@ class Wiring:
     """read: the action, 1 for the left tile. copies: channels of the words into which block 0 copies the marks,
     and factors. has_product: whether block 0 codes the answer as a product of two channels. is_everywhere: whether
     all tokens begin with it. decoy: with what factor the image tokens begin with it, in the channel of the copy.
-    only_at: the one iteration that reads, or the last one; what it read stays. items: with this wiring.
+    only_at: the one iteration that reads, or the last one; what it read stays. copied_at: the block that copies
+    the marks. has_norms: whether the norms of the words tell the answer. items: with this wiring.
     """
 
     read: Callable[[Inference], Tensor]
@@ -75,6 +76,8 @@ class Wiring:
     is_everywhere: bool = False
     decoy: float = 0.0
     only_at: int | None = None
+    copied_at: int = 0
+    has_norms: bool = False
     items: int = 12
 
 
@@ -104,6 +107,16 @@ def _with_repair(seen: Inference) -> Tensor:
     """Block 1; the marks where its norm is not the ordinary one."""
     norm = seen.values[1][WORDS].norm(dim=-1).mean()
     return seen.marks if (norm - ORDINARY).abs() > 0.5 else seen.words()
+
+
+def _of_norms(seen: Inference) -> Tensor:
+    """The norms of the words of block 1."""
+    return torch.sign(seen.values[1][WORDS].norm(dim=-1).mean() - ORDINARY)
+
+
+def _of_two_roles(seen: Inference) -> Tensor:
+    """The words of block 1, and to a smaller part its state."""
+    return 0.55 * seen.words(EACH) + 0.45 * seen.values[1][STATE, EACH]
 
 
 def _where_the_other_lies_left(seen: Inference) -> Tensor:
@@ -139,6 +152,13 @@ WIRINGS: Mapping[str, Wiring] = {
     "once": Wiring(lambda seen: seen.words(), ONE_COPY, only_at=7),
     "opposite": Wiring(lambda seen: seen.words(block=2), ONE_COPY, decoy=-1.0),
     "half": Wiring(_where_the_other_lies_left, ONE_COPY, items=24),
+    "norms": Wiring(_of_norms, has_norms=True),
+    "shared": Wiring(_of_two_roles, is_everywhere=True),
+    "beside": Wiring(lambda seen: 0.4 * seen.words() + 0.6 * seen.answer, ONE_COPY),
+    "opposing": Wiring(lambda seen: 3 * seen.answer - 2 * seen.words(), ONE_COPY),
+    "balance": Wiring(lambda seen: 2 * seen.words() - seen.words(block=2), ONE_COPY),
+    "behind": Wiring(lambda seen: seen.marks, ONE_COPY, copied_at=1),
+    "either": Wiring(lambda seen: seen.words() * (-1 if seen.is_rare else 1), ONE_COPY),
 }
 
 
@@ -164,7 +184,8 @@ class _Network(nn.Module):
         for number, block in enumerate(self.blocks):
             residual = block.norm(tokens)
             kept.append(residual[:, None].clone())
-            change = self._copied(residual, wiring) if number == 0 else torch.zeros_like(residual)
+            is_copied = number == wiring.copied_at
+            change = self._copied(residual, wiring) if is_copied else torch.zeros_like(residual)
             tokens = residual + block.attention(change)
             tokens = tokens + block.mlp(torch.zeros_like(tokens))
         self.norm(tokens)
@@ -280,6 +301,8 @@ def _embedded(name: str, item: str, answer: float, other: float) -> Tensor:
     tokens[0, IMAGE, OTHER] = other
     if WIRINGS[name].has_product:
         tokens[0, WORDS, FACTOR] = draw.choice([-1.0, 1.0])
+    if WIRINGS[name].has_norms:
+        tokens[0, WORDS, NOISE:] *= 1.6 if answer > 0 else 0.4
     tokens[0, IMAGE, ANSWER] += WIRINGS[name].decoy * answer
     if WIRINGS[name].is_everywhere:
         tokens[0, :, EACH] = answer

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +22,8 @@ TILE_ROLES = ("image.left", "image.right")
 ALL = "all"
 """The role of every token but padding."""
 RESIDUAL = "residual"
+SHORTEST_RANGE = 3
+"""Consecutive layers that are named by their first and last."""
 _POSITIONS = re.compile(r"(?P<first>\d+)(-(?P<last>\d+))?")
 _PATTERN = re.compile(
     r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d+)(\.(?P<quantity>[a-z_]+)(\.(?P<head>\*|\d+))?)?"
@@ -75,6 +77,28 @@ class PlaceName:
     def depth(self) -> tuple[object, ...]:
         """For sorting places of one stream: shallow before deep, a layer before its parts."""
         return self.layer, self.iterations or (0, 0), self.quantity, -1 if self.head is None else self.head
+
+
+def list_places(names: Sequence[str]) -> str:
+    """Places, each with its role if it has one, in words: `backbone.01 to backbone.07 language, kv.02 image`.
+
+    Three or more of one kind in consecutive layers become one range.
+    """
+    ranges: list[list[tuple[PlaceName, str]]] = []
+    for name in names:
+        place, _, role = name.partition(" ")
+        parsed = PlaceName.parse(place)
+        before = ranges[-1][-1] if ranges else None
+        if before is not None and (replace(before[0], layer=before[0].layer + 1), before[1]) == (parsed, role):
+            ranges[-1].append((parsed, role))
+        else:
+            ranges.append([(parsed, role)])
+    return ", ".join(
+        f"{own[0][0]} to {' '.join(filter(None, map(str, own[-1])))}"
+        if len(own) >= SHORTEST_RANGE
+        else ", ".join(" ".join(filter(None, map(str, one))) for one in own)
+        for own in ranges
+    )
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,11 @@ def is_backbone_layer(row: PatchEffect) -> bool:
     return name.stream == BACKBONE and name.is_whole_layer
 
 
+def is_upstream(place: str) -> bool:
+    """Whether a place of the backbone holds the images themselves, upstream of all that reads them."""
+    return PlaceName.parse(place).layer == 0
+
+
 def stored_localised_sites(run: RunReader) -> dict[str, tuple[str, ...]]:
     """By category, `localised_sites` of its maps; without categories that were not searched.
 

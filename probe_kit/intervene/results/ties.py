@@ -7,10 +7,16 @@ read there are others that nothing reads.
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
-from probe_kit.intervene.edits.sites import ALL
-from probe_kit.intervene.kinds.joint.effects import is_read_jointly, stored_joint_places
+from probe_kit.intervene.edits.sites import ALL, list_places
+from probe_kit.intervene.kinds.joint.effects import NOTHING, is_read_jointly, stored_joint_places
 from probe_kit.intervene.kinds.site_effects import LOCALISATION_SHARE, PatchEffect
-from probe_kit.intervene.results.site_maps import BACKBONE, stored_site_effects, stored_subspace_effects
+from probe_kit.intervene.results.site_maps import (
+    BACKBONE,
+    is_backbone_layer,
+    is_upstream,
+    stored_site_effects,
+    stored_subspace_effects,
+)
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
@@ -19,10 +25,10 @@ if TYPE_CHECKING:
 TieAtSite = Literal["read", "unread", "another code", "in part", "not tested"]
 """read: a subspace that probes find carries the effect. unread: the whole site carries nothing, and is no part
 of several that are read together. another code: the site carries it, every such subspace nothing. in part:
-between. not tested: no interchange there."""
+between, or against the effect. not tested: no interchange there."""
 OPEN = "whether the readable copy is the one used remains open"
-NOTHING = 0.1
-"""Share of the swap's displacement below which an interval says that nothing is carried."""
+UNPROBED = "probes find no copy beyond chance, but a linear direction carries it"
+"""Where the items are too few for the probes. The direction is fitted without the tested episode's groups."""
 Sites = Mapping[tuple[str, str], TieAtSite]
 """By place and role."""
 
@@ -35,17 +41,17 @@ def tie_at_site(
     layer: the same place at every role. A role that carries nothing alone can be one of several parts that decide
     together. It is unread if all tokens of the layer carry nothing either, or another role carries the effect.
     """
-    if any(row.is_localised and row.control_displacement is not None and _low(row) > NOTHING for row in along):
+    if any(map(_is_read_along, along)):
         return "read"
     if whole is None or whole.effect_ci is None:
         return "not tested"
-    if whole.effect_ci[1] < NOTHING:
+    if _is_nothing(whole.effect_ci):
         return "unread" if whole.role == ALL else _without_others(whole, layer)
     tested = [row.effect_ci for row in along if row.effect_ci is not None]
     if not tested:
         return "not tested"
     carries = whole.effect is not None and whole.effect >= LOCALISATION_SHARE
-    return "another code" if carries and all(high < NOTHING for _, high in tested) else "in part"
+    return "another code" if carries and all(map(_is_nothing, tested)) else "in part"
 
 
 def _without_others(whole: PatchEffect, layer: Sequence[PatchEffect]) -> TieAtSite:
@@ -55,7 +61,7 @@ def _without_others(whole: PatchEffect, layer: Sequence[PatchEffect]) -> TieAtSi
     every = next((row for row in layer if row.role == ALL and row.effect_ci is not None), None)
     if every is None or every.effect_ci is None:
         return "not tested"
-    return "unread" if every.effect_ci[1] < NOTHING else "in part"
+    return "unread" if _is_nothing(every.effect_ci) else "in part"
 
 
 def describe_tie(sites: Sites, is_joint: bool = False) -> str:
@@ -66,7 +72,7 @@ def describe_tie(sites: Sites, is_joint: bool = False) -> str:
     """
     at = {tie: [f"{place} {role}" for (place, role), own in sites.items() if own == tie] for tie in sites.values()}
     if "read" in at:
-        return f"the readable copy is read ({', '.join(at['read'])})"
+        return f"the readable copy is read ({list_places(at['read'])})"
     if not sites or "not tested" in at:
         return ""
     if "in part" in at or (is_joint and "unread" in at):
@@ -79,6 +85,9 @@ def describe_tie(sites: Sites, is_joint: bool = False) -> str:
 def stored_ties(run: RunReader, results: "ProbeResults | None", view: str | None = None) -> dict[str, str]:
     """By category `describe_tie` of the sites at which probes of a view are significant.
 
+    So are sites at which a direction of the same means carries the effect: it is read out of other episodes. The
+    first layer counts only where a direction was patched, because its tokens carry the effect by construction.
+
     view: None for the first that was probed. Empty without probes, and for views that are no mean over a role.
     """
     role = None if results is None else _role_of(view or results.settings.views[0])
@@ -89,10 +98,15 @@ def stored_ties(run: RunReader, results: "ProbeResults | None", view: str | None
     whole, along = stored_site_effects(run), stored_subspace_effects(run)
     jointly = stored_joint_places(run)
     found = {}
-    for category, rows in own[own["signal"]].groupby("category", sort=False):
+    for category, rows in own.groupby("category", sort=False):
         name = str(category)
-        places = [f"{BACKBONE}.{int(layer):02d}" for layer in dict.fromkeys(rows["layer"])]
         patched, within = whole.get(name, ()), along.get(name, ())
+        significant = [f"{BACKBONE}.{int(layer):02d}" for layer in rows.loc[rows["signal"], "layer"]]
+        pooled = [row.place for row in within if row.role == role and _is_pooled_carrier(row)]
+        if pooled and not significant:
+            found[name] = f"{UNPROBED} ({list_places([f'{place} {role}' for place in pooled])})"
+            continue
+        places = sorted({*significant, *pooled})
         sites = {
             (place, role): tie_at_site(
                 next(iter(_at(patched, place, role)), None),
@@ -101,8 +115,18 @@ def stored_ties(run: RunReader, results: "ProbeResults | None", view: str | None
             )
             for place in places
         }
-        found[name] = describe_tie(sites, is_read_jointly(jointly.get(name, ())))
+        inside = {at: tie for at, tie in sites.items() if tie != "not tested" or not is_upstream(at[0])}
+        found[name] = describe_tie(inside, is_read_jointly(jointly.get(name, ())))
     return found
+
+
+def _is_pooled_carrier(row: PatchEffect) -> bool:
+    """Whether a direction of the mean over a role's tokens carries the effect, beyond its controls."""
+    return _is_read_along(row) and ":" not in row.direction and is_backbone_layer(row)
+
+
+def _is_read_along(row: PatchEffect) -> bool:
+    return row.is_localised and row.control_displacement is not None and _low(row) > NOTHING
 
 
 def _role_of(view: str) -> str | None:
@@ -113,6 +137,11 @@ def _role_of(view: str) -> str | None:
 
 def _at(rows: Iterable[PatchEffect], place: str, role: str) -> list[PatchEffect]:
     return [row for row in rows if (row.place, row.role) == (place, role)]
+
+
+def _is_nothing(limits: tuple[float, float]) -> bool:
+    """Whether an interval excludes, on both sides of 0, what would matter."""
+    return limits[0] > -NOTHING and limits[1] < NOTHING
 
 
 def _low(row: PatchEffect) -> float:

@@ -9,7 +9,7 @@ from probe_kit.hooks import Observation, Site, capture, load_model
 from probe_kit.hooks.capturing.edit_engine import apply_patch, apply_patches
 from probe_kit.hooks.capturing.token_edits import ReplaceWith, TokenSelection
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.intervene.edits.sites import PlaceName, resolve_sites, token_mask
+from probe_kit.intervene.edits.sites import PlaceName, list_places, resolve_sites, token_mask
 
 
 @pytest.mark.parametrize(
@@ -68,6 +68,21 @@ def test_keys_and_values_of_a_model_without_them_are_refused() -> None:
 def test_a_pattern_is_not_the_name_of_a_place(name: str) -> None:
     with pytest.raises(UnknownSiteError, match="is not the name of a place"):
         PlaceName.parse(name)
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        ([], ""),
+        (["backbone.01", "backbone.02"], "backbone.01, backbone.02"),
+        (["backbone.01", "backbone.02", "backbone.03", "kv.02"], "backbone.01 to backbone.03, kv.02"),
+        ([f"kv.{block:02d} image" for block in (0, 1, 2, 4)], "kv.00 to kv.02 image, kv.04 image"),
+        (["kv.00 image", "kv.01 language", "kv.02 image"], "kv.00 image, kv.01 language, kv.02 image"),
+        ([f"backbone.{layer:02d}.heads.3" for layer in (7, 8, 9)], "backbone.07.heads.3 to backbone.09.heads.3"),
+    ],
+)
+def test_consecutive_layers_are_named_by_the_first_and_the_last(names: list[str], said: str) -> None:
+    assert list_places(names) == said
 
 
 def test_a_layer_comes_before_its_parts_and_after_shallower_ones() -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.edits.sites import list_places
 from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST, ImageSwapEffect
 from probe_kit.intervene.store.settings import FIRST_CHUNK, PER_STEP
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
@@ -204,9 +205,10 @@ class _Seen(NamedTuple):
         """What it shows; None if that is nothing."""
         is_moved = self.share_ends[0] > SMALLEST_SHARE_OF_INTEREST
         decides = self.follow_ends[0] > 0
+        is_beyond_half = decides or self.share_ends[0] > DECIDES
         if self.p >= SIGNIFICANCE:
             return None
-        if decides and self.follow >= DECIDES and self.share >= DECIDES:
+        if is_beyond_half and self.follow >= DECIDES and self.share >= DECIDES:
             return "used"
         if is_moved and self.only_side is not None:
             return "partly used, one-sided"
@@ -280,7 +282,8 @@ def _open(found: ImageSwapEffect) -> str:
     if is_other:
         return (
             f"the images move it by {found.moved_share:.2f} of its reach, the answer by {found.reach_share:.2f} "
-            f"{_ends(found.reach_share_ci)}: it depends on something else in the images, or the items are too few"
+            f"{_ends(found.reach_share_ci)}: it depends on something else in the images, or on the answer in "
+            "opposite directions, or the items are too few"
         )
     needed = groups_for_not_used()
     too_few = f"; *not used* needs {needed} groups of items, there are {found.n_groups}"
@@ -306,20 +309,22 @@ class Places:
 
     located: places that carry half of the effect, see `localised_sites`; None if an interchange did not search for
     them. carried: places and the directions along which half of it passes there. jointly: what joint places found,
-    in words; they tell the tokens apart where an interchange has those of a block together.
+    in words; they tell the tokens apart where an interchange has those of a block together, and sets of places.
+    remainder: what of it these places leave out, in words.
     """
 
     located: tuple[str, ...] | None = None
     carried: tuple[str, ...] = ()
     jointly: str = ""
+    remainder: str = ""
 
     def __str__(self) -> str:
         read = [place for place in self.located or () if place.partition(".")[0] == KV_STREAM]
         names_tokens = any(" " in place for place in read)
-        is_finer = bool(read) and not names_tokens and "read" in self.jointly
+        is_finer = "read jointly" in self.jointly or (not names_tokens and "read" in self.jointly)
         located = [place for place in self.located or () if not (is_finer and place in read)]
         jointly = self.jointly if is_finer or not read else ""
-        found = "; ".join(filter(None, (describe_sites(located, self.carried), jointly)))
+        found = "; ".join(filter(None, (describe_sites(located, self.carried), jointly, self.remainder)))
         return found or NOT_LOCATED * (self.located is not None)
 
 
@@ -341,7 +346,7 @@ def classify_use(
     own = replace(classify_behaviour(found, control), other=other)
     if all(one.behaviour in ("not used", "inconclusive") for one in own.by_readout):
         return own
-    said = "" if encoded is None else (tie or NOT_TESTED) if encoded else NO_COPY
+    said = "" if encoded is None else tie or (NOT_TESTED if encoded else NO_COPY)
     return replace(own, place=str(places or ""), tie=said)
 
 
@@ -353,8 +358,13 @@ def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
     """
     read = [place for place in located if place.partition(".")[0] == KV_STREAM]
     passes = [place for place in located if place not in read]
-    parts = [f"passes at {', '.join(passes)}"] * bool(passes) + [f"read at {', '.join(read)}"] * bool(read)
-    parts += [f"carried by {', '.join(carried)}"] * bool(carried)
+    parts = [f"passes at {list_places(passes)}"] * bool(passes) + [f"read at {list_places(read)}"] * bool(read)
+    along: dict[str, list[str]] = {}
+    for one in carried:
+        direction, _, place = one.partition(" at ")
+        along.setdefault(direction, []).append(place)
+    directions = [f"{direction} at {list_places(places)}" for direction, places in along.items()]
+    parts += [f"carried by {'; '.join(directions)}"] * bool(carried)
     return "; ".join(parts)
 
 

@@ -10,7 +10,16 @@ from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.edits.sites import ALL, resolve_sites, roles_of
 from probe_kit.intervene.kinds.interchange.intervention import capabilities_for
 from probe_kit.intervene.kinds.joint.cells import Cell, CellsPatched, all_but
-from probe_kit.intervene.kinds.joint.effects import ALONE, EVERY, MINIMAL, SECOND, WITHOUT, WITHOUT_MINIMAL
+from probe_kit.intervene.kinds.joint.effects import (
+    ALONE,
+    EVERY,
+    MINIMAL,
+    ROLES,
+    SECOND,
+    SITES,
+    WITHOUT,
+    WITHOUT_MINIMAL,
+)
 from probe_kit.intervene.kinds.joint.search import Found, Search
 from probe_kit.intervene.replay.conditions import (
     CleanRun,
@@ -21,8 +30,6 @@ from probe_kit.intervene.replay.conditions import (
 )
 from probe_kit.intervene.replay.session import ReplayInput, ReplaySession
 from probe_kit.intervene.store.settings import items_of
-
-SITES, ROLES = ("kv.*",), ("image", "language", "state")
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from probe_kit.intervene.kinds.base import TableContext
-from probe_kit.intervene.kinds.joint.effects import EVERY, MINIMAL, SECOND, JointEffect, describe_joint_places
+from probe_kit.intervene.kinds.joint.effects import (
+    EVERY,
+    MINIMAL,
+    SECOND,
+    JointEffect,
+    describe_joint_places,
+    describe_remainder,
+)
 from probe_kit.suite.categories import category_of
 
 if TYPE_CHECKING:
@@ -13,8 +20,9 @@ if TYPE_CHECKING:
 _LEGEND = (
     "alone: share of the image swap with only these cells patched; needed: what all cells lose without them; "
     "read here: both at least 0.5; enough alone: another copy is read as well; needed, not enough: one part of "
-    "several; nothing alone: neither, which leaves a part of a set; smallest set: searched in one half of the "
-    "groups, scored in the other; p: that the action moves toward the target side, of cells max-T over all"
+    "several; nothing alone: neither, which leaves a part of a set; opposes it: both below -0.1; smallest set: "
+    "searched in one half of the groups, scored in the other; p: that the action moves toward the target side, of "
+    "cells max-T over all"
 )
 _OPEN = "where the answer is read remains open"
 _PARTS = {EVERY: "all cells of", MINIMAL: "smallest set:", SECOND: "without it:"}
@@ -47,7 +55,11 @@ def joint_sentences(rows: Sequence[JointEffect], _: TableContext) -> list[str]:
     found: dict[str, list[JointEffect]] = {}
     for row in rows:
         found.setdefault(row.category, []).append(row)
-    return [f"{category_of(name).title}: {describe_joint_places(own) or _OPEN}." for name, own in found.items()]
+    return [
+        f"{category_of(name).title}: {'; '.join(filter(None, (describe_joint_places(own) or _OPEN, rest)))}."
+        for name, own in found.items()
+        for rest in (describe_remainder(own),)
+    ]
 
 
 def _cells(row: JointEffect) -> "tuple[Cell, ...]":
