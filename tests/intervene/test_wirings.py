@@ -1,7 +1,7 @@
 """Verdicts on policies whose wiring is known: what they read, and where, is written down in `wirings`."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from probe_kit.intervene.kinds.joint.effects import (
     measured_joint_places,
 )
 from probe_kit.intervene.kinds.joint.intervention import JointPlaces
+from probe_kit.intervene.kinds.joint.table import few_groups_notes
 from probe_kit.intervene.kinds.site_effects import patch_effects
 from probe_kit.intervene.replay.conditions import Condition
 from probe_kit.intervene.results.site_maps import localised_sites
@@ -179,6 +180,9 @@ def test_a_single_place_is_read_and_is_the_smallest_set(wired: WiredSession) -> 
     assert (rows["kv.01 language"].finding, rows["kv.02 language"].finding) == ("read here", "nothing alone")
     assert (rows["minimal"].cells, rows["minimal"].finding) == ("kv.01 language", "read here")
     assert describe_joint_places(list(rows.values())) == "read at kv.01 language"
+    assert few_groups_notes([rows["minimal"]], None) == []  # type: ignore[arg-type]
+    (note,) = few_groups_notes([replace(rows["minimal"], n_groups=4)], None)  # type: ignore[arg-type]
+    assert note.startswith("copied: the smallest set is scored in 4 groups, in which no p can be below 0.062")
 
 
 def test_a_majority_of_blocks_is_read_jointly_and_at_no_single_place(wired: WiredSession) -> None:

@@ -71,7 +71,7 @@ def _cells(row: PatchEffect) -> "tuple[Cell, ...]":
 
     low, high = row.net_ci
     texts = (
-        "n/a" if row.effect is None else f"{row.effect:.2f}{'*' * row.is_by_construction}",
+        "n/a" if row.effect is None else f"{row.effect:.2f}{'*' * (row.is_localised and row.is_by_construction)}",
         f"{row.net:+.2f} [{low:+.2f}, {high:+.2f}]",
         f"{row.net_left:+.2f} / {row.net_right:+.2f}",
         f"{100 * row.mean_displacement:+.2f}",

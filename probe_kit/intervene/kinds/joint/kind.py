@@ -9,6 +9,7 @@ KIND = Kind(
     effects="probe_kit.intervene.kinds.joint.effects:measured_joint_places",
     table="probe_kit.intervene.kinds.joint.table:joint_table",
     sentences="probe_kit.intervene.kinds.joint.table:joint_sentences",
+    notes="probe_kit.intervene.kinds.joint.table:few_groups_notes",
     options={
         "sites": "of cells that run in parallel: several blocks of kv, or one layer; default kv.*",
         "roles": "of the cells' tokens; default image,language,state",

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit.intervene.kinds.base import TableContext
+from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.kinds.joint.effects import (
     EVERY,
     MINIMAL,
@@ -12,6 +12,8 @@ from probe_kit.intervene.kinds.joint.effects import (
     describe_joint_places,
     describe_remainder,
 )
+from probe_kit.statistics.sign_flips import smallest_flip_p
+from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite.categories import category_of
 
 if TYPE_CHECKING:
@@ -60,6 +62,20 @@ def joint_sentences(rows: Sequence[JointEffect], _: TableContext) -> list[str]:
         for name, own in found.items()
         for rest in (describe_remainder(own),)
     ]
+
+
+def few_groups_notes(rows: Sequence[JointEffect], _: Measurement) -> list[str]:
+    """Where the half of the groups that scores a smallest set cannot confirm any."""
+    too_few = {row.category: row.n_groups for row in rows if row.part == MINIMAL and _cannot_confirm(row.n_groups)}
+    return [
+        f"{name}: the smallest set is scored in {count} groups, in which no p can be below "
+        f"{smallest_flip_p(count):.2g}, so that none is confirmed. Play more (--items)."
+        for name, count in too_few.items()
+    ]
+
+
+def _cannot_confirm(groups: int) -> bool:
+    return smallest_flip_p(groups) >= SIGNIFICANCE
 
 
 def _cells(row: JointEffect) -> "tuple[Cell, ...]":
