@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from probe_kit.study.packing.data_set import write_data_set
     from probe_kit.study.packing.pack import pack_study
     from probe_kit.study.packing.publishing import publish_data_set
+    from probe_kit.study.packing.report import write_study_report
     from probe_kit.study.packing.trackers import track_study
     from probe_kit.study.planning.plan import StudyPlan, plan_study
     from probe_kit.study.reading import LoadedStudy, load_study
@@ -45,6 +46,7 @@ __all__ = [
     "publish_data_set",
     "track_study",
     "write_data_set",
+    "write_study_report",
 ]
 
 __getattr__, __dir__ = lazy_names(
@@ -61,6 +63,7 @@ __getattr__, __dir__ = lazy_names(
         "publish_data_set": "packing.publishing",
         "track_study": "packing.trackers",
         "write_data_set": "packing.data_set",
+        "write_study_report": "packing.report",
         "StudyPlan": "planning.plan",
         "plan_study": "planning.plan",
         "Failure": "ledger",

@@ -90,9 +90,8 @@ def run(
     plan = plan_study(study, only)
     if calibrate:
         plan = _calibrated(plan, env_workers)
-    if dry_run or as_json:
-        print_json(plan.to_json()) if as_json else print_plan(plan)
     if dry_run:
+        _print(plan, as_json)
         return
     failed = _played(plan, slots=slots, ray=ray, env_workers=env_workers, retry_failed=retry_failed)
     if plan.totals()["missing"]:
@@ -100,11 +99,15 @@ def run(
     if plan.totals()["unprobed"] and not no_probes:
         failed += _probed(plan, jobs or slots or None)
         plan = plan_study(study, only)
-    print_plan(plan)
+    _print(plan, as_json)
     for failure in failed:
         say(marked("[red]{}[/]", failure))
     if failed or plan.totals()["missing"]:
         raise typer.Exit(UNFINISHED)
+
+
+def _print(plan: "StudyPlan", as_json: bool) -> None:
+    print_json(plan.to_json()) if as_json else print_plan(plan)
 
 
 def _calibrated(plan: "StudyPlan", env_workers: int | None) -> "StudyPlan":
@@ -160,7 +163,7 @@ def status(file: File, only: Only = None, as_json: AsJson = False) -> None:
     from probe_kit.study import load_study, plan_study
 
     plan = plan_study(load_study(file), only)
-    print_json(plan.to_json()) if as_json else print_plan(plan)
+    _print(plan, as_json)
     if not plan.whole:
         raise typer.Exit(UNFINISHED)
 
@@ -174,7 +177,10 @@ def table(
     style: Annotated[Style, typer.Option("--format", help="Output format.")] = "table",
     partial: Partial = False,
 ) -> None:
-    """Print a table of a study, or all, from its stored runs. Loads no model."""
+    """Print a table of a study, or all, from its stored runs. Loads no model.
+
+    With --partial the command exits with 1 if anything is missing that the study would play.
+    """
     from probe_kit.retention.formats.latex import latex_table
     from probe_kit.retention.formats.terminal import responsive_table
     from probe_kit.study import load_study, make_table
@@ -192,15 +198,17 @@ def table(
     if style == "json":
         found = {one: table_json(own) for one, own in made.items()}
         print_json(found[name] if name else found)
-        return
-    for own in made.values():
-        if style == "table":
+    elif style == "table":
+        for own in made.values():
             out.print(responsive_table(own.text))
-        else:
-            print_text(latex_table(own.text) if style == "latex" else markdown_text(own))
-    if not name:
+    else:
+        texts = (latex_table(own.text) if style == "latex" else markdown_text(own) for own in made.values())
+        print_text("\n\n".join(text.rstrip("\n") for text in texts))
+    if not name and style != "json":
         tests = sum(own.n_tests for own in made.values())
         say(f"{len(made)} tables with {tests} tests; each is corrected within its own comparison.")
+    if len(made) < (1 if name else len(study.study.tables)) or any(own.is_partial for own in made.values()):
+        raise typer.Exit(UNFINISHED)
 
 
 @app.command("figure")
@@ -224,6 +232,30 @@ def figure(
     for one in [name] if name else study.study.figures:
         for path in save_figures(make_figures(study, one, partial), out_folder):
             out.print(str(path), highlight=False, markup=False, soft_wrap=True)
+
+
+@app.command("report")
+def report(
+    file: File,
+    html: Annotated[Path, typer.Option("--html", metavar="PATH", help="HTML file to write.")],
+    partial: Partial = False,
+) -> None:
+    """Write state, all tables and all figures of a study as one HTML file, from its stored runs. Loads no model.
+
+    With --partial the command exits with 1 if anything is missing that the study would play.
+    """
+    from probe_kit.retention.label_commands import say_report
+    from probe_kit.study import load_study, write_study_report
+
+    if html.is_dir():
+        raise UsageError(f"--html {html} is a folder; give a file, such as {html / 'report.html'}")
+    with err.status("drawing the report"):
+        made = write_study_report(load_study(file), html, partial)
+    say_report(html)
+    for name, reason in made.missing.items():
+        say(marked("[red]no {}: {}[/]", name, reason))
+    if made.is_partial:
+        raise typer.Exit(UNFINISHED)
 
 
 @app.command("pack")

@@ -1,7 +1,7 @@
 """Expansion of a study file into its cells."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,10 +10,32 @@ from probe_kit._terminal.options import read_size
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
 from probe_kit.extract.vqa.templates import find_template
+from probe_kit.hooks.registry import family_names, get_family
 from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.mistakes import Mistake
+from probe_kit.study.places import Place
 from probe_kit.study.planned_suite import PlannedSuite, slugs
 from probe_kit.study.schema import AskTable, BlockTable, ConditionTable, ModelTable, Study
+
+SCRIPTED = ("expert", "expert-mirrored", "idle")
+"""Policies without a network, which stand in place of a family."""
+
+
+def is_known(model: ModelTable) -> bool:
+    """Whether there is such a family."""
+    return model.family in SCRIPTED or model.family in family_names()
+
+
+def answers(model: ModelTable) -> bool:
+    """Whether the model is a VLM."""
+    family = get_family(model.family)
+    return family is not None and family.reads
+
+
+def acts(model: ModelTable) -> bool:
+    """Whether the model is a policy."""
+    family = get_family(model.family)
+    return model.family in SCRIPTED or (family is not None and family.acts)
 
 
 @dataclass(frozen=True)
@@ -27,7 +49,7 @@ class Member:
     seed: int
 
     @property
-    def path(self) -> tuple[str | int, ...]:
+    def path(self) -> Place:
         """Of the list that names its condition or ask."""
         return ("runs", self.place, "conditions" if self.block.conditions else "asks")
 
@@ -47,18 +69,27 @@ def excludes(rule: dict[str, str], model: str, way: str) -> bool:
     return all(names[part] == value for part, value in rule.items())
 
 
-def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]]:
-    """The cells of a study whose names are all known, and mistakes that only their settings show.
+def expand(
+    study: Study, suite: PlannedSuite, known_mistakes: Sequence[Mistake] = ()
+) -> tuple[list[Cell], list[Mistake]]:
+    """The cells of a study, and mistakes that only their settings show.
 
     Blocks that ask for the same run share its cell.
+    known_mistakes: of the file; runs of their tables are left out.
     """
     found: dict[tuple[str, str, int], Cell] = {}
     mistakes: list[Mistake] = []
-    for member in members(study):
+    wrong = {one.path[:length] for one in known_mistakes if not one.absent for length in (2, 3)}
+    for member in (one for one in members(study) if _can_be_made(study, one, wrong)):
         try:
             settings = _settings(study, member)
         except ProbeKitError as error:
             mistakes.append(Mistake(_blamed(study, member, str(error)), str(error)))
+            continue
+        try:
+            settings.scene.to_json()
+        except ProbeKitError as error:  # of the one file that a scene is drawn with
+            mistakes.append(Mistake(("conditions", member.way, "background"), str(error)))
             continue
         selection = _selection(study, member.block, suite)
         place = (member.model, member.way, member.seed)
@@ -77,14 +108,28 @@ def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]
     return list(found.values()), list(dict.fromkeys(mistakes))
 
 
+def _can_be_made(study: Study, member: Member, wrong: set[Place]) -> bool:
+    """Whether the names of a run are known and nothing is wrong with its model and its condition or ask."""
+    model, (home, ways) = study.models.get(member.model), _ways(study, member)
+    concerned: set[Place] = {("models", member.model), (home, member.way), ("runs", member.place, "tokens")}
+    if model is None or member.way not in ways or wrong & concerned:
+        return False
+    return answers(model) if member.block.asks else acts(model)
+
+
+def _ways(study: Study, member: Member) -> tuple[str, Mapping[str, ConditionTable | AskTable]]:
+    """The tables that hold its condition or ask, and their name."""
+    return ("asks", study.asks) if member.block.asks else ("conditions", study.conditions)
+
+
 def _selection(study: Study, block: BlockTable, suite: PlannedSuite) -> Selection:
     categories = block.categories or study.suite.categories or list(suite.items)
     return Selection(slugs(categories), block.items or study.suite.items)
 
 
-def _blamed(study: Study, member: Member, said: str) -> tuple[str | int, ...]:
+def _blamed(study: Study, member: Member, said: str) -> Place:
     """The table whose values a settings error is of, and the key in it that the message names."""
-    home, name = ("conditions" if member.block.conditions else "asks"), member.way
+    home, name = _ways(study, member)[0], member.way
     try:
         _settings_of(study, member.model, ConditionTable(), None)
     except ProbeKitError:
@@ -162,7 +207,8 @@ def _same_settings(cells: list[Cell]) -> list[Mistake]:
             if alike and cell.way != other.way:
                 home = "asks" if cell.asks else "conditions"
                 said = f"is the same as {other.way!r} for {cell.model!r}: all values are equal"
-                found.append(Mistake((home, cell.way), f"{said}. Leave one out, or exclude it for this model"))
+                said = f"{said}. Leave one out, or exclude it for this model"
+                found.append(Mistake((home, cell.way), said, absent=True))
     return found
 
 
@@ -186,4 +232,5 @@ def _without_control(study: Study, cells: list[Cell]) -> Iterator[Mistake]:
             probed = any(block in table.runs for block in cell.selections) and not cell.unavailable
             if probed and model.untrained is not None and control_of(study, cells, cell) is None:
                 said = f"{model.untrained!r}, the control of {cell.name}, has no run in the same scene"
-                yield Mistake(("probes", name, "controls"), f"{said}; play it so, or capture it so with no_act")
+                said = f"{said}; play it so, or capture it so with no_act"
+                yield Mistake(("probes", name, "controls"), said, absent=True)

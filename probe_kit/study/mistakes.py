@@ -1,25 +1,46 @@
 """Mistakes in a study file: where each stands, what is wrong, and what would be right."""
 
+import json
+import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 
 from probe_kit.errors import UsageError
-from probe_kit.study.places import line_of
+from probe_kit.study.places import Place, line_of
+
+_BARE = re.compile(r"[\w.-]+")
+_LONGEST = 60
+"""Characters of a name or value that a message quotes."""
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """path: of the value in the file, such as `("runs", 0, "models")`. text: what is wrong and what is right."""
+    """path: of the value in the file, such as `("runs", 0, "models")`. text: what is wrong and what is right.
 
-    path: tuple[str | int, ...]
+    absent: whether something is not there, which may follow from another mistake. name: the unknown one.
+    """
+
+    path: Place
     text: str
+    absent: bool = False
+    name: str = ""
 
     @property
     def place(self) -> str:
         """The path as it would be written, such as `runs[0].models`."""
-        parts = [f"[{part}]" if isinstance(part, int) else f".{part}" for part in self.path]
+        parts = [f"[{part}]" if isinstance(part, int) else f".{_key(part)}" for part in self.path]
         return "".join(parts).removeprefix(".") or "the file"
+
+
+def _key(name: str) -> str:
+    """A name on one line, in quotes where it needs them."""
+    return shortened(name if _BARE.fullmatch(name) else json.dumps(name))
+
+
+def shortened(text: str) -> str:
+    """The text, or its beginning."""
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
 class StudyFileError(UsageError):
@@ -36,11 +57,9 @@ def unknown(what: str, name: str, known: Collection[str], none: str = "there are
     """What to say of a name that is not known, with the nearest match."""
     near = get_close_matches(name, known, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
-    return f"unknown {what} {name!r}; known: {', '.join(known) or none}.{hint}"
+    return f"unknown {what} {shortened(name)!r}; known: {', '.join(known) or none}.{hint}"
 
 
-def each_unknown(
-    path: tuple[str | int, ...], what: str, names: Iterable[str], known: Collection[str]
-) -> list[Mistake]:
+def each_unknown(path: Place, what: str, names: Iterable[str], known: Collection[str]) -> list[Mistake]:
     """A mistake per name that is not known."""
-    return [Mistake(path, unknown(what, name, known)) for name in names if name not in known]
+    return [Mistake(path, unknown(what, name, known), name=name) for name in names if name not in known]

@@ -1,10 +1,12 @@
 """Reading of study files, your own and those of the package."""
 
+import re
 import tomllib
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
@@ -13,14 +15,13 @@ from probe_kit.study import schema
 from probe_kit.study.archive import RUNS, STUDY_FILE, Pack, open_archive
 from probe_kit.study.cells import Cell
 from probe_kit.study.expansion import expand
-from probe_kit.study.mistakes import Mistake, StudyFileError
+from probe_kit.study.left_over import LeftOver
+from probe_kit.study.mistakes import Mistake, StudyFileError, shortened
+from probe_kit.study.places import Place, part_in_file
 from probe_kit.study.planned_suite import PlannedSuite, planned_suite
 from probe_kit.study.references import reference_mistakes
 
-_WORDS = {
-    "extra_forbidden": "unknown key",
-    "missing": "is missing",
-}
+_NAME_PATTERN = "'^[a-z0-9][a-z0-9._-]{0,59}$'"
 
 
 @dataclass(frozen=True)
@@ -70,22 +71,16 @@ def load_study(name: str | Path) -> LoadedStudy:
     """
     archive = open_archive(name)
     file = find_study(str(name)) if archive is None else archive / STUDY_FILE
+    text, content = _parsed(file)
     try:
-        text = file.read_text(encoding="utf-8")
-        study = schema.Study.model_validate(tomllib.loads(text))
-    except UnicodeDecodeError as error:
-        raise UsageError(f"{file} is no UTF-8 text: {error}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise UsageError(f"{file}: {error}. The file is TOML 1.0") from error
+        study = schema.Study.model_validate(content)
     except ValidationError as error:
-        raise StudyFileError(str(file), text, _mistakes(error)) from None
+        raise StudyFileError(str(file), text, [*_mistakes(error, content), *_further(error, content)]) from None
     if archive is not None:  # its runs are all it has
         study = study.model_copy(update={"reuse": schema.ReuseTable()})
     suite, mistakes = planned_suite(study.suite) if archive is None else (_packed_suite(archive), [])
-    mistakes += reference_mistakes(study, suite)
-    if not mistakes:
-        cells, mistakes = expand(study, suite)
-    if mistakes:
+    cells, found = _checked(study, suite)
+    if mistakes := [*mistakes, *found]:
         raise StudyFileError(str(file), text, mistakes)
     if archive is None:
         return LoadedStudy(file, study, suite, tuple(cells))
@@ -100,32 +95,82 @@ def _packed_suite(archive: Path) -> PlannedSuite:
     return PlannedSuite(str(suite["identity"]), dict(suite["items"]), None, "the archive", here=False)
 
 
-def _mistakes(error: ValidationError) -> list[Mistake]:
+def _parsed(file: Path) -> tuple[str, dict[str, Any]]:
+    """Text and content of a file. Raises UsageError for what is no TOML."""
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+        return text, tomllib.loads(text)
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{file} is no UTF-8 text: {error}") from error
+    except RecursionError:
+        raise UsageError(f"{file}: its lists or tables nest too deeply") from None
+    except tomllib.TOMLDecodeError as error:
+        said, _, place = str(error).removesuffix(")").partition(" (at ")
+        line = found[1] if (found := re.search(r"line (\d+)", place)) else str(text.count("\n") + 1)
+        raise UsageError(f"{file}:{line}: {said} ({place}). The file must be TOML 1.0") from error
+
+
+def _checked(study: schema.Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]]:
+    """The cells of a study, and all mistakes that its schema does not show."""
+    mistakes = reference_mistakes(study, suite)
+    cells, further = expand(study, suite, mistakes)
+    found = [*mistakes, *(one for one in further if not (mistakes and one.absent))]
+    return cells, list(dict.fromkeys(found))
+
+
+# -- mistakes of the schema --------------------------------------------------------------------------------------
+
+
+def _mistakes(error: ValidationError, content: dict[str, Any]) -> list[Mistake]:
     """What pydantic found, in our words where its own name no key or value of the file."""
-    found = []
+    found: dict[Place, list[str]] = {}
     for one in error.errors(include_url=False, include_context=True):
-        path = tuple(part for part in one["loc"] if part != "[key]")
-        text = _WORDS.get(one["type"]) or f"{_plain(one['msg'])}, not {one['input']!r}"
-        if one["type"] == "extra_forbidden":
+        missing = one["type"] == "missing"
+        path = part_in_file(one["loc"], content)
+        if missing:
+            path, text = (*path, one["loc"][-1]), "is missing"
+        elif one["type"] == "extra_forbidden":
             text = f"unknown key{_near(path)}"
-        found.append(Mistake(path, text))
-    return found
+        else:
+            text = f"{_plain(one['msg'])}, not {shortened(repr(one['input']))}"
+        found.setdefault(path, []).append(text)
+    return [Mistake(path, _joined(texts)) for path, texts in found.items()]
+
+
+def _joined(texts: list[str]) -> str:
+    """What several choices would take of one value, in one sentence."""
+    *others, last = texts
+    return " or ".join([*(text.rpartition(", not ")[0] for text in others), last])
 
 
 def _plain(message: str) -> str:
-    return f"{message[:1].lower()}{message[1:]}".replace("input should", "should")
+    plain = f"{message[:1].lower()}{message[1:]}".removeprefix("value error, ").replace("input should", "should")
+    said = f"{_NAME_PATTERN} (small letters, digits, dots, hyphens and underscores)"
+    return plain.replace(_NAME_PATTERN, said)
 
 
-def _near(path: tuple[str | int, ...]) -> str:
+def _near(path: Place) -> str:
     """What the key may have been meant as, or else what its table knows."""
-    home = schema.Study if len(path) == 1 else _TABLES.get(str(path[0]), schema.Study)
-    if "exclude" in path[:-1]:
-        home = schema.ExcludeTable
-    if path[0] == "comparisons" and "pairs" in path[:-1]:
-        home = schema.PairsTable
+    home = _table_of(path)
     names = [field.alias or name for name, field in home.model_fields.items()]
     near = get_close_matches(str(path[-1]), names, n=1)
     return f"; did you mean {near[0]!r}?" if near else f"; known here: {', '.join(names)}"
+
+
+def _table_of(path: Place) -> type[BaseModel]:
+    """The table that the last name of a path stands in."""
+    inner = next((one for name, one in _INNER.items() if name in path[2:-1]), None)
+    return inner or (schema.Study if len(path) == 1 else _TABLES.get(str(path[0]), schema.Study))
+
+
+def _further(error: ValidationError, content: dict[str, Any]) -> list[Mistake]:
+    """Mistakes of the rest of a file whose wrong values are left out, so that one reading shows all."""
+    left = LeftOver(content)
+    study = left.validated(error)
+    if study is None:
+        return []
+    suite, mistakes = planned_suite(study.suite)
+    return left.own([*mistakes, *_checked(study, suite)[1]])
 
 
 _TABLES: dict[str, type[BaseModel]] = {
@@ -142,3 +187,9 @@ _TABLES: dict[str, type[BaseModel]] = {
     "figures": schema.FigureTable,
 }
 """By the first name of a path, what the tables there may say."""
+_INNER: dict[str, type[BaseModel]] = {
+    "exclude": schema.ExcludeTable,
+    "pairs": schema.PairsTable,
+    "elsewhere": schema.ElsewhereTable,
+}
+"""By its key, what a table inside a table may say."""

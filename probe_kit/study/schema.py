@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from probe_kit.extract.run_layout import AskTokens, LaterViews
 from probe_kit.extract.vqa.phrases import Picture, Query
@@ -12,15 +12,44 @@ from probe_kit.scene_names import ArmName, Rendering, SceneName
 from probe_kit.train.choices import Baseline, Target
 
 SCHEMA_VERSION = 1
+
+
+def _each_once[Value](values: list[Value]) -> list[Value]:
+    """The values. Raises ValueError where one comes twice."""
+    for twice in (value for at, value in enumerate(values) if value in values[:at]):
+        raise ValueError(f"{twice!r} comes twice; name each once")
+    return values
+
+
+def _printable(text: str) -> str:
+    """The text. Raises ValueError where a terminal or file name could not show it."""
+    if not text.isprintable():
+        raise ValueError("a line break or control character is not allowed")
+    return text
+
+
+def _whole_number(value: Any) -> Any:
+    """The value. Raises ValueError for `true` and `1.0`, which Python finds equal to 1."""
+    if type(value) is not int:
+        raise ValueError("should be 1")
+    return value
+
+
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,59}$")]
 """Of a model, condition, ask, block or table: small letters, digits, dots, hyphens and underscores."""
-Names = Annotated[list[str], Field(min_length=1)]
+Text = Annotated[str, Field(min_length=1, max_length=500), AfterValidator(_printable)]
+"""What is shown as it is, or names a place: one line."""
+Names = Annotated[list[str], Field(min_length=1), AfterValidator(_each_once)]
+SeveralNames = Annotated[list[str], Field(min_length=2), AfterValidator(_each_once)]
+TwoNames = Annotated[list[str], Field(min_length=2, max_length=2), AfterValidator(_each_once)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Even = Annotated[int, Field(ge=2, le=1_000_000, multiple_of=2)]
+Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Size = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,3}x[1-9][0-9]{0,3}$")]
 TableKind = Literal[
     "success", "sides", "ablation", "vlms", "vlm-vla", "probing", "groups", "chain", "score", "stages", "drift"
 ]
+Control = Literal["untrained"] | Baseline
 FigureKind = Literal["curves", "sides", "dose", "overview"]
 KINDS: tuple[TableKind, ...] = get_args(TableKind)
 
@@ -28,7 +57,7 @@ KINDS: tuple[TableKind, ...] = get_args(TableKind)
 class _Table(BaseModel):
     """A table of the file: unknown keys are mistakes, and nothing is converted silently."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 class SuiteTable(_Table):
@@ -38,7 +67,7 @@ class SuiteTable(_Table):
     counts: items per category of a suite that is not here yet, for the plan; later it must hold so many.
     """
 
-    path: str | None = None
+    path: Text | None = None
     categories: Names | None = None
     items: Even | None = None
     counts: dict[str, Even] = {}
@@ -53,14 +82,14 @@ class ModelTable(_Table):
     """
 
     family: str
-    label: str | None = None
-    groups: list[Name] = []
+    label: Text | None = None
+    groups: Annotated[list[Name], AfterValidator(_each_once)] = []
     vlm: str | None = None
     finetuned_from: str | None = None
     untrained: str | None = None
-    checkpoint: str | None = None
+    checkpoint: Text | None = None
     random_weights: bool = False
-    weights_seed: Annotated[int, Field(ge=0)] = 0
+    weights_seed: Seed = 0
     options: dict[str, Any] = {}
     protocol: ProtocolName | None = None
     scene: SceneName | None = None
@@ -68,7 +97,7 @@ class ModelTable(_Table):
     dtype: Dtype | None = None
     batch: Count = 1
     gpus: Annotated[int, Field(ge=0, le=1)] = 0
-    unavailable: Annotated[str, Field(min_length=1)] | None = None
+    unavailable: Text | None = None
 
 
 class ConditionTable(_Table):
@@ -78,7 +107,7 @@ class ConditionTable(_Table):
     tile_side: float | None = None
     light_level: float | None = None
     rendering: Rendering | None = None
-    background: str | None = None
+    background: Text | None = None
     picture_size: Size | None = None
     epsilon: float | None = None
     arm: ArmName | None = None
@@ -93,7 +122,7 @@ class ConditionTable(_Table):
 class AskTable(_Table):
     """How a VLM is asked, as in `probe-kit ask`."""
 
-    prompt: str
+    prompt: Text
     picture_size: Size = "224x224"
     picture: Picture = "frame"
     query: Query = "target"
@@ -116,7 +145,7 @@ class BlockTable(_Table):
     asks: Names | None = None
     categories: Names | None = None
     items: Even | None = None
-    seeds: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)] = [0]
+    seeds: Annotated[list[Seed], Field(min_length=1), AfterValidator(_each_once)] = [0]
     tokens: AskTokens | None = None
     exclude: list[ExcludeTable] = []
 
@@ -127,15 +156,15 @@ class ProbesTable(_Table):
     runs: Names
     views: Names = ["mean"]
     permutations: Annotated[int, Field(ge=0, le=100_000)] = 200
-    controls: list[Literal["untrained"] | Baseline] = []
+    controls: Annotated[list[Control], AfterValidator(_each_once)] = []
     target: Target = "correct"
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Seed = 0
 
 
 class PairsTable(_Table):
     """Two conditions of the same models."""
 
-    conditions: Annotated[list[str], Field(min_length=2, max_length=2)]
+    conditions: TwoNames
     models: Names
 
 
@@ -143,22 +172,26 @@ class ComparisonTable(_Table):
     """A named comparison, one family of tests: pairs of conditions, a chain of models, or groups of models."""
 
     pairs: PairsTable | None = None
-    chain: Annotated[list[str], Field(min_length=2)] | None = None
-    groups: Annotated[list[str], Field(min_length=2)] | None = None
+    chain: SeveralNames | None = None
+    groups: SeveralNames | None = None
 
 
 class DriftTable(_Table):
     """Pairs of models, each `model` or `model/ask`, and the view of the tokens."""
 
-    pairs: Annotated[list[Annotated[list[str], Field(min_length=2, max_length=2)]], Field(min_length=1)]
+    pairs: Annotated[
+        list[Annotated[list[str], Field(min_length=2, max_length=2)]],
+        Field(min_length=1),
+        AfterValidator(_each_once),
+    ]
     view: str = "mean"
 
 
 class ElsewhereTable(_Table):
     """Numbers that were not measured here, beside the score. values: by model. source: where they are from."""
 
-    title: Annotated[str, Field(min_length=1)]
-    source: Annotated[str, Field(min_length=1)]
+    title: Text
+    source: Text
     values: Annotated[dict[str, float], Field(min_length=1)]
 
 
@@ -188,7 +221,7 @@ class FigureTable(_Table):
 class ReuseTable(_Table):
     """Folders of other runs, such as those made by hand; equal ones serve the study where they lie."""
 
-    folders: Names = []
+    folders: Annotated[list[Text], AfterValidator(_each_once)] = []
 
 
 class Study(_Table):
@@ -197,9 +230,9 @@ class Study(_Table):
     out: folder or URL of runs; default `runs/NAME`. scene: of every model that names none, and of VLMs too.
     """
 
-    version: Literal[1] = Field(alias="schema")
+    version: Annotated[Literal[1], BeforeValidator(_whole_number)] = Field(alias="schema")
     name: Name
-    out: str | None = None
+    out: Text | None = None
     scene: SceneName | None = None
     suite: SuiteTable = SuiteTable()
     reuse: ReuseTable = ReuseTable()

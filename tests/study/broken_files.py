@@ -112,6 +112,31 @@ MISTAKES: list[tuple[str, str, str]] = [
     ('controls = ["untrained"]', 'controls = ["binding"]  # here', "probes.main.controls[0]"),
     ('chain = ["base", "state"]', 'chain = ["base"]  # here', "list should have at least 2 items"),
     ('kind = "success"', 'kind = "sucess"  # here', "tables.success.kind: should be 'success'"),
+    ("schema = 1", "schema = true  # here", "schema: should be 1, not True"),
+    ("items = 24", "items = nan  # here", "suite.items: should be a valid integer, not nan"),
+    ("light_level = 0.7", "light_level = inf  # here", "conditions.dark.light_level: should be a finite number"),
+    (
+        "light_level = 0.7",
+        "captured_calls = true  # here",
+        "conditions.dark.captured_calls: should be a valid integer or should be 'all', not True",
+    ),
+    ('groups = ["one"]', 'groups = ["one"]\nlabel = ""  # here', "at least 1 character"),
+    ('groups = ["one"]', 'groups = ["one"]\nlabel = "a\\u001b[1m"  # here', "control character is not allowed"),
+    ('out = "runs/small"', 'out = "a\\u0000b"  # here', "out: a line break or control character"),
+    ('models = ["reader"]', 'models = ["reader"]\nseeds = [0, 0]  # here', "0 comes twice; name each once"),
+    ('chain = ["base", "state"]', 'chain = ["base", "base"]  # here', "'base' comes twice"),
+    ('groups = ["one", "other"]', 'groups = ["one", "one"]  # here', "'one' comes twice"),
+    (
+        '["plain", "dark"], models',
+        '["plain", "plain"], models',
+        "comparisons.light.pairs.conditions: 'plain' comes",
+    ),
+    ("[models.reader]", '[models."re\\nader"]  # here', 'models."re\\nader": string should match pattern'),
+    (
+        'kind = "success"\nruns = ["main"]',
+        'kind = "score"\nruns = ["main"]\nelsewhere = { title = "x", sorce = "y", values = { base = 1 } }  # here',
+        "tables.success.elsewhere.sorce: unknown key; did you mean 'source'?",
+    ),
     # names of other tables
     ('categories = ["color", "Shape"]', 'categories = ["colour"]  # here', "unknown category 'colour'; known: "),
     ("items = 24", "items = 200  # here", "200 items are asked for, and color has 150, shape has 150"),
@@ -156,6 +181,65 @@ MISTAKES: list[tuple[str, str, str]] = [
         "models.spare: is in no run",
     ),
     # what does not fit together
+    ('out = "runs/small"', 'out = "ftp://host/x"  # here', "out: runs lie in folders or at s3://"),
+    ("[suite]\n", "[suite]\ncounts = { color = 10 }  # here\n", "belongs to a suite of your own"),
+    ("[models.random]", '[models.ledger]  # here\nfamily = "idle"\n\n[models.random]', "the ledger's folder"),
+    (
+        'finetuned_from = "base"',
+        'finetuned_from = "base"\nlabel = "reader"',
+        "models.reader: 'state' is called 'reader' too",
+    ),
+    ("light_level = 0.7", 'background = "absent.png"  # here', "absent.png cannot be read"),
+    ('runs = ["main"]\npermutations', 'runs = ["main"]\nviews = ["meen"]  # here\npermutations', "is no view of"),
+    (
+        "[comparisons.light]",
+        '[probes.more]\nruns = ["main"]  # here\n\n[comparisons.light]',
+        "block 'main' is probed by 'main' too",
+    ),
+    (
+        'chain = ["base", "state"]',
+        'chain = ["base", "reader"]  # here',
+        "no condition in common (base: dark, plain",
+    ),
+    (
+        'groups = ["other"]',
+        'groups = ["other", "one"]',
+        "'state' is in 'other' and 'one'; groups have no model in common",
+    ),
+    (
+        "[tables.success]",
+        '[tables.drift]\nkind = "drift"\ndrift = "more"\n\n[drift.more]\nview = "last"  # here\n'
+        'pairs = [["base", "state"]]\n\n[tables.success]',
+        "the view 'last' of 'base' is not probed; its probes have mean",
+    ),
+    (
+        "[drift.words]",
+        '[tables.drift]\nkind = "drift"\ndrift = "words"\n\n[drift.words]',
+        "'reader/p1' is asked by block 'vlms' with tokens none",
+    ),
+    (
+        'kind = "success"\nruns = ["main"]',
+        'kind = "success"\nruns = ["main"]\ncomparison = "light"  # here',
+        "a table of kind 'success' shows no comparison",
+    ),
+    ('kind = "success"\nruns', 'kind = "vlms"\nruns', "and no block of `runs` asks one"),
+    ('kind = "success"\nruns', 'kind = "stages"\nruns', "`runs` have no policy with its VLM"),
+    (
+        'kind = "success"\nruns = ["main"]',
+        'kind = "success"\nruns = ["light"]\ncategories = ["shape"]  # here',
+        "'shape' is in no block of `runs`, which have color",
+    ),
+    (
+        'kind = "success"\nruns = ["main"]',
+        'kind = "score"\nruns = ["main"]\n'
+        'elsewhere = { title = "x", source = "y", values = { reader = 1 } }  # here',
+        "'reader' is in no block of `runs`, so its number has no row",
+    ),
+    (
+        'comparison = "light"',
+        'comparison = "light"\nruns = ["vlms"]  # here',
+        "no model of the comparison 'light'",
+    ),
     (
         "[conditions.dark]\nlight_level = 0.7",
         "[conditions.dark]  # here\nlight_level = 1.0",
@@ -209,5 +293,11 @@ ELSEWHERE = {
     "'reader' is asked in several ways": "pairs = [\n",
     "no block makes the run 'reader/p3'": "pairs = [\n",
     "a table of kind 'ablation' needs `comparison`": "[tables.light]",
+    "comparisons.light.pairs.conditions: 'plain' comes": "pairs = {",
+    "'reader/p1' is asked by block 'vlms' with tokens none": "pairs = [\n",
+    "models.reader: 'state' is called 'reader' too": "[models.reader]",
+    "'state' is in 'other' and 'one'; groups have no model in common": 'groups = ["one", "other"]',
+    "and no block of `runs` asks one": 'runs = ["main"]\n\n[tables.light]',
+    "`runs` have no policy with its VLM": 'runs = ["main"]\n\n[tables.light]',
 }
 """Where a mistake is said that is not made where it shows: the line on which this text begins."""

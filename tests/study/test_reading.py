@@ -62,8 +62,36 @@ def test_all_mistakes_are_said_at_once_in_the_order_of_the_file(tmp_path: Path) 
     ]
 
 
+def test_a_wrong_value_hides_no_wrong_name_and_makes_no_mistake_elsewhere(tmp_path: Path) -> None:
+    text = changed(
+        ("items = 24", "items = 23  # here"),
+        ('vlm = "reader"', 'vln = "reader"  # here'),
+        ('finetuned_from = "base"', 'finetuned_from = "bass"  # here'),
+        ("random_weights = true", 'random_weights = "yes"  # here'),
+        ('family = "vlm-tiny"', 'famly = "vlm-tiny"  # here'),
+        ("light_level = 0.7", 'light_level = "dark"  # here'),
+        ('conditions = ["plain"]', 'conditions = "plain"  # here'),
+        ('models = ["base", "state"]\n', 'models = ["base", "stats"]  # here\n'),
+        ("permutations = 100", 'permutations = "all"  # here'),
+        ('kind = "ablation"\ncomparison = "light"', 'kind = "ablation"\ncomparison = "lihgt"  # here'),
+    )
+    with pytest.raises(StudyFileError) as caught:
+        load_study(written(tmp_path, text))
+    lines = {int(line.split(":")[1]) for line in str(caught.value).splitlines()}
+    lacks_a_family = text[: text.index("[models.reader]")].count("\n") + 1
+    assert lines == {*lines_with(text, "# here"), lacks_a_family}, str(caught.value)
+
+
 @pytest.mark.parametrize(
-    ("text", "said"), [("a = = 1", "line 1"), ("schema = 1\nschema = 1", "overwrite"), ("", "is missing")]
+    ("text", "said"),
+    [
+        ("a = = 1", ":1: .*line 1"),
+        ("schema = 1\nschema = 1", ":2: .*overwrite"),
+        ("a = [\n1,\n", ":3: Invalid value .*end of document"),
+        ("", "is missing"),
+        (f"a = {'[' * 3000}{']' * 3000}", "nest too deeply"),
+    ],
+    ids=["no value", "a key twice", "an open list", "nothing", "deep"],
 )
 def test_what_is_no_toml_or_says_nothing_is_refused(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):
@@ -86,13 +114,30 @@ after = 3
 name = "[x]"
 [[runs]]
 name = "y"
+[[runs.exclude]] # \u2028
+model = "a"
+[[runs.exclude]]
+model = "b"
+[strings]
+text = \"\"\"
+[no.table]
+after = "it's no key"
+\"\"\"
+odd = '''# "'''
+[last.y]
+x.z = 1
 """
     places = [
         ("a",), ("b", "c"), ("table", "quoted name", "x"), ("table", "quoted name", "x", "key"),
         ("table", "quoted name", "x", "key", 0, 1), ("table", "quoted name", "x", "after"), ("runs", 0, "name"),
-        ("runs", 1), ("runs", 1, "name"), ("nothing",),
+        ("runs", 1), ("runs", 1, "name"), ("runs", 1, "exclude", 1, "model"), ("strings", "text"),
+        ("last", "y", "x"), ("last",), ("nothing",),
     ]  # fmt: skip
-    assert [line_of(text, place) for place in places] == [1, 2, 3, 4, 4, 8, 10, 11, 12, 1]
+    assert [line_of(text, place) for place in places] == [1, 2, 3, 4, 4, 8, 10, 11, 12, 16, 18, 24, 23, 1]
+
+
+def test_a_byte_order_mark_is_read_over(tmp_path: Path) -> None:
+    assert keys(load_study(written(tmp_path, f"\ufeff{BASE}"))) == keys(load_study(written(tmp_path)))
 
 
 # -- expansion ---------------------------------------------------------------------------------------------------

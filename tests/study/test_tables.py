@@ -16,7 +16,7 @@ from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.retention.formats.latex import latex_table
 from probe_kit.statistics.paired_tests import holm
-from probe_kit.study import LoadedStudy
+from probe_kit.study import LoadedStudy, load_study, write_study_report
 from probe_kit.study.tables.compared import difference_table, stages_table
 from probe_kit.study.tables.rates import score_table, success_table, vlm_table
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
@@ -166,9 +166,49 @@ def test_without_a_name_all_tables_are_printed_and_their_tests_are_counted(
     drift = '[drift.one]\npairs = [["expert", "idle"]]\n[tables.drift]\nkind = "drift"\ndrift = "one"\n'
     file.write_text(f"{played.file.read_text(encoding='utf-8')}{drift}", encoding="utf-8")
     partly = run.invoke(app, ["study", "table", str(file), "--partial"])
-    assert partly.exit_code == 0
+    assert partly.exit_code == 1
     assert "no table drift: " in partly.stderr
+    assert "4 tables" in partly.stderr
     assert run.invoke(app, ["study", "table", str(file)]).exit_code != 0
+
+
+def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: LoadedStudy, tmp_path: Path) -> None:
+    file, page, run = tmp_path / "named.toml", tmp_path / "report.html", CliRunner()
+    text = played.file.read_text(encoding="utf-8").partition("[figures.curves]")[0]
+    text = text.replace('label = "Idle"', 'label = "<b>Idle & 5 %</b>"')
+    file.write_text(text, encoding="utf-8")
+    before = file_times(Path(played.study.folder))
+    made = run.invoke(app, ["study", "report", str(file), "--html", str(page)])
+    assert made.exit_code == 0, made.output
+    html = page.read_text(encoding="utf-8")
+    made_of = (
+        "table-main",
+        "table-sides",
+        "table-score",
+        "table-light",
+        "figure-overview",
+        "figure-sides",
+        "file",
+    )
+    assert all(f'id="{name}"' in html for name in made_of)
+    assert html.count('<img class="plot"') == 2
+    assert "&lt;b&gt;Idle &amp; 5 %&lt;/b&gt;" in html
+    assert "<b>Idle" not in html
+    assert str(tmp_path.parent) not in html
+    assert 'src="http' not in html
+    assert write_study_report(load_study(file), page).html == html
+    assert file_times(Path(played.study.folder)) == before
+    file.write_text(text.replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8")
+    refused = run.invoke(app, ["study", "report", str(file), "--html", str(tmp_path / "other.html")])
+    assert refused.exit_code == 1
+    assert not (tmp_path / "other.html").exists()
+    partly = run.invoke(app, ["study", "report", str(file), "--html", str(page), "--partial"])
+    assert partly.exit_code == 1
+    assert "· dark is missing: not played yet" in page.read_text(encoding="utf-8")
+
+
+def file_times(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
 def test_the_viewer_opens_every_stored_run_of_a_study(played: LoadedStudy, tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ def _full_headings(table: TextTable) -> list[str]:
 
 _WORDS = (
     "model", "run", "category", "prompt", "verdict", "label", "metric", "view", "backbone site", "action site",
-    "stream", "best site", "exceeds",
+    "stream", "best site", "exceeds", "system", "systems", "half", "runs", "groups", "blocks", "state",
 )  # fmt: skip
 """Columns of plain tables that hold no numbers."""
 

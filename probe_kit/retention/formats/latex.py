@@ -15,22 +15,27 @@ from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.formats.heat import HEAT
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
+_GREEK = {
+    "α": "alpha", "β": "beta", "γ": "gamma", "δ": "delta", "ε": "epsilon", "θ": "theta", "λ": "lambda", "μ": "mu",
+    "π": "pi", "ρ": "rho", "σ": "sigma", "τ": "tau", "φ": "phi", "ψ": "psi", "ω": "omega", "Δ": "Delta",
+}  # fmt: skip
 _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
-    "Δ": r"$\Delta$",
     "±": r"$\pm$",
     "–": "--",
     "−": "$-$",
     "<": "$<$",
     ">": "$>$",
+    "|": r"\textbar{}",
+    "×": r"$\times$",
     "·": r"$\cdot$",
     "✓": r"$^{*}$",
     "↑": r"$\uparrow$",
     "↓": r"$\downarrow$",
     "→": r"$\rightarrow$",
-    "π": r"$\pi$",
+    **{letter: f"$\\{name}$" for letter, name in _GREEK.items()},
 }
 MOST_COLUMNS = 13
 """Of a tabular; a wider table of text is printed as several below each other, each with the first column."""

@@ -1,1 +1,1 @@
-"""Archives and data sets of a study: runs without activations, and every table, readable alone."""
+"""A study for others: archive, data set and report, made of stored runs without activations and readable alone."""

@@ -56,7 +56,8 @@ def make_table(study: LoadedStudy, name: str, partial: bool = False) -> NamedTab
         raise UsageError(
             f"no run of the table {name!r} is stored. Play them with `probe-kit study run {study.file}`"
         )
-    return _made(study, table, runs, name).with_note([*runs.missing, *_versions(runs)])
+    made = _made(study, table, runs, name).with_note([*runs.missing, *runs.unfinished, *_versions(runs)])
+    return replace(made, is_partial=bool(runs.unfinished))
 
 
 def _categories(table: TableTable) -> tuple[str, ...] | None:
@@ -118,17 +119,18 @@ def _wanted(study: LoadedStudy, table: TableTable) -> Callable[[Cell], Selection
     if comparison is None:
         return of_blocks(table.runs or ())
     models, ways = _compared(study, comparison)
+    asks = comparison.pairs is not None  # a chain and groups are of policies
 
     def wanted(cell: Cell) -> Selection | None:
         blocks = table.runs is None or of_blocks(table.runs)(cell) is not None
-        shown = cell.model in models and (ways is None or cell.way in ways) and not cell.asks and blocks
+        shown = cell.model in models and cell.way in ways and (asks or not cell.asks) and blocks
         return cell.selection if shown else None
 
     return wanted
 
 
-def _compared(study: LoadedStudy, comparison: ComparisonTable) -> tuple[list[str], list[str] | None]:
-    """Models of a comparison, and their conditions; None for the first condition that all have."""
+def _compared(study: LoadedStudy, comparison: ComparisonTable) -> tuple[list[str], list[str]]:
+    """Models of a comparison, and their conditions: those of its pairs, else the first that all models have."""
     if comparison.pairs is not None:
         return comparison.pairs.models, comparison.pairs.conditions
     groups = set(comparison.groups or ())

@@ -13,10 +13,14 @@ Number = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class NamedTable:
-    """text: what is printed. numbers: one object per number, with system, category, interval and n."""
+    """text: what is printed. numbers: one object per number, with system, category, interval and n.
+
+    is_partial: whether runs are missing that `study run` would play; the note names them.
+    """
 
     text: TextTable
     numbers: tuple[Number, ...]
+    is_partial: bool = False
 
     def with_note(self, sentences: Sequence[str]) -> "NamedTable":
         """The same with more sentences below it."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit._terminal.console import say
-from probe_kit.errors import ProbeKitError, RunIncompleteError, UsageError
+from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, UsageError
 from probe_kit.extract import open_run
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.study.cells import Cell, Selection
@@ -37,10 +37,14 @@ class StoredRun:
 
 @dataclass(frozen=True)
 class StoredRuns:
-    """found: in the order of the file. missing: of the others, why they are not in the table."""
+    """found: in the order of the file. missing: of the others, why they are not in the table.
+
+    unfinished: what `study run` would still play of both, in words; only of partial tables.
+    """
 
     found: tuple[StoredRun, ...]
     missing: tuple[str, ...]
+    unfinished: tuple[str, ...] = ()
 
     def labels(self, study: LoadedStudy) -> dict[str, str]:
         """By location, the model's label; with condition or ask, and seed, where a model has several runs."""
@@ -59,7 +63,7 @@ def stored_runs(
     partial: accept runs that are missing or unfinished; they are named. categories: slugs, all by default.
     Raises RunIncompleteError for a run that is missing, unfinished or damaged, unless `partial`.
     """
-    found, missing = [], []
+    found, missing, unfinished = [], [], []
     for cell in study.cells:
         selection = wanted(cell)
         if selection is None:
@@ -69,15 +73,37 @@ def stored_runs(
             missing.append(f"{label} is missing: {cell.unavailable}")
             continue
         try:
-            found.append(open_cell(study, cell, selection, partial, categories))
+            own = open_cell(study, cell, selection, partial, categories)
+            found.append(own)
+            if done := _part_done(own.run):
+                unfinished.append(f"{label} has {done} episodes")
         except ProbeKitError as error:
             if not partial:
                 raise RunIncompleteError(
-                    f"{cell.name} is not whole: {error}. Finish it with `probe-kit study run {study.file}`, or "
-                    "accept what is there (--partial)"
+                    f"{cell.name} is not whole: {_seen(error)}. Finish it with `probe-kit study run {study.file}`,"
+                    " or accept what is there (--partial)"
                 ) from error
-            missing.append(f"{label} is missing")
-    return StoredRuns(tuple(found), tuple(missing))
+            unfinished.append(f"{label} is missing: {_why_missing(study, cell, error)}")
+    return StoredRuns(tuple(found), tuple(missing), tuple(unfinished))
+
+
+def _part_done(run: "Run") -> str:
+    """How many of its episodes an unfinished run has, empty for a whole one."""
+    done = len(run.episodes)
+    return f"{done} of {run.planned}" if done < run.planned else ""
+
+
+def _why_missing(study: LoadedStudy, cell: Cell, error: ProbeKitError) -> str:
+    """The failure that the ledger has, or else what is wrong with the run."""
+    failure = None if study.archive is not None else Ledger(study.study.folder).of(cell).failure
+    if failure is not None:
+        return failure.reason
+    return "not played yet" if isinstance(error, RunNotFoundError) else _seen(error)
+
+
+def _seen(error: ProbeKitError) -> str:
+    """What an error says was seen, without its advice on a single run."""
+    return str(error).partition(". ")[0].removesuffix(".")
 
 
 def stored_location(study: LoadedStudy, cell: Cell) -> "Location":
@@ -142,7 +168,7 @@ def stored_runs_by_name(name: str) -> "list[Run] | None":
     found = stored_runs(
         study, of_blocks([block for cell in study.cells for block in cell.selections]), partial=True
     )
-    for remark in found.missing:
+    for remark in (*found.missing, *found.unfinished):
         say(remark)
     if not found.found:
         raise UsageError(f"no run of {study.file} is stored. Play it with `probe-kit study run {name}`")

@@ -28,6 +28,7 @@ def test_text_is_escaped_and_only_defined_retention_is_coloured(table: Retention
 
 def test_a_backslash_is_escaped_once() -> None:
     assert escape(r"a_b\c%") == r"a\_b\textbackslash{}c\%"
+    assert escape("λ|π0 × 2") == r"$\lambda$\textbar{}$\pi$0 $\times$ 2"
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,9 @@ def test_tables_are_made_of_stored_runs_alone_and_name_what_is_missing(file: Pat
     made = make_table(study, "main", partial=True)
     assert made.text.columns == ("system", "Color", "mean", "score")
     assert [cells[0] for cells in made.text.cells] == ["expert", "idle"]
-    assert made.text.note.endswith("broken · short is missing")
+    (failure,) = (one.failure for one in plan_study(study).cells if one.failure)
+    assert made.text.note.endswith(f"broken · short is missing: {failure.reason}")
+    assert made.is_partial
     light = make_table(study, "light")
     assert [cells[:3] for cells in light.text.cells] == [
         ("idle · dark − idle · short", name, "+0.0 [-100.0, +100.0]") for name in ("Color", "mean")

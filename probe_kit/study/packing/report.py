@@ -1,0 +1,113 @@
+"""The report of a study: one HTML file with its state, every table and figure, and the settings of its runs."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from probe_kit._system.drafts import write_whole
+from probe_kit.errors import ProbeKitError, UsageError
+from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.displays.base.report_figure import ReportFigure
+from probe_kit.retention.formats.html import plain_tables
+from probe_kit.retention.report.pictures import Picture, data_uri
+from probe_kit.retention.report.provenance import citation, provenance
+from probe_kit.retention.report.render import render
+from probe_kit.retention.report.words import words_of
+from probe_kit.study.figures import make_figures
+from probe_kit.study.planning.plan import StudyPlan, plan_study
+from probe_kit.study.reading import LoadedStudy
+from probe_kit.study.tables.make import make_table
+from probe_kit.study.tables.stored_runs import of_blocks, stored_runs
+from probe_kit.version import __version__
+
+
+@dataclass(frozen=True)
+class StudyReport:
+    """html: the page. missing: by table or figure, why it is not there. is_partial: whether a run is missing."""
+
+    html: str
+    missing: dict[str, str]
+    is_partial: bool
+
+
+def write_study_report(study: LoadedStudy, path: Path | str, partial: bool = False) -> StudyReport:
+    """Write the report of a study as one HTML file, whole or not at all.
+
+    partial: leave out what is missing; the page names it with the reason.
+    Raises UsageError where no run is stored, and what `make_table` and `make_figures` raise.
+    """
+    made = study_report(study, partial)
+    write_whole(Path(path), made.html)
+    return made
+
+
+def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
+    """The page as text, from stored runs alone. It needs no network, and holds no path of this machine."""
+    file, missing = study.study, dict[str, str]()
+    tables = _made("table", file.tables, lambda name: make_table(study, name, partial), missing, partial)
+    figures = _made("figure", file.figures, lambda name: make_figures(study, name, partial), missing, partial)
+    used = of_blocks([block.name for block in file.runs])
+    runs = stored_runs(study, used, partial=True)
+    if not runs.found:
+        raise UsageError(f"no run of {study.file} is stored. Play it with `probe-kit study run {study.file}`")
+    labels, plan = runs.labels(study), plan_study(study)
+    places = tuple(place for one in runs.found for place in (one.run.location.address, one.place))
+    pages = {name: plain_tables([own.text])[0] for name, own in tables.items()}
+    state = plain_tables([_state(plan)])[0]
+    drawn = {name: [_picture(one, places) for one in own] for name, own in figures.items()}
+    sentence, bibtex = citation([one.run for one in runs.found])
+    html = render(
+        "study.html.jinja",
+        places,
+        title=file.name,
+        version=__version__,
+        several=False,
+        suite=study.suite.identity,
+        totals=plan.totals(),
+        state=state,
+        missing=missing,
+        skipped=plan.skipped(),
+        tables=pages,
+        figures=drawn,
+        file=study.file.read_text(encoding="utf-8-sig"),
+        provenance=[provenance(labels[one.place], one.run, None) for one in runs.found],
+        words=words_of([state, *pages.values()]),
+        sentence=sentence,
+        bibtex=bibtex,
+    )
+    partly = bool(missing) or bool(runs.unfinished) or any(own.is_partial for own in tables.values())
+    return StudyReport(html, missing, partly)
+
+
+def _made[Made](
+    kind: str, names: Iterable[str], make: Callable[[str], Made], missing: dict[str, str], partial: bool
+) -> dict[str, Made]:
+    """What can be made, by name; adds to `missing` why the rest cannot."""
+    found = {}
+    for name in names:
+        try:
+            found[name] = make(name)
+        except ProbeKitError as error:
+            if not partial:
+                raise
+            missing[f"{kind} {name}"] = str(error)
+    return found
+
+
+def _state(plan: StudyPlan) -> TextTable:
+    """A row per run: what is stored of it."""
+    cells = tuple(
+        (
+            one.cell.model,
+            one.cell.way + (f", seed {one.cell.seed}" if one.cell.seed else ""),
+            ", ".join(one.cell.selections),
+            str(one.cell.episodes),
+            one.words,
+        )
+        for one in plan.cells
+    )
+    return TextTable("Runs", "", ("model", "run", "blocks", "episodes", "state"), cells, names=2, means=False)
+
+
+def _picture(figure: ReportFigure, places: tuple[str, ...]) -> Picture:
+    return Picture(figure.title, "", figure.reading, *data_uri(figure, places), extra=False)
