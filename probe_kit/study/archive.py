@@ -68,7 +68,7 @@ class Pack:
 def open_archive(name: str | Path) -> Path | None:
     """The folder of an archive, unpacked for this process if it is a zip file; None for what is no archive.
 
-    Raises RunDamagedError where a file is missing or has other bytes than were packed.
+    Raises RunDamagedError where a file is missing, was added, or has other bytes than were packed.
     """
     place = Path(name)
     if place.is_dir():
@@ -119,16 +119,21 @@ def write_sums(folder: Path) -> None:
 
 
 def check_sums(folder: Path) -> None:
-    """Raise RunDamagedError, naming the file, where one of `SHA256SUMS` is missing or has other bytes."""
+    """Raise RunDamagedError, naming the file, where one is missing, has other bytes, or was added."""
     if not (folder / SUMS_FILE).is_file():
         raise RunDamagedError(f"{folder} has no {SUMS_FILE}. {_RESTORE}")
+    summed = set[Path]()
     for line in (folder / SUMS_FILE).read_text(encoding="utf-8").splitlines():
         digest, _, name = line.partition("  ")
         file = folder / name
+        summed.add(file)
         if not file.is_file():
             raise RunDamagedError(f"{file} is missing. {_RESTORE}")
         if _digest(file) != digest:
             raise RunDamagedError(f"{file} has other bytes than were packed. {_RESTORE}")
+    for file in files_of(folder):
+        if file not in summed and file.name != SUMS_FILE:
+            raise RunDamagedError(f"{file} was not packed: {SUMS_FILE} does not have it. {_RESTORE}")
 
 
 def _digest(file: Path) -> str:

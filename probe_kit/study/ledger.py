@@ -204,7 +204,19 @@ def settings_changed(before: Mapping[str, Any], after: Mapping[str, Any]) -> lis
     """In words what differs between the settings of two records, such as `light_level 1 → 0.7`."""
     old, new = _leaves(before), _leaves(after)
     names = [name for name in (*new, *(one for one in old if one not in new)) if old.get(name) != new.get(name)]
-    return [f"{name.rpartition('.')[2]} {_short(old.get(name))} → {_short(new.get(name))}" for name in names]
+    return [_changed(name.rpartition(".")[2], old.get(name), new.get(name)) for name in names]
+
+
+def _changed(name: str, before: Any, after: Any) -> str:
+    """One setting in words; of a checkpoint's files only those that differ."""
+    if name == "checkpoint" and isinstance(before, list) and isinstance(after, list):
+        files = [{file: stat for file, *stat in one} for one in (before, after)]
+        other = [file for file in files[0] | files[1] if files[0].get(file) != files[1].get(file)]
+        return f"checkpoint: {_short(', '.join(other))} changed"
+    shown = (
+        f"{len(one)} files" if name == "checkpoint" and isinstance(one, list) else one for one in (before, after)
+    )
+    return f"{name} {' → '.join(map(_short, shown))}"
 
 
 def _leaves(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -80,6 +80,10 @@ def test_changed_settings_are_named_by_their_innermost_key() -> None:
     after = {"scene": {"light_level": 0.7, "light": {"ambient": 0.45}}, "seed": 0, "wordings": None}
     assert settings_changed(before, after) == ["light_level 1 → 0.7", "wordings ['knowledge'] → none"]
     assert settings_changed(before, before) == []
+    files = [[["a.json", 4, 1], ["b", 5, 1]], [["a.json", 4, 1], ["b", 5, 2], ["c", 1, 1]]]
+    before, after = ({"checkpoint": one} for one in files)
+    assert settings_changed(before, after) == ["checkpoint: b, c changed"]
+    assert settings_changed({"checkpoint": "owner/name"}, after) == ["checkpoint owner/name → 3 files"]
 
 
 def test_two_settings_of_one_innermost_name_are_told_apart() -> None:

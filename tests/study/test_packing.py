@@ -27,14 +27,14 @@ def test_every_table_is_the_same_from_the_archive_alone(
     played: LoadedStudy, archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither runs nor suite are where they were."""
-    before = {name: make_table(played, name).text for name in played.study.tables}
+    before = {name: make_table(played, name) for name in played.study.tables}
     home = Path(played.study.folder)
     away = tmp_path / "away"
     home.rename(away)
     monkeypatch.setattr("probe_kit.study.reading.planned_suite", None)
     try:
         packed = load_study(archive)
-        assert {name: make_table(packed, name).text for name in packed.study.tables} == before
+        assert {name: make_table(packed, name) for name in packed.study.tables} == before
         assert {one.state for one in plan_study(packed).cells} == {"whole"}
     finally:
         away.rename(home)
@@ -81,6 +81,10 @@ def test_what_was_changed_or_lost_is_named(played: LoadedStudy, tmp_path: Path) 
     (changed / "tables" / "main.md").write_text("other", encoding="utf-8")
     with pytest.raises(RunDamagedError, match=r"main\.md has other bytes than were packed"):
         load_study(changed)
+    more = copytree(folder, tmp_path / "more")
+    (more / "runs" / "added.json").touch()
+    with pytest.raises(RunDamagedError, match=r"added\.json was not packed"):
+        load_study(more)
     lost = copytree(folder, tmp_path / "lost")
     rmtree(lost / "runs" / "idle")
     with pytest.raises(RunDamagedError, match=r"runs/idle/.* is missing\. Fetch the archive again"):

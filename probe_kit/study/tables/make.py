@@ -24,7 +24,7 @@ from probe_kit.study.schema import ComparisonTable, DriftTable, TableTable
 from probe_kit.study.tables.compared import difference_table, group_table, stages_table, vlm_vla_table
 from probe_kit.study.tables.drifts import drift_table
 from probe_kit.study.tables.formats import table_of_record
-from probe_kit.study.tables.named_table import NamedTable
+from probe_kit.study.tables.named_table import NamedTable, Number
 from probe_kit.study.tables.rates import probing_table, score_table, sides_table, success_table, vlm_table
 from probe_kit.study.tables.stored_runs import StoredRun, StoredRuns, of_blocks, stored_runs
 from probe_kit.train.results.probe_results import ProbeResults
@@ -57,7 +57,13 @@ def make_table(study: LoadedStudy, name: str, partial: bool = False) -> NamedTab
             f"no run of the table {name!r} is stored. Play them with `probe-kit study run {study.file}`"
         )
     made = _made(study, table, runs, name).with_note([*runs.missing, *runs.unfinished, *_versions(runs)])
-    return replace(made, is_partial=bool(runs.unfinished))
+    return replace(made, is_partial=bool(runs.unfinished), numbers=_named_runs(made.numbers, runs))
+
+
+def _named_runs(numbers: Sequence[Number], runs: StoredRuns) -> tuple[Number, ...]:
+    """Numbers with runs as the plan names them: a location says where a run lies now, or where it was unpacked."""
+    names = {one.place: one.cell.name for one in runs.found}
+    return tuple({**one, "run": names[one["run"]]} if one.get("run") in names else one for one in numbers)
 
 
 def _categories(table: TableTable) -> tuple[str, ...] | None:

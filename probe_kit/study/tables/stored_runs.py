@@ -39,17 +39,18 @@ class StoredRun:
 class StoredRuns:
     """found: in the order of the file. missing: of the others, why they are not in the table.
 
-    unfinished: what `study run` would still play of both, in words; only of partial tables.
+    unfinished: what `study run` would still play of both, in words; only of partial tables. models: of every run,
+    stored or not.
     """
 
     found: tuple[StoredRun, ...]
     missing: tuple[str, ...]
-    unfinished: tuple[str, ...] = ()
+    unfinished: tuple[str, ...]
+    models: tuple[str, ...]
 
     def labels(self, study: LoadedStudy) -> dict[str, str]:
         """By location, the model's label; with condition or ask, and seed, where a model has several runs."""
-        names = [one.cell.model for one in self.found]
-        return {one.place: _label(study, one.cell, names.count(one.cell.model) > 1) for one in self.found}
+        return {one.place: _label(study, one.cell, self.models.count(one.cell.model) > 1) for one in self.found}
 
 
 def stored_runs(
@@ -63,11 +64,12 @@ def stored_runs(
     partial: accept runs that are missing or unfinished; they are named. categories: slugs, all by default.
     Raises RunIncompleteError for a run that is missing, unfinished or damaged, unless `partial`.
     """
-    found, missing, unfinished = [], [], []
+    found, missing, unfinished, models = [], [], [], []
     for cell in study.cells:
         selection = wanted(cell)
         if selection is None:
             continue
+        models.append(cell.model)
         label = _label(study, cell, True)
         if cell.unavailable:
             missing.append(f"{label} is missing: {cell.unavailable}")
@@ -84,7 +86,7 @@ def stored_runs(
                     " or accept what is there (--partial)"
                 ) from error
             unfinished.append(f"{label} is missing: {_why_missing(study, cell, error)}")
-    return StoredRuns(tuple(found), tuple(missing), tuple(unfinished))
+    return StoredRuns(tuple(found), tuple(missing), tuple(unfinished), tuple(models))
 
 
 def _part_done(run: "Run") -> str:
