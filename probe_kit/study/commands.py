@@ -158,13 +158,36 @@ def _probed(plan: "StudyPlan", jobs: int | None) -> "list[Failure]":
 
 
 @app.command("status")
-def status(file: File, only: Only = None, as_json: AsJson = False) -> None:
-    """Print what is stored of a study, and why other runs are to be made; exit with 1 if anything is missing."""
+def status(
+    file: File,
+    only: Only = None,
+    as_json: AsJson = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Compare every stored byte with its hash; takes long.")
+    ] = False,
+    orphans: Annotated[
+        bool, typer.Option("--orphans", help="List stored runs that the file does not use.")
+    ] = False,
+) -> None:
+    """Print what is stored of a study, and why other runs are to be made; exit with 1 if anything is missing.
+
+    With --verify it also exits with 1 if a stored byte was changed. Nothing is deleted.
+    """
     from probe_kit.study import load_study, plan_study
+    from probe_kit.study.planning.stored_checks import changed_runs, orphaned_runs
 
     plan = plan_study(load_study(file), only)
-    _print(plan, as_json)
-    if not plan.whole:
+    problems = changed_runs(plan) if verify else {}
+    others = orphaned_runs(plan) if orphans else []
+    if as_json:
+        further = {"problems": problems} if verify else {}
+        print_json({**plan.to_json(), **further, **({"orphans": others} if orphans else {})})
+    else:
+        print_plan(plan)
+        lines = [f"damaged: {name}: {one}" for name, found in problems.items() for one in found]
+        for line in (*lines, *(f"used by no run of the file: {place}" for place in others)):
+            out.print(line, highlight=False, markup=False, soft_wrap=True)
+    if problems or not plan.whole:
         raise typer.Exit(UNFINISHED)
 
 

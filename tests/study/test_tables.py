@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 from statistics import fmean
 
 import numpy as np
@@ -205,6 +206,29 @@ def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: Loa
     partly = run.invoke(app, ["study", "report", str(file), "--html", str(page), "--partial"])
     assert partly.exit_code == 1
     assert "· dark is missing: not played yet" in page.read_text(encoding="utf-8")
+
+
+def test_status_finds_changed_bytes_and_runs_that_the_file_does_not_use(
+    played: LoadedStudy, tmp_path: Path
+) -> None:
+    out, file, run = copytree(played.study.folder, tmp_path / "out"), tmp_path / "study.toml", CliRunner()
+    text = played.file.read_text(encoding="utf-8").replace(played.study.folder, str(out))
+    file.write_text(text, encoding="utf-8")
+    words = ["study", "status", str(file), "--verify", "--orphans", "--json"]
+    whole = run.invoke(app, words)
+    assert whole.exit_code == 0, whole.output
+    found = json.loads(whole.stdout)
+    assert (found["problems"], found["orphans"]) == ({}, [])
+    (commit, *_) = sorted(out.glob("expert/*/data.zarr/trajectory/c/1/*/*"))
+    commit.write_bytes(commit.read_bytes()[:-1] + b"?")
+    assert run.invoke(app, words[:3]).exit_code == 0, "what is not read is not compared"
+    file.write_text(text.replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8")
+    changed = run.invoke(app, words)
+    assert changed.exit_code == 1
+    found = json.loads(changed.stdout)
+    assert list(found["problems"]) == ["expert/short"]
+    assert "has other bytes than were written" in found["problems"]["expert/short"][0]
+    assert [Path(place).name.partition("-")[0] for place in found["orphans"]] == ["dark"]
 
 
 def file_times(folder: Path) -> dict[Path, int]:
