@@ -37,8 +37,9 @@ if TYPE_CHECKING:
 class ModelTest:
     """Two groups of models compared with the model as the unit.
 
-    n, n_minus: models of either group. difference: of the groups' means, with Welch's 95 % interval. p: exact and
-    two-sided, of exchanging the models' labels; smallest_p: the least that so few models allow.
+    n, n_minus: models of either group; runs of equal weights are of one. difference: of the groups' means, with
+    Welch's 95 % interval. p: exact and two-sided, of exchanging the models' labels; smallest_p: the least that so
+    few models allow.
     """
 
     n: int
@@ -329,15 +330,32 @@ def _models(
     value: Callable[[Sequence[RowWithEstimates]], float | None],
     largest: float = inf,
 ) -> ModelTest | None:
-    """sides: per category, the row of each run. A value per run, over its categories. largest: see `ModelTest`."""
-    found = [
-        [value(of_run) for of_run in zip(*side, strict=True)] if len({len(one) for one in side}) == 1 else []
-        for side in sides
-    ]
-    known = [[one for one in side if one is not None] for side in found]
-    complete = all(len(some) == len(every) > 0 for some, every in zip(known, found, strict=True))
-    first, second = known
-    return ModelTest.of(first, second, largest) if complete else None
+    """sides: per category, the row of each run. A value per model. largest: see `ModelTest`.
+
+    None where a model has no value, or is on both sides: its labels cannot be exchanged.
+    """
+    first, second = (_by_model(side, value) for side in sides)
+    if first is None or second is None or first.keys() & second.keys():
+        return None
+    return ModelTest.of(list(first.values()), list(second.values()), largest)
+
+
+def _by_model(
+    side: Sequence[Sequence[RowWithEstimates]], value: Callable[[Sequence[RowWithEstimates]], float | None]
+) -> dict[str, float] | None:
+    """The value of each model over its categories, by the hash of its weights, or by run where that is unknown.
+
+    Runs of one model, such as of several seeds, are averaged: they are no further models.
+    """
+    if len({len(one) for one in side}) != 1:
+        return None
+    values: dict[str, list[float]] = {}
+    for of_run in zip(*side, strict=True):
+        found, run = value(of_run), of_run[0].row.run
+        if found is None:
+            return None
+        values.setdefault(run.weights_sha256 or run.location, []).append(found)
+    return {model: float(np.mean(own)) for model, own in values.items()} or None
 
 
 def _sr_of_model(rows: Sequence[RowWithEstimates]) -> float | None:

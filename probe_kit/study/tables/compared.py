@@ -85,7 +85,7 @@ def group_table(table: RetentionTable, title: str) -> NamedTable:
     )
     note = (
         "p over models: exact, labels of models exchanged, in brackets the least that so few models allow and "
-        "Welch's interval; the last column is of these models on other items"
+        "Welch's interval; runs of one model are averaged; the last column is of these models on other items"
     )
     columns = ("groups", "category", "p over models (least)", "these models, points [95 %]")
     numbers = tuple({**_number(row), "p": None, "p_holm": None} for row in found)

@@ -1,6 +1,7 @@
 """Groups of models: the model is the unit, and the least p that so few allow follows the p."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from io import StringIO
 
 import pytest
@@ -38,6 +39,20 @@ def test_every_format_shows_the_p_over_models_and_the_least_possible_one(table: 
     for text in (console.file.getvalue(), table.to_markdown(), table.to_latex(), table._repr_html_()):  # type: ignore[attr-defined]
         assert "over models" in text
         assert "(0.100)" in text
+
+
+def test_runs_of_one_model_are_no_further_models(probed_run: ProbedRun) -> None:
+    """Seeds of two models against seeds of two others: four models, whatever the number of seeds."""
+    runs = [
+        replace(probed_run({"color": ([0.5, 0.7 + 0.02 * at], [[0.6, 0.7]])}, f"run {at}"), weights_sha256=model)
+        for at, model in enumerate("aaabbbcccddd")
+    ]
+    for row in retention_table({"first": runs[:6], "second": runs[6:]}).differences:
+        assert row.sr_models is not None
+        assert (row.sr_models.n, row.sr_models.n_minus, row.sr_models.smallest_p) == (2, 2, pytest.approx(1 / 3))
+    again = replace(runs[6], weights_sha256="b")
+    both = retention_table({"first": runs[:6], "second": [again, *runs[7:]]}).differences
+    assert [row.sr_models for row in both] == [None, None], "a model on both sides cannot change sides"
 
 
 def test_single_runs_have_no_p_over_models(probed_run: ProbedRun) -> None:
