@@ -130,6 +130,8 @@ def draw_overview(table: RetentionTable) -> "Figure":
     figure, grid = panels(len(scores), width=3.1, height=0.24 * len(systems) + 0.8, columns=min(3, len(scores)))
     for axes, (domain, own) in zip(grid, scores.items(), strict=True):
         found = [own.get(system, 0.0) for system in systems]
+        for at in (at for at, system in enumerate(systems) if system not in own):
+            axes.text(2, at, "no episodes", fontsize=7, color="0.45", va="center")
         axes.barh(range(len(systems)), found, color=[BLUE if score >= 0 else VERMILION for score in found])
         axes.axvline(0, color="0.45", lw=1)
         plain(axes)

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.retention import retention_table
+from probe_kit.retention.displays.base.style import text_width
 from probe_kit.study import LoadedStudy, make_figures
 from probe_kit.study.figures import draw_overview
 from probe_kit.study.tables.rates import domain_scores
@@ -35,6 +36,18 @@ def test_the_overview_has_a_panel_per_domain_and_a_bar_per_system_on_one_scale(t
     assert {axes.get_xlim() for axes in shown} == {(-105.0, 105.0)}
     bars = [[p.get_width() for p in axes.patches if isinstance(p, Rectangle)] for axes in shown]
     assert bars == [[50.0, 50.0], [-100.0, -100.0]]
+
+
+def test_the_overview_says_what_has_no_episodes_and_takes_names_as_they_are(tmp_path: Path) -> None:
+    right, name = np.ones((20, 2), bool), r"a $\frac{1$ b $5^^$"
+    both = acted(tmp_path / "both", {"color": right, "traffic": right}, name)
+    table = retention_table([both, acted(tmp_path / "one", {"color": right}, "one")], pairs=())
+    figure = draw_overview(table)
+    physical, normative = (axes for axes in figure.axes if axes.get_visible())
+    assert [[text.get_text() for text in axes.texts] for axes in (physical, normative)] == [[], ["no episodes"]]
+    figure.savefig(tmp_path / "overview.svg")
+    assert name in [text.get_text() for text in physical.get_yticklabels()]
+    assert text_width(name, 8) > text_width("a b", 8)
 
 
 def test_figures_are_drawn_by_name_from_stored_runs(played: LoadedStudy, tmp_path: Path) -> None:

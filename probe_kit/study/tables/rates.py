@@ -70,8 +70,20 @@ def _disagrees(row: RetentionRow) -> bool:
 
 
 def _disagreement(table: RetentionTable) -> list[str]:
-    found = any(_disagrees(row) for row in table.rows)
-    return ["* the 95 % interval and the range of guessing disagree about 50 %"] if found else []
+    notes = []
+    if any(_disagrees(row) for row in table.rows):
+        notes.append("* the 95 % interval and the range of guessing disagree about 50 %")
+    if any(_is_unmarked(row) for row in table.rows):
+        notes.append("rates beyond it whose 95 % interval includes 50 % have no mark: too few items")
+    return notes
+
+
+def _is_unmarked(row: RetentionRow) -> bool:
+    """Whether the rate is beyond what guessing reaches, and its interval includes one half."""
+    own = row.success
+    if own.sr is None or own.chance_margin is None or own.regime != Regime.NO_RELIABLE_KNOWLEDGE:
+        return False
+    return abs(own.sr - 0.5) > own.chance_margin
 
 
 def sides_table(table: RetentionTable) -> NamedTable:

@@ -3,6 +3,7 @@
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from probe_kit.retention.displays.base.display import Picture, picture_of
 
@@ -16,6 +17,12 @@ class ShownFigure(Figure):
     """
 
     caption: str = ""
+
+    def draw(self, renderer: Any) -> None:
+        """Draw; a `$` in the name of a model or category begins no formula."""
+        for words in self.findobj(Text):
+            words.set_parse_math(False)
+        super().draw(renderer)
 
     def savefig(self, fname: Any, **options: Any) -> None:
         """Save, by default 300 pixels per inch."""

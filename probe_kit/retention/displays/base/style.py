@@ -199,7 +199,9 @@ def text_width(text: str, size: float) -> float:
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
 
-    return float(TextPath((0, 0), text, prop=FontProperties(size=size)).get_extents().width) / 72
+    return (
+        float(TextPath((0, 0), text.replace("$", r"\$"), prop=FontProperties(size=size)).get_extents().width) / 72
+    )
 
 
 def significance_handles(colour: str = "0.3") -> "list[Line2D]":
