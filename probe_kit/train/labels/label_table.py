@@ -4,9 +4,12 @@ import csv
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from datetime import date, time
+from decimal import Decimal
 from math import isinf, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from uuid import UUID
 
 import numpy as np
 
@@ -28,6 +31,8 @@ SOURCE, FRAME = "source_episode", "frame"
 MOST_BYTES = 1 << 30
 EXACT = 2**53
 """Integers beyond it have no exact float64."""
+MOST_DIGITS = 400
+"""Of an integer that are read: with so many it is refused, and Python converts no more than 4,300."""
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
@@ -69,7 +74,21 @@ class LabelTable:
                     f"{self.lines[first[1]]} has {_ARTICLE[first[0]]}; expected one type. Correct one of the two, "
                     "or leave the cell empty"
                 )
+        self._check_exact(column, cells)
         return cells
+
+    def _check_exact(self, column: str, cells: Sequence[Cell]) -> None:
+        """Raise UsageError for decimals that are all whole, one beyond 2^53: they may be rounded integers.
+
+        A table with empty cells stores integers as decimals.
+        """
+        numbers = {row: cell for row, cell in enumerate(cells) if isinstance(cell, float)}
+        beyond = [row for row, cell in numbers.items() if abs(cell) > EXACT]
+        if beyond and all(cell.is_integer() for cell in numbers.values()):
+            raise UsageError(
+                f"{self.where(beyond[0], column)}: the whole number {numbers[beyond[0]]:g} is beyond 2^53, so it "
+                "may be a rounded integer. Write it as text if it is a name, or give a larger unit"
+            )
 
     def texts(self, column: str) -> list[str]:
         """The cells of one column as names, none of them empty. Raises UsageError."""
@@ -86,8 +105,8 @@ class LabelTable:
         if isinstance(cell, int):
             if abs(cell) > EXACT:
                 raise UsageError(
-                    f"{self.where(row, column)}: the integer {cell} is beyond 2^53, so it has no exact float64. "
-                    "Write it as text if it is a name, or subtract an offset"
+                    f"{self.where(row, column)}: the integer {_short(cell)} is beyond 2^53, so it has no exact "
+                    "float64. Write it as text if it is a name, or subtract an offset"
                 )
             return "integer"
         if isinstance(cell, float):
@@ -113,7 +132,7 @@ def read_table(table: "Path | str | pd.DataFrame", wanted: Sequence[str]) -> Lab
     path = Path(table)
     _check_file(path)
     if path.suffix.lower() in (".parquet", ".pq"):
-        return _of_frame(_read_parquet(path), str(path), wanted)
+        return _of_parquet(path, wanted)
     return _of_csv(path, wanted)
 
 
@@ -169,8 +188,8 @@ def _places(names: Sequence[str], wanted: Sequence[str], source: str) -> dict[st
     if EPISODE not in names and SOURCE not in names:
         shown = ", ".join(terminal_safe(name) for name in names[:12]) or "no column"
         raise UsageError(
-            f"{source}, line 1 lacks the key column {EPISODE!r}; it has {shown}. `probe-kit labels RUN` "
-            "writes a table with the keys of a run"
+            f"{source}, line 1 lacks the key column {EPISODE!r}; it has {shown}. "
+            f"{_other_delimiter(names)}`probe-kit labels RUN` writes a table with the keys of a run"
         )
     keys = (EPISODE, INFERENCE) if EPISODE in names else (SOURCE, FRAME)
     read = [name for name in dict.fromkeys((*keys, *wanted)) if name in names]
@@ -184,6 +203,20 @@ def _places(names: Sequence[str], wanted: Sequence[str], source: str) -> dict[st
     return {name: names.index(name) for name in read}
 
 
+def _other_delimiter(names: Sequence[str]) -> str:
+    """What to do about a heading that has the key beside another delimiter than a comma."""
+    for delimiter, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+        fields = {field.strip().strip('"') for one in names for field in one.split(delimiter)}
+        if len(fields) > len(names) and fields & {EPISODE, SOURCE}:
+            return f"Its fields are separated by {name}; save it with commas. "
+    return ""
+
+
+def _short(number: int) -> str:
+    digits = str(number)
+    return digits if len(digits) <= 40 else f"{digits[:12]}… of {len(digits)} digits or more"
+
+
 def _parsed(text: str, column: str) -> Cell:
     """A field of a CSV file as the type that it spells; ids stay text."""
     if not text:
@@ -191,7 +224,7 @@ def _parsed(text: str, column: str) -> Cell:
     if column == EPISODE:
         return text
     if _INTEGER.fullmatch(text):
-        return int(text) if len(text) < 40 else float(text)
+        return int(text[:MOST_DIGITS])
     if _NUMBER.fullmatch(text) or _INFINITE.fullmatch(text):
         return float(text)
     if text.lower() == "nan":
@@ -199,13 +232,21 @@ def _parsed(text: str, column: str) -> Cell:
     return {"true": True, "false": False}.get(text.lower(), text)
 
 
-def _read_parquet(path: Path) -> "pd.DataFrame":
+def _of_parquet(path: Path, wanted: Sequence[str]) -> LabelTable:
+    """Cells by arrow, because pandas rounds large integers beside empty cells."""
     parquet = require("pyarrow.parquet", "export")
     try:
-        frame: pd.DataFrame = parquet.read_table(path).to_pandas()
+        with parquet.ParquetFile(path) as file:
+            names = file.schema_arrow.names
+            place = _places(names, wanted, str(path))
+            read = file.read(columns=list(place))
+    except UsageError:
+        raise
     except Exception as error:  # pyarrow raises many kinds for files that are no Parquet
-        raise UsageError(f"{path} is no Parquet file: {error}. Write it again, or give a CSV file") from error
-    return frame
+        reason = str(error).rstrip(".")
+        raise UsageError(f"{path} is no Parquet file: {reason}. Write it again, or give a CSV file") from error
+    cells = {name: read.column(name).to_pylist() for name in place}
+    return _of_cells(cells, tuple(names), len(read), str(path))
 
 
 def _of_frame(frame: "pd.DataFrame", source: str, wanted: Sequence[str]) -> LabelTable:
@@ -213,16 +254,37 @@ def _of_frame(frame: "pd.DataFrame", source: str, wanted: Sequence[str]) -> Labe
         frame = frame.reset_index()
     names = [str(name) for name in frame.columns]
     place = _places(names, wanted, source)
-    columns = {name: [_plain(cell) for cell in frame.iloc[:, number].tolist()] for name, number in place.items()}
-    return LabelTable(source, "row", tuple(names), columns, list(range(1, len(frame) + 1)))
+    cells = {name: frame.iloc[:, number].tolist() for name, number in place.items()}
+    return _of_cells(cells, tuple(names), len(frame), source)
 
 
-def _plain(cell: Any) -> Cell:
-    """A cell of a frame as a Python type; whatever means "missing" is None."""
+def _of_cells(cells: dict[str, list[Any]], names: tuple[str, ...], count: int, source: str) -> LabelTable:
+    table = LabelTable(source, "row", names, {}, list(range(1, count + 1)))
+    for name, column in cells.items():
+        table.columns[name] = [_plain(cell, table, row, name) for row, cell in enumerate(column)]
+    return table
+
+
+def _plain(cell: Any, table: LabelTable, row: int, column: str) -> Cell:
+    """A cell of a frame or Parquet file as a Python type; whatever means "missing" is None. Dates are texts.
+
+    Raises UsageError for other objects, such as lists.
+    """
     import pandas as pd
 
-    if cell is None or cell is pd.NA or cell is pd.NaT or (isinstance(cell, float) and isnan(cell)):
-        return None
     if isinstance(cell, np.generic):
-        return _plain(cell.item())
-    return cell if isinstance(cell, bool | int | float) else str(cell) or None
+        cell = cell.item()
+    if cell is None or cell is pd.NA or cell is pd.NaT:
+        return None
+    if isinstance(cell, Decimal):
+        cell = float(cell)
+    if isinstance(cell, float):
+        return None if isnan(cell) else cell
+    if isinstance(cell, bool | int):
+        return cell
+    if isinstance(cell, str | date | time | UUID):
+        return str(cell) or None
+    raise UsageError(
+        f"{table.where(row, column)} is of type {type(cell).__name__}; expected text, a number, or true or false. "
+        "Write one such value per row, a duration as a number of seconds"
+    )

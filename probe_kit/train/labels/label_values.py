@@ -13,6 +13,8 @@ from probe_kit.train.labels.label_table import Cell
 
 MOST_DOUBTFUL = 20
 """Integers of 3 to so many values can be classes or quantities; only the user knows."""
+LARGEST = 1e100
+"""Quantities are squared and summed in float64, which ends at 1e308."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,9 @@ def code_labels(cells: Sequence[Cell], task: Task | None, target: str) -> LabelV
     chosen = task or _only_task(distinct, target)
     _check_task(chosen, distinct, target)
     if chosen == "continuous":
-        numbers = [np.nan if cell is None else float(cell) for cell in cells]
-        return LabelValues(chosen, (), np.array(numbers, np.float64))
+        numbers = np.array([np.nan if cell is None else float(cell) for cell in cells], np.float64)
+        _check_squares(numbers, target)
+        return LabelValues(chosen, (), numbers)
     code = {value: number for number, value in enumerate(distinct)}
     codes = [np.nan if cell is None else code[_whole(cell)] for cell in cells]
     return LabelValues(chosen, tuple(map(str, distinct)), np.array(codes, np.float64))
@@ -78,10 +81,23 @@ def _only_task(distinct: Sequence[Cell], target: str) -> Task:
     return "continuous"
 
 
+def _check_squares(numbers: NDArray[np.float64], target: str) -> None:
+    """Raise UsageError for quantities whose sums of squares leave the range of float64."""
+    largest, spread = float(np.nanmax(np.abs(numbers))), float(np.nanmax(numbers) - np.nanmin(numbers))
+    if largest > LARGEST or spread < 1 / LARGEST:
+        raise UsageError(
+            f"column {target!r} has values up to {largest:g}, and they differ by {spread:g}; expected at most "
+            f"{LARGEST:g}, and differences of at least {1 / LARGEST:g}. Correct the cell, or give another unit"
+        )
+
+
 def _check_task(task: Task, distinct: Sequence[Cell], target: str) -> None:
-    text = isinstance(distinct[0], str | bool)
-    if task == "continuous" and text:
-        raise UsageError(f"column {target!r} has texts such as {distinct[0]!r}; a continuous label needs numbers")
+    if task == "continuous" and isinstance(distinct[0], str | bool):
+        kind = "true and false" if isinstance(distinct[0], bool) else f"texts such as {distinct[0]!r}"
+        raise UsageError(
+            f"column {target!r} has {kind}; a continuous label needs numbers. Use --task "
+            f"{'binary' if len(distinct) == 2 else 'classes'}"
+        )
     if task == "binary" and len(distinct) != 2:
         shown = ", ".join(repr(value) for value in distinct[:4])
         raise UsageError(

@@ -226,9 +226,11 @@ def _numbers(table: LabelTable, column: str) -> tuple[int, ...] | None:
         return None
     cells = table.columns[column]
     for row, cell in enumerate(cells):
-        if isinstance(cell, bool | str | None) or not float(cell).is_integer() or cell < 0:
+        fraction = isinstance(cell, float) and not cell.is_integer()
+        if isinstance(cell, bool | str | None) or fraction or cell < 0:
+            shown = "empty" if cell is None else repr(cell)
             raise UsageError(
-                f"{table.where(row, column)} is {cell!r}; expected the number of {_COUNTED[column]}, from 0"
+                f"{table.where(row, column)} is {shown}; expected the number of {_COUNTED[column]}, from 0"
             )
     return tuple(int(cell) for cell in cells if cell is not None)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.train import ArrayRun, Labels
+from probe_kit.train.choices import TASKS, Task
 from probe_kit.train.labels.label_probe import fit_label_probe
 from probe_kit.train.labels.label_problem import LabelProblem, label_problem
 from probe_kit.train.labels.labelled_samples import LabelledSamples
@@ -17,7 +18,9 @@ GROUPS, FRAMES = 12, 6
 GROUP, FRAME = (axis.ravel() for axis in np.indices((GROUPS, FRAMES)))
 
 
-def problem_of(values: NDArray[np.float64], permutations: int, kinds: list[str] | None = None) -> LabelProblem:
+def problem_of(
+    values: NDArray[np.float64], permutations: int, kinds: list[str] | None = None, task: Task = "continuous"
+) -> LabelProblem:
     """Labels of one episode per group."""
     names = np.array([f"e{number}" for number in range(GROUPS)])
     table = pd.DataFrame({"episode_id": names[GROUP], "inference": FRAME, "y": values})
@@ -25,7 +28,7 @@ def problem_of(values: NDArray[np.float64], permutations: int, kinds: list[str] 
     run = ArrayRun(Path("nowhere"), "none", "none", episodes, {})
     everywhere = np.full(GROUP.size, "all")
     samples = LabelledSamples(GROUP, FRAME, values, names[GROUP], everywhere, FRAMES, {})
-    return label_problem(run, Labels.read(table, "y", "continuous"), samples, permutations, 0)
+    return label_problem(run, Labels.read(table, "y", task), samples, permutations, 0)
 
 
 def trend_and_noise(draw: np.random.Generator) -> NDArray[np.float64]:
@@ -68,6 +71,22 @@ def test_a_trend_over_the_episode_is_read_and_is_no_signal() -> None:
     assert pointwise_p(np.array([shuffled.metric]), shuffled.null[None, :])[0] == 0.05, (
         "as a null of frames has it"
     )
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_score_of_a_labelling_does_not_depend_on_its_place_among_the_permutations(task: Task) -> None:
+    """So the real labels are one of equally likely labellings, and p is exact whatever the probe is."""
+    draw = np.random.default_rng(2)
+    values = trend_and_noise(draw)
+    levels = {"binary": [0.5], "classes": [1 / 3, 2 / 3], "continuous": []}[task]
+    if levels:
+        values = np.digitize(values, np.quantile(values, levels)).astype(np.float64)
+    problem = problem_of(values, 5, task=task)
+    features = draw.normal(size=(GROUP.size, 4))
+    probe = fit_label_probe(features, problem.columns, task, problem.folds)
+    turned = fit_label_probe(features, np.roll(problem.columns, 1, axis=1), task, problem.folds)
+    expected = np.roll([probe.metric, *probe.null], 1)
+    np.testing.assert_allclose([turned.metric, *turned.null], expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -1,10 +1,14 @@
 """Labels of one's own: what is read, and what is refused with its file and line."""
 
+from datetime import timedelta
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
+from pyarrow import parquet
 
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import UsageError
@@ -65,6 +69,11 @@ def test_the_task_follows_from_the_values_where_they_leave_no_doubt(
         ("episode_id,y,y\na,1,2\n", "line 1 has the column 'y' twice"),
         ("episode_id,y\n", "has no line below its heading"),
         ("", "lacks the key column"),
+        (
+            "episode_id;y\na;1\n",
+            "it has episode_id;y. Its fields are separated by semicolons; save it with commas.",
+        ),
+        ("episode_id\ty\na\t1\n", "Its fields are separated by tabs; save it with commas."),
         ("episode_id,y\na,1\nb,red\n", "line 3, column 'y': 'red' is text, and line 2 has a number"),
         ("episode_id,y\na,1\n\nb,true\n", "line 4, column 'y': True is true or false"),
         ("episode_id,y\na,1\nb\n", "line 3 has 1 fields, the heading has 2"),
@@ -81,7 +90,7 @@ def test_the_task_follows_from_the_values_where_they_leave_no_doubt(
         (HEADING + "a,-1,1,s\n", "line 2, column 'inference' is -1; expected the number of a captured"),
         (HEADING + "a,0.5,1,s\n", "line 2, column 'inference' is 0.5"),
         (HEADING + "a,inf,1,s\n", "line 2, column 'inference' is inf"),
-        (HEADING + "a,,1,s\n", "line 2, column 'inference' is None"),
+        (HEADING + "a,,1,s\n", "line 2, column 'inference' is empty"),
         (HEADING + "a,0,1,s\nb,0,2,\n", "line 3, column 'scene' is empty; expected a name in every line"),
         ("episode_id,y\na,1\nb,1\n", "has one value, 1; expected two or more"),
         ("episode_id,y\na,\nb,\n", "has no value; expected two or more"),
@@ -100,11 +109,22 @@ def test_a_table_that_is_wrong_is_refused_with_its_line(tmp_path: Path, text: st
         (["red", "blue"], "continuous", "texts such as 'blue'; a continuous label needs numbers"),
         (["1", "2", "3"], "binary", "has 3 values (1, 2, 3, …); a binary label needs two"),
         (["1.5", "2", "3"], "classes", "decimals such as 1.5; classes need texts or integers"),
+        (
+            ["true", "false"],
+            "continuous",
+            "has true and false; a continuous label needs numbers. Use --task binary",
+        ),
+        (
+            ["0.5", "1.5", "1e300"],
+            None,
+            "has values up to 1e+300, and they differ by 1e+300; expected at most 1e+100",
+        ),
+        (["1e-200", "2e-200", "3e-200"], None, "differences of at least 1e-100. Correct the cell"),
         (["1", "2"], "ordinal", "task 'ordinal'; expected one of binary, classes, continuous"),
     ],
 )
 def test_a_task_that_the_values_cannot_have_is_refused(
-    tmp_path: Path, cells: list[str], task: str, expected: str
+    tmp_path: Path, cells: list[str], task: str | None, expected: str
 ) -> None:
     rows = "".join(f"e{number},{cell}\n" for number, cell in enumerate(cells))
     with pytest.raises(UsageError) as refused:
@@ -121,6 +141,37 @@ def test_files_that_are_no_tables_are_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "no.parquet").write_bytes(b"PAR1")
     with pytest.raises(UsageError, match="is no Parquet file"):
         Labels.read(tmp_path / "no.parquet", "y")
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([[1, 2], [3, 4]], "row 1, column 'y' is of type list; expected text, a number, or true or false"),
+        ([{"a": 1}, {"a": 2}], "is of type dict"),
+        ([b"x", b"y"], "is of type bytes"),
+        ([timedelta(seconds=1), timedelta(seconds=2)], "a duration as a number of seconds"),
+        ([2**60, None], "row 1, column 'y': the integer 1152921504606846976 is beyond 2^53"),
+        ([2**64 - 1, 1], "row 1, column 'y': the integer 18446744073709551615 is beyond 2^53"),
+        ([1.0, 2.0**60], "row 2, column 'y': the whole number 1.15292e+18 is beyond 2^53"),
+    ],
+)
+def test_cells_of_parquet_that_are_no_labels_are_refused_with_their_row(
+    tmp_path: Path, values: list[object], expected: str
+) -> None:
+    column = pa.array(values, pa.uint64() if 2**64 - 1 in values else None)
+    parquet.write_table(pa.table({"episode_id": ["a", "b"], "y": column}), tmp_path / "labels.parquet")
+    with pytest.raises(UsageError) as refused:
+        Labels.read(tmp_path / "labels.parquet", "y")
+    assert expected in str(refused.value)
+
+
+def test_a_column_that_a_parquet_file_has_twice_is_refused_and_others_keep_their_dots(tmp_path: Path) -> None:
+    names = ["episode_id", "arm.y", "z", "z"]
+    columns = [pa.array(["a", "b"]), pa.array([Decimal("0.25"), Decimal("1.50")]), *[pa.array([1, 2])] * 2]
+    parquet.write_table(pa.Table.from_arrays(columns, names), tmp_path / "labels.parquet")
+    assert Labels.read(tmp_path / "labels.parquet", "arm.y", "continuous").coded.values.tolist() == [0.25, 1.5]
+    with pytest.raises(UsageError, match="has the column 'z' twice"):
+        Labels.read(tmp_path / "labels.parquet", "z")
 
 
 def test_a_heading_of_a_million_columns_is_read_for_the_few_that_are_asked_for(tmp_path: Path) -> None:
@@ -151,11 +202,15 @@ def test_a_formula_is_a_text_and_leaves_as_one(tmp_path: Path, formula: str) -> 
         ("episode_id,y\na\u202e,1.5\nb,2.5\n", "y", "line 2, column 'episode_id' holds the control or direction"),
         ("episode_id,y\na,r\x1b[31med\nb,blue\n", "y", "character U+001B"),
         ("episode_id,y\na,r\x00ed\nb,blue\n", "y", "character U+0000"),
-        ("episode_id,y\na," + "9" * 5000 + "\nb,2.5\n", "y", "line 2, column 'y' is infinite"),
+        (
+            "episode_id,y\na," + "9" * 5000 + "\nb,2.5\n",
+            "y",
+            "line 2, column 'y': the integer 999999999999… of 400 digits or more",
+        ),
         ("episode_id,y\na,1e999\nb,2.5\n", "y", "line 2, column 'y' is infinite"),
         ("episode_id,y\na," + "x" * 200_000 + "\nb,y\n", "y", "line 2 is no CSV: field larger than field limit"),
         ("episode_id,y\na,1.5\nb,N/A\n", "y", "line 3, column 'y': 'N/A' is text, and line 2 has a number"),
-        ("source_episode,frame,y\n0,nan,1.5\n1,0,2.5\n", "y", "column 'frame' is None; expected the number of a"),
+        ("source_episode,frame,y\n0,nan,1.5\n1,0,2.5\n", "y", "column 'frame' is empty; expected the number of a"),
         (
             "source_episode,frame,y\n0.5,0,1.5\n1,0,2.5\n",
             "y",
