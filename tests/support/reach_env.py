@@ -112,6 +112,15 @@ class Forgetful(ReachEnv):
         return Step(found.observation, done, {**found.facts, **further})
 
 
+class Shrinking(ReachEnv):
+    """Leaves numbers out of the state behind the first step."""
+
+    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        found = super()._as_step(seen, done, success)
+        state = found.observation.state[: None if self._env.steps < 2 else 5]
+        return Step(Observation(found.observation.image, state, self._episode.instruction), done, found.facts)
+
+
 class Broken(ReachEnv):
     """Raises at the third step."""
 

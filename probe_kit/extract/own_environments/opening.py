@@ -176,7 +176,9 @@ def checked_step(answer: object, episode: EnvEpisode, where: str) -> Step:
         )
     for name, value in answer.facts.items():
         number = isinstance(value, bool | int | float | np.bool_ | np.integer | np.floating)
-        if not isinstance(name, str) or UNSAFE.search(name) or not number or not np.isfinite(float(value)):
+        if not isinstance(name, str) or not name.strip() or UNSAFE.search(name):
+            raise OwnEnvironmentError(f"{where}: a fact has the name {name!r}; expected plain text")
+        if not number or not np.isfinite(float(value)):
             raise OwnEnvironmentError(
                 f"{where}: the fact {name!r} is {value!r}; expected a finite number or a truth value"
             )

@@ -123,7 +123,18 @@ class _Trial:
         steps = [_copied(self._begin(environment, episode))]
         while len(steps) <= STEPS and not steps[-1].done:
             steps.append(_copied(self._step(environment, episode, len(steps))))
+            self._check_shapes(steps)
         return steps
+
+    def _check_shapes(self, steps: list[Step]) -> None:
+        """Raise _BrokenError if the last step has pictures or a state of other shapes than the episode's first."""
+        before, now = _shapes(steps[0]), _shapes(steps[-1])
+        if changed := [name for name in {**before, **now} if before.get(name) != now.get(name)]:
+            name = changed[0]
+            raise _BrokenError(
+                f"{self.source.name}, step() {len(steps) - 1}: {name} has the shape {now.get(name, 'none')}, in "
+                f"reset() {before.get(name, 'none')}; expected the same at every step"
+            )
 
     def _begin(self, environment: OwnEnvironment, episode: EnvEpisode) -> Step:
         with naming_environment(self.source.name, "reset()"):
@@ -151,7 +162,8 @@ _CHECKS: Sequence[tuple[str, str, Callable[[_Trial], None]]] = (
     ("episodes_are_listed", "Its episodes have different ids, and are the same every time.", _Trial.list_episodes),
     (
         "steps_are_whole",
-        "Pictures are uint8 (H, W, 3), the state float32, facts finite, and actions have the promised width.",
+        "Pictures are uint8 (H, W, 3), the state float32, both of constant shape; facts are finite, and actions "
+        "have the promised width.",
         _Trial.play,
     ),
     ("facts_are_constant", "Every step of every episode has facts of the same names.", _Trial.facts_are_constant),
@@ -190,6 +202,12 @@ def _copied(step: Step) -> Step:
     cameras = {name: picture.copy() for name, picture in seen.cameras.items()}
     copy = type(seen)(seen.image.copy(), seen.state.copy(), seen.instruction, seen.intrinsics, cameras)
     return Step(copy, step.done, dict(step.facts))
+
+
+def _shapes(step: Step) -> dict[str, tuple[int, ...]]:
+    seen = step.observation
+    further = {f"the camera {name!r}": picture.shape for name, picture in seen.cameras.items()}
+    return {"the picture": seen.image.shape, "the state": seen.state.shape, **further}
 
 
 def _check_equal(first: list[Step], again: list[Step], which: str) -> None:

@@ -78,7 +78,8 @@ def label_problem(
         warnings.warn(
             f"label {labels.target!r}: {100 * share:.0f} % of the samples are in groups that have another one to "
             "exchange labels with; expected half or more, so there is no p. Groups exchange where they have the "
-            "same layouts, labelled inferences and value of --exchange-within",
+            "same layouts, labelled inferences and value of --exchange-within. Label the same inferences in every "
+            "group, or leave groups with gaps out",
             stacklevel=3,
         )
         permutations = 0

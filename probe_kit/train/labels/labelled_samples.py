@@ -122,6 +122,9 @@ def labelled_samples(
         f"episodes that end {short}": int((chosen & ~whole).sum()),
         "episodes without a label": int((whole & ~labelled.any(axis=1)).sum()),
         "inferences without a label": int((~labelled)[labelled.any(axis=1)].sum()),
+        f"labels outside the window of {window}": _outside(table[whole], labelled[whole])
+        if labels.per_step
+        else 0,
         "labels of frames or episodes that the run does not show": unseen,
     }
     return LabelledSamples(
@@ -134,6 +137,11 @@ def labelled_samples(
         {reason: count for reason, count in left_out.items() if count},
         None if align_to is None else steps,
     )
+
+
+def _outside(table: NDArray[np.float64], labelled: NDArray[np.bool_]) -> int:
+    """How many labels (E, C) of episodes with a whole window are outside it. labelled: (E, window) inside it."""
+    return int(np.isfinite(table).sum() - labelled.sum())
 
 
 def _events(run: RunReader, labels: Labels, align_to: Labels) -> NDArray[np.intp]:

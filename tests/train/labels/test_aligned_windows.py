@@ -41,7 +41,10 @@ def test_a_window_begins_where_the_cube_is_first_held(run: Run) -> None:
     samples = labelled_samples(run, labels, None, 0, None, event)
     assert samples.window == CALLS - GRASPED
     assert set(samples.inferences.tolist()) == {GRASPED, GRASPED + 1}
-    assert samples.left_out == {"episodes in which sim.held is never true": 1}
+    assert samples.left_out == {
+        "episodes in which sim.held is never true": 1,
+        "labels outside the window of 2": GRASPED * (len(run.episodes) - 1),
+    }
     expected = [
         run.trajectory(int(row)).tool[3 * call, 1]
         for row, call in zip(samples.rows, samples.inferences, strict=True)
@@ -57,7 +60,10 @@ def test_an_event_may_be_a_value_of_a_column_of_classes(run: Run) -> None:
         run, Labels.of_run(run, "sim.tool_y"), None, 0, None, phase.equal_to("after release")
     )
     assert (samples.window, set(samples.inferences.tolist())) == (1, {3})
-    assert samples.left_out == {"episodes in which sim.phase=after release is never true": 1}
+    assert samples.left_out == {
+        "episodes in which sim.phase=after release is never true": 1,
+        "labels outside the window of 1": 3 * (len(run.episodes) - 1),
+    }
     with pytest.raises(UsageError, match="no value 'landed'; it has after release, before grasp, holding"):
         phase.equal_to("landed")
     with pytest.raises(UsageError, match="quantities, not classes"):
