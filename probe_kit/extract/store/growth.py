@@ -40,6 +40,10 @@ class Growth:
         return ""
 
 
+_CONTENT = "content_blake2b"
+"""Of recordings: hash of the files that hold an episode."""
+
+
 def further_rows(stored: Sequence[Row], asked: Sequence[Row], where: str) -> list[Row]:
     """The rows of a plan that the stored one lacks; none if the stored one holds them all.
 
@@ -63,6 +67,12 @@ def _check_equal(was: Row, now: Row, where: str) -> None:
     """Raise SettingsMismatchError unless an episode is planned as it is stored, but for its number."""
     for part in sorted((was.keys() | now.keys()) - {_NUMBER}):
         if was.get(part) != now.get(part):
+            if part == _CONTENT:
+                raise SettingsMismatchError(
+                    f"the files of the data set that hold {was['episode_id']} have changed since {where} began: "
+                    f"their {part} is stored as {was.get(part)!r}, here {now.get(part)!r}. Give the data set as "
+                    "it was, or choose another --out"
+                )
             raise SettingsMismatchError(
                 f"{where} plans {was['episode_id']} otherwise: its {part} is stored as {was.get(part)!r}, here "
                 f"{now.get(part)!r}. Use the suite, the kind of --wordings and the version of probe_kit that the "
