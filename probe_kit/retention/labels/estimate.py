@@ -1,5 +1,6 @@
 """Retention of a label: share of the backbone's score above chance that is left in the action."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
 
@@ -210,13 +211,13 @@ def _listed(names: tuple[str, ...]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def check_same_label(results: list[LabelResults]) -> None:
-    """Raise UsageError where two results are of labels that differ in any value or sample."""
-    for one in results[1:]:
-        first = results[0]
+def check_same_label(results: Sequence[LabelResults], places: Sequence[str]) -> None:
+    """Raise UsageError where results at two places are of labels that differ in any value or sample."""
+    first = results[0]
+    for one, place in zip(results, places, strict=True):
         if one.settings.label != first.settings.label:
             raise UsageError(
-                f"the labels {one.settings.target!r} of {one.settings.model} and {first.settings.model} differ "
+                f"the labels {one.settings.target!r} of {place} and {places[0]} differ "
                 f"(sha256 {one.settings.label[:12]} and {first.settings.label[:12]}); retention is compared on "
                 "the same labels of the same episodes. Show the runs one by one"
             )

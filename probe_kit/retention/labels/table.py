@@ -25,7 +25,7 @@ from probe_kit.statistics.paired_tests import holm
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.labels.label_results import LabelResults
-from probe_kit.train.labels.label_store import load_label_results, stored_targets
+from probe_kit.train.labels.label_store import load_label_results, stored_versions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,13 +56,14 @@ class LabelRetentionTable:
     """Rows per target, run and view; no row is a mean, as labels of different tasks have different metrics.
 
     results: the probes that they were made of, by location and target. tried: by location, all label columns of
-    which the run has probes. family: which tests the signal is corrected for.
+    which the run has probes, with the number of versions of their values. family: which tests the signal is
+    corrected for.
     """
 
     rows: tuple[LabelRow, ...]
     results: Mapping[tuple[str, str], LabelResults] = field(default_factory=dict)
     iterations: Iterations = "all"
-    tried: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    tried: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     family: Family = "label"
 
     @property
@@ -139,12 +140,13 @@ class LabelRetentionTable:
         names = {row.location: row.run for row in self.rows}
         found = []
         for place, targets in self.tried.items():
-            if len(targets) > 1:
-                shown = ", ".join([*targets[:_NAMED], *["…"] * (len(targets) > _NAMED)])
+            if (count := sum(targets.values())) > 1:
+                named = [f"{name} in {of} versions" if of > 1 else name for name, of in targets.items()]
+                shown = ", ".join([*named[:_NAMED], *["…"] * (len(named) > _NAMED)])
                 corrected = "of each label alone" if self.family == "label" else (
                     f"corrected for the {len(self.targets)} labels of this table (Holm)"
                 )  # fmt: skip
-                found.append(f"{names[place]} has probes of {len(targets)} labels ({shown}); p is {corrected}.")
+                found.append(f"{names[place]} has probes of {count} labels ({shown}); p is {corrected}.")
         return found
 
     def to_frame(self) -> "pd.DataFrame":
@@ -225,7 +227,7 @@ def label_retention_table(
     results: dict[tuple[str, str], LabelResults] = {}
     for target in named:
         own = [load_label_results(run, key, target) for run, key in zip(runs, chosen, strict=True)]
-        check_same_label(own)
+        check_same_label(own, places)
         results |= {(place, target): one for place, one in zip(places, own, strict=True)}
     names = dict(zip(places, full_names(runs), strict=True))
     rows = [
@@ -233,7 +235,7 @@ def label_retention_table(
         for (place, _), one in results.items()
         for view in views or one.settings.views
     ]
-    tried = {place: stored_targets(run) for place, run in zip(places, runs, strict=True)}
+    tried = {place: stored_versions(run) for place, run in zip(places, runs, strict=True)}
     corrected = rows if family == "label" else _corrected(rows, results)
     return LabelRetentionTable(tuple(corrected), results, iterations, tried, family)
 

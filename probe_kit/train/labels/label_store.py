@@ -1,6 +1,7 @@
 """Storage of probes of a label: `RUN/probes/<key>/`, beside the other probes, either complete or absent."""
 
 import json
+from collections import Counter
 from dataclasses import asdict
 from datetime import UTC, datetime
 from io import BytesIO
@@ -73,7 +74,15 @@ def load_label_results(run: RunReader, key: str | None = None, target: str | Non
 
 def stored_targets(run: RunReader) -> tuple[str, ...]:
     """The label columns of which the run has probes on its present episodes, in alphabetical order."""
-    return tuple(sorted({str(bundle.head["settings"]["target"]) for bundle in _current(run)[0]}))
+    return tuple(stored_versions(run))
+
+
+def stored_versions(run: RunReader) -> dict[str, int]:
+    """The same, with the number of different values that each column had: every one of them was a test."""
+    settings = [bundle.head["settings"] for bundle in _current(run)[0]]
+    return dict(
+        sorted(Counter(target for target, _ in {(str(o["target"]), o["label"]) for o in settings}).items())
+    )
 
 
 def _current(run: RunReader) -> tuple[list[Bundle], int]:

@@ -197,7 +197,7 @@ def test_runs_whose_labels_differ_are_not_put_into_one_table(trained: Run, tmp_p
     frame = pd.DataFrame({"episode_id": other.episodes["episode_id"], "y": np.arange(len(other.episodes)) / 7})
     for run, values in ((trained, frame), (other, frame.assign(y=frame["y"] + 1))):
         train_probes(run, labels=Labels.read(values, "y", task="continuous"), permutations=9, controls=())
-    with pytest.raises(UsageError, match="sha256"):
+    with pytest.raises(UsageError, match=r"the labels .y. of .*other and .* differ \(sha256"):
         label_retention_table([trained, other], "y")
 
 
@@ -257,6 +257,11 @@ def test_trap_9_the_table_says_how_many_labels_were_tried_and_corrects_them_by_h
         .sentences[-1]
         .startswith("labelled (random weights) has probes of 3")
     )
+    table = pd.DataFrame({"episode_id": three.episodes["episode_id"]})
+    table["even"] = np.arange(len(table)) // 2 % 2
+    train_probes(three, labels=Labels.read(table, "even"), permutations=0, controls=())
+    tried = label_retention_table([three], "kind").sentences[-1]
+    assert "has probes of 4 labels (even in 2 versions, kind, sim.tool_y)" in tried
 
 
 def holm_by_hand(family: list[float], p: float) -> float:
