@@ -118,8 +118,14 @@ class LeRobotFolder:
         return [int(start) for start in self.meta.episodes["dataset_from_index"]]
 
     def task(self, number: int) -> str:
-        """The text of a task."""
-        return str(self.meta.tasks.iloc[number].name)
+        """The text of a task. Raises RecordingError for a number that `meta` does not name once."""
+        texts = self.meta.tasks.index[self.meta.tasks["task_index"] == number]
+        if len(texts) != 1:
+            raise RecordingError(
+                f"{self.path.name}: meta/tasks.parquet has {len(texts)} tasks of the number {number}, which a "
+                "frame names; expected one. Repair the data set, or give --instruction TEXT"
+            )
+        return str(texts[0])
 
     # -- hashes ----------------------------------------------------------------------------------------
 
@@ -133,9 +139,15 @@ class LeRobotFolder:
         return self._hash_of(self.files(episode, cameras))
 
     def files(self, episode: int, cameras: Sequence[str]) -> list[Path]:
-        """The files that hold an episode and the videos of some cameras."""
+        """The files that hold an episode and the videos of some cameras. Raises RecordingError for others."""
         videos = [self.meta.get_video_file_path(episode, key) for key in cameras if key in self.meta.video_keys]
-        return [self.path / one for one in (self.meta.get_data_file_path(episode), *videos)]
+        found = [self.meta.get_data_file_path(episode), *videos]
+        if outside := [one for one in found if Path(one).is_absolute() or ".." in Path(one).parts]:
+            raise RecordingError(
+                f"{self.path.name}: meta/info.json names {outside[0]} for episode {episode}; expected a file in "
+                "the data set's folder. Correct data_path and video_path"
+            )
+        return [self.path / one for one in found]
 
     def _hash_of(self, files: Sequence[Path]) -> str:
         together = blake2b(digest_size=_DIGITS)
@@ -243,6 +255,8 @@ def _check_format(path: Path) -> None:
         raise RecordingError(
             f"{path.name} has format {version}; this version reads v3.0. Convert it with `{CONVERTER} --repo-id=…`"
         )
+    if missing := [name for name in ("tasks.parquet", "episodes") if not (path / "meta" / name).exists()]:
+        raise RecordingError(f"{path.name} has no meta/{missing[0]}. Copy the data set again")
 
 
 def _metadata(path: Path) -> Any:

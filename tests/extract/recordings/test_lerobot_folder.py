@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
@@ -295,6 +296,32 @@ def test_a_missing_file_is_named_and_the_hub_is_not_asked(recording: Path, tmp_p
     next((broken / "data").rglob("*.parquet")).unlink()
     with pytest.raises(RecordingError, match=r"data/chunk-000/file-000\.parquet of episode 0 is missing"):
         prepare(settings(broken))
+
+
+@pytest.mark.parametrize("place", ["/etc/hostname", "../other/file-{file_index:03d}.parquet"])
+def test_files_outside_the_folder_are_refused(recording: Path, tmp_path: Path, place: str) -> None:
+    moved = shutil.copytree(recording, tmp_path / "rec")
+    info = json.loads((moved / "meta" / "info.json").read_text(encoding="utf-8"))
+    (moved / "meta" / "info.json").write_text(json.dumps({**info, "data_path": place}), encoding="utf-8")
+    with pytest.raises(RecordingError, match="for episode 0; expected a file in the data set's folder"):
+        prepare(settings(moved))
+
+
+def test_tasks_are_named_by_their_number_wherever_their_line_is(recording: Path, tmp_path: Path) -> None:
+    """lerobot writes them in order; a table that was edited may have another one."""
+    moved = shutil.copytree(recording, tmp_path / "rec")
+    tasks = pd.read_parquet(moved / "meta" / "tasks.parquet")
+    tasks.iloc[::-1].to_parquet(moved / "meta" / "tasks.parquet")
+    texts = [
+        [stretch.instruction for stretch in prepare(settings(one)).plan.episodes] for one in (recording, moved)
+    ]  # type: ignore[union-attr]
+    assert texts[0] == texts[1]
+    rewrite(moved, lambda table: table.assign(task_index=np.int64(-1)))
+    with pytest.raises(RecordingError, match="has 0 tasks of the number -1"):
+        prepare(settings(moved))
+    (moved / "meta" / "tasks.parquet").unlink()
+    with pytest.raises(RecordingError, match=r"rec has no meta/tasks\.parquet"):
+        prepare(settings(moved))
 
 
 def test_data_that_lacks_an_episode_that_its_meta_names_is_refused(recording: Path, tmp_path: Path) -> None:
