@@ -101,7 +101,7 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         """The picture (height, w, 3) uint8 of the scene now: for films, and no model.
 
         Shrunk from that of `render` where that was drawn since the last action. Else drawn at this height, which
-        takes a quarter of the time at half the height and gives less smooth edges.
+        takes an eighth of the time at a third of the height and gives less smooth edges.
         """
         if self._frame is None:
             return self.scene.small_picture(height)

@@ -18,6 +18,7 @@ from probe_kit.env.rotations import Array, to_vector, yaw_quaternion
 from probe_kit.env.simulation.background import load_photo, wooden_table
 from probe_kit.env.simulation.bullet import BulletClient
 from probe_kit.env.simulation.camera import Backdrop, Camera, Frame, Picture
+from probe_kit.env.simulation.film import INVISIBLE, FilmCamera
 from probe_kit.env.simulation.tiles import TextureCache, write_quad
 from probe_kit.env.spec import XY, XYZ, CameraSpec, LightSpec, SceneSpec
 from probe_kit.errors import SceneError
@@ -31,7 +32,6 @@ FLOOR_SIZE = (8.0, 8.0, 0.02)
 FLOOR_CENTRE = (0.0, 0.0, -0.75)
 FLOOR_COLOR = (0.62, 0.64, 0.66, 1.0)
 TILE_COLOR = (0.85, 0.85, 0.83, 1.0)
-INVISIBLE = (0.0, 0.0, 0.0, 0.0)
 LIMBO = (0.0, 0.0, 5.0)
 """Where the cube waits in the saved state, so far up that it touches nothing."""
 TILE_LIMBO: Mapping[Side, XYZ] = MappingProxyType({"left": (0.0, 1.0, 5.0), "right": (0.0, -1.0, 5.0)})
@@ -70,7 +70,6 @@ class Scene:
         self.camera = Camera(spec.camera)
         self._folder = tempfile.TemporaryDirectory(prefix="probe-kit-scene-")
         self._closed: tuple[tuple[int, float, bytes, bytes], int] | None = None
-        self._small_backdrop: Backdrop | None = None
         try:
             self._build()
         except BaseException:
@@ -187,19 +186,25 @@ class Scene:
         return any(self.touches_tile(side) for side in SIDES)
 
     def frame(self) -> Frame:
-        """Robot, cube and tiles as the camera sees them, without the table."""
+        """Robot, cube and tiles as the camera sees them, without the table. Small pictures do not change it.
+
+        PyBullet normalises the normals of a mesh in place whenever it draws them. The last bit of some alternates,
+        and with it a colour by 1 of 255. So small pictures are made an even number.
+        """
         if self.spec.tile_mass > 0:
             self._lay_pictures()
+        if self._small_drawn % 2:
+            self.camera.at_height(1).render(self.client, self.spec.light, self.spec.light_level)
+            self._small_drawn += 1
         return self._draw()
 
     def small_picture(self, height: int) -> Picture:
         """The finished picture (height, w, 3), drawn with fewer pixels, so that edges are less smooth."""
         if self.spec.tile_mass > 0:
             self._lay_pictures()
-        camera = self.camera.at_height(height)
-        if self._small_backdrop is None or len(self._small_backdrop.depth) != height:
-            self._small_backdrop = self.backdrop.at_size(camera.spec)
-        return self._small_backdrop.under(camera.render(self.client, self.spec.light, self.spec.light_level))
+        self._small_drawn += 1
+        camera, spec = self.camera.at_height(height), self.spec
+        return self._film.picture(camera, spec.light, spec.light_level, tuple(self._shown.values()))
 
     def _draw(self) -> Frame:
         return self.camera.render(self.client, self.spec.light, self.spec.light_level)
@@ -231,13 +236,15 @@ class Scene:
         self.floor = self._box(FLOOR_SIZE, FLOOR_CENTRE, FLOOR_COLOR)
         empty = _drawn_once(_EMPTY_TABLES, (spec.camera, spec.light, spec.light_level), self._draw)
         self.backdrop = Backdrop(self._surroundings(empty), empty.depth)
-        self._small_backdrop = None
         for body in (self.table, self.floor):
             client.changeVisualShape(body, -1, rgbaColor=INVISIBLE)
         self._load_tiles()
         self.cube = self._box((spec.cube_side,) * 3, LIMBO, (*spec.cube_color, 1), spec.cube_mass)
         model = ARMS[spec.arm]
         self.arm = Arm(client, model, spec.physics, spec.arm_urdf or model.urdf(folder))
+        resting = (*self.tiles.values(), *self.quads.values())
+        self._film = FilmCamera(client, self.backdrop, resting, (self.cube, self.arm.body))
+        self._small_drawn = 0
         self.home_q = self._find_home()
         self.arm.place(self.home_q, spec.home_opening)
         if spec.tile_mass > 0:
