@@ -93,6 +93,7 @@ class _Pages:
 
     def __init__(self, catalogue: Catalogue, tick_s: float) -> None:
         self._catalogue, self._tick_s, self._lock = catalogue, tick_s, Lock()
+        self._session = secrets.token_hex(8)
         self._files = page_files()
         self._follower = Follower(catalogue)
 
@@ -127,7 +128,8 @@ class _Pages:
             return PlainTextResponse(str(error), 500)
 
     def _payload(self, request: Request, name: str) -> Response:
-        tag = self._catalogue.stamp(name)
+        # Of this server alone: behind the same port, a later one may have other runs, interventions or labels.
+        tag = f"{self._session}-{self._catalogue.stamp(name)}"
         known = request.headers.get("if-none-match") == f'"{tag}"'
         return _tagged(request, b"" if known else self._catalogue.script(name), tag, _KINDS["js"])
 

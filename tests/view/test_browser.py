@@ -386,12 +386,16 @@ def test_hostile_text_is_text(page: Page, address: str) -> None:
     [
         "#/nothing", "#/episodes?ep=abc&t=-7&case=x&category=none&site=no", "#/map?category=%00&site=1", "#?&&=",
         "#/compare?with=none&ep=999", "#/episodes?t=1e9&case=constructor.right-wrong", "#/constructor",
+        "#/episodes?outcome=lost&layout=none&case=backbone.constructor", "#/questions?category=none&from=-3",
     ],
 )  # fmt: skip
 def test_an_unknown_address_falls_back(page: Page, address: str, place: str) -> None:
     page.open(address + place)
     assert page.read("document.querySelector('main').innerText.length") > 40
     assert page.read("document.querySelectorAll('.trouble').length") == 0
+    assert page.read("document.querySelectorAll('main .empty').length") == 0, "filters that read “all” keep all"
+    if "questions" in place:
+        assert page.read("document.querySelectorAll('[data-item]').length") > 0
 
 
 def test_the_page_can_be_used_by_keyboard_alone(page: Page, address: str) -> None:

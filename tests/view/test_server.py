@@ -183,6 +183,15 @@ def test_what_the_browser_has_is_not_sent_again_and_large_payloads_are_packed(se
             assert len(packed) < len(content)
 
 
+def test_what_a_browser_has_of_a_former_server_is_sent_again(server: Client, little_runs: Path) -> None:
+    """Behind one port the next server may have another VLM run, intervention or label beside equal commits."""
+    _, headers, content = server.ask("/data/run/run.js")
+    with served([open_run(little_runs / "run"), open_run(little_runs / "other")]) as later:
+        later.admit()
+        status, _, again = later.ask("/data/run/run.js", If_None_Match=headers["etag"])
+    assert (status, again[:20]) == (200, content[:20])
+
+
 def test_episodes_that_are_committed_while_the_page_is_open_are_followed(
     small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -131,4 +131,6 @@ class Backdrop:
         """The picture (H, W, 3) of `frame` composed with the backdrop: the nearer surface is visible."""
         # The renderer lets the surface that is drawn later win a tie, and the table is drawn first.
         in_front = (frame.bodies >= 0) & (frame.depth <= self.depth)
-        return np.where(in_front[..., None], frame.rgb, self.rgb)
+        picture = self.rgb.copy()
+        picture[in_front] = frame.rgb[in_front]
+        return picture

@@ -1,6 +1,6 @@
 // Compare: two runs, episode by episode, where id, scene seed and policy seed are equal.
 "use strict";
-const APART_CM = 0.5, OTHER_ACTION = 1e-3;
+const APART_CM = 0.5, OTHER_ACTION = 1e-3, FEW = 4;
 
 function Compare({ run, list, runs, place }) {
   const others = runs.filter((r) => r.key !== run.key), other = others.find((r) => r.key === place.with) ?? others[0];
@@ -18,16 +18,20 @@ function Compare({ run, list, runs, place }) {
   const called = (r) => (run.label === b.label ? `${r.label} (${r.key})` : r.label);
   return html`<div class="compare"><section class="panel"><h2>A <${Text}>${called(run)}<//> and B <${Text}>${called(b)}<//> <small>${pairs.length.toLocaleString("en")} episodes with the same ids and seeds · ${frames.toLocaleString("en")} with the same first frame</small></h2>
     ${others.length > 1 && html`<label class="choice inline"><span>B</span><select value=${other.key} onChange=${(e) => go({ with: e.target.value, ep: undefined })}>${others.map((r) => html`<option value=${r.key}>${r.label} (${r.key})</option>`)}</select></label>`}
-    <details><summary>${names.length === 1 ? "1 setting differs" : `${names.length} settings differ`}</summary><table><tbody>${names.map((name) => html`<tr><th scope="row">${name}</th><td><${Text}>${run.settings[name] ?? "–"}<//></td><td><${Text}>${b.settings[name] ?? "–"}<//></td></tr>`)}</tbody></table></details>
+    <details open=${names.length <= FEW}><summary>${names.length === 1 ? "1 setting differs" : `${names.length} settings differ`}</summary><table><tbody>${names.map((name) => html`<tr><th scope="row">${name}</th><td><${Text}>${run.settings[name] ?? "–"}<//></td><td><${Text}>${b.settings[name] ?? "–"}<//></td></tr>`)}</tbody></table></details>
     ${pairs.length ? html`<div class="quad">${quads.map(({ p, q, own }) => html`<div class="lane" data-quad=${`${p ? "right" : "wrong"}-${q ? "right" : "wrong"}`}><div class="lanename">A ${p ? "✓" : "✗"} B ${q ? "✓" : "✗"} <b>${own.length}</b></div><div class="chips">${own.slice(0, 80).map(({ a }) => html`<a class="chip" aria-current=${a === pair.a ? "true" : null} title=${a.instruction} href=${link({ ep: a.number, t: 0 })}>${a.number}</a>`)}${own.length > 80 && html`<span class="more">and ${own.length - 80} more</span>`}</div></div>`)}</div>`
       : html`<p class="empty">The runs have no episode with the same id and seeds.</p>`}</section>
     ${pair && html`<${Pair} key=${pair.a.number} run=${run} b=${b} pair=${pair} place=${place} />`}</div>`;
 }
-/* The site of each run whose log-odds are compared: the chosen one where both have it, else the best of one stream.
+/* The site of each run whose log-odds are compared: the chosen one where both have it, else A's best of one stream, or
+   the best of each where B has no signal at A's, as another model.
    Null where either has no signal there, since a sign without signal says nothing. */
 function comparedSites(runs, maps, place, category) {
   const chosen = runs.map((r) => siteNamed(r, place.site)), best = runs.map((r) => categoryOf(r, category)?.best);
   if (chosen.every((site) => site >= 0)) return chosen.every((site, k) => maps[k]?.signal[site]) ? chosen : null;
+  const shared = ["action", "backbone"].map((name) => best[0]?.[name]).filter((own) => own?.signal).map(({ site }) => [site, siteNamed(runs[1], runs[0].sites[site].name)]);
+  const same = shared.find(([, theirs]) => maps[1]?.signal[theirs]);
+  if (same) return same;
   const part = ["action", "backbone"].find((name) => best.every((own) => own?.[name]?.signal));
   return part ? best.map((own) => own[part].site) : null;
 }
@@ -51,13 +55,14 @@ function Pair({ run, b, pair, place }) {
   const readings = sites && [[run, x], [b, y]].map(([r, e], k) => readingAt(r, e, maps[k], sites[k]));
   const found = differences(x, y, apart, readings);
   const names = { [pair.a.side_correct]: pair.a.target, [opposite(pair.a.side_correct)]: pair.a.distractor };
-  const odds = (readings ?? []).map((own, k) => ({ name: `${"AB"[k]} ${short([run, b][k].sites[sites[k]].name)}`, x: own.map((r) => r.step), y: own.map((r) => r.value), kind: ["backbone", "expert"][k], hold: true, dots: true, weak: (i) => !own[i].signal }));
+  const odds = (readings ?? []).map((own, k) => ({ name: `${"AB"[k]} ${short([run, b][k].sites[sites[k]].name)}`, x: own.map((r) => r.step), y: own.map((r) => r.value), kind: ["ours", "theirs"][k], hold: true, dots: true, weak: (i) => !own[i].signal }));
   const top = 1.2 * Math.max(4, ...odds.flatMap((line) => line.y.map((v) => Math.abs(v) || 0)));
   const film = (r, one, e, letter) => html`<div><h3>${letter} <${Outcome} outcome=${one.outcome} /></h3><${Film} run=${r.key} one=${one} frames=${e.frames} now=${now} steps=${e.trajectory.frames - 1} /></div>`;
   return html`<section class="panel"><h2>${title} <small class="sentence">${found.length ? `${found.map((f) => f.words).join("; ")}.` : "No difference: the tools never part by 5 mm."}</small></h2>
     <div class="pair">${film(run, pair.a, x, "A")}${film(b, pair.b, y, "B")}
     <div><h3>From above <small>B dashed</small></h3><${Plan} trajectory=${x.trajectory} inferences=${x.inferences} other=${y.trajectory} now=${now} scene=${run.scene} correct=${pair.a.side_correct} names=${names} /></div></div>
     <div class="scrub"><input type="range" min="0" max=${last} value=${now} aria-label="Control step" onInput=${(e) => step(+e.target.value)} /><output>${now} / ${last}</output></div>
+    ${!maps.every(Boolean) && html`<p class="note">No log-odds are compared: ${maps.map((map, k) => map ? null : "AB"[k]).filter(Boolean).join(" and ")} ${maps.some(Boolean) ? "has" : "have"} no probes of this category.</p>`}
     ${maps.every(Boolean) && !sites && html`<p class="note">No log-odds are compared: no site that both runs are compared at has signal in both.</p>`}
     ${odds.length > 0 && html`<${Series} title="Probe" unit="log-odds toward the correct side" steps=${last} now=${now} onNow=${step} low=${-top} high=${top} height=${150} lines=${odds} />`}
     <${Series} title="Distance between the tools" unit="cm" steps=${last} now=${now} onNow=${step} low=${0} high=${Math.max(2, ...apart) * 1.1} height=${130} zero=${false} sign=${false} marks=${found.filter((f) => f.kind === "tools").map((f) => ({ name: "5 mm", x: f.step }))} lines=${[{ name: "distance", x: apart.map((_, i) => i), y: apart, kind: "arm" }]} /></section>`;

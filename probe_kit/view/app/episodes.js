@@ -27,9 +27,16 @@ function inCase(run, one, name, chosen) {
   const [part, pair] = name.split(".");
   return (part === "site" ? chosen?.(one).pair : partCase(run, one, part)) === pair;
 }
+/* The parts whose reading can be crossed with the arm's outcome, and their labels. */
+function casesOf(run, place) {
+  const parts = ["backbone", "action"].filter((part) => run.categories.some((c) => c.best[part]?.signal));
+  return [...parts.map((part) => [part, labelOf(run, part)]), ...(siteNamed(run, place.site) >= 0 ? [["site", short(place.site)]] : [])];
+}
+/* The episodes that the filters of the address keep; a value that no episode has is no filter. */
 function kept(run, list, place, chosen) {
-  const words = (place.words ?? "").toLowerCase(), known = PAIRS[(place.case ?? "").split(".")[1]];
-  return list.filter((one) => (!place.category || one.category === place.category) && (!place.outcome || one.outcome === place.outcome) && (!place.layout || one.layout === place.layout)
+  const words = (place.words ?? "").toLowerCase(), [part, pair] = (place.case ?? "").split("."), known = Object.hasOwn(PAIRS, pair) && casesOf(run, place).some(([name]) => name === part);
+  const chosenOf = ["category", "outcome", "layout"].filter((name) => list.some((one) => one[name] === place[name]));
+  return list.filter((one) => chosenOf.every((name) => one[name] === place[name])
     && (!known || inCase(run, one, place.case, chosen)) && (!words || `${one.instruction ?? ""} ${one.id} ${one.number}`.toLowerCase().includes(words)));
 }
 
@@ -41,8 +48,7 @@ function Choice({ name, label, value, options }) {
 }
 function Filters({ run, list, shown, place }) {
   const values = (name, words = (v) => v) => [...new Set(list.map((one) => one[name]))].filter((v) => v != null).sort().map((v) => [v, words(v)]);
-  const parts = ["backbone", "action"].filter((part) => run.categories.some((c) => c.best[part]?.signal));
-  const cases = [...parts.map((part) => [part, labelOf(run, part)]), ...(siteNamed(run, place.site) >= 0 ? [["site", short(place.site)]] : [])];
+  const cases = casesOf(run, place);
   const active = FILTERS.some((name) => place[name]);
   return html`<form class="filters" aria-label="Filters" onSubmit=${(e) => e.preventDefault()}>
     <${Choice} name="category" label="category" value=${place.category} options=${values("category", (v) => titleOf(run, v))} />
@@ -162,7 +168,7 @@ function Delivered({ text, lost }) {
 }
 function Facts({ run, one, episode }) {
   const rules = Object.entries(episode.outcomes);
-  return html`<p class="facts"><${Outcome} outcome=${one.outcome} /> <span>correct: <b>${one.side_correct}</b></span> <span>${run.answers ? "answered" : "placed"}: <b>${one.side_placed ?? "none"}</b></span> <span>${titleOf(run, one.category)}</span> <span>${one.layout}</span>
+  return html`<p class="facts"><${Outcome} outcome=${one.outcome} /> <span>correct side: <b>${one.side_correct}</b></span> <span>${run.answers ? "answered" : "placed"}: <b>${one.side_placed ?? "none"}</b></span> <span>${titleOf(run, one.category)}</span> <span>${one.layout}</span>
     ${one.distance != null && html`<span>${(100 * one.distance).toFixed(1)} cm from the correct picture</span>`}
     ${one.ending && html`<span>ended by ${ENDINGS[one.ending] ?? one.ending}</span>`}
     ${rules.map(([rule, outcome]) => html`<span class="soft" title=${run.rules[rule]}>${rule}: ${OUTCOMES[outcome] ?? outcome}</span>`)}

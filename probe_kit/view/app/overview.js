@@ -20,12 +20,12 @@ function Overview({ run, list }) {
   const parts = ["backbone", "action"].filter((part) => run.categories.some((c) => c.best[part]));
   const worth = list.filter((one) => inCase(run, one, "backbone.right-wrong")).sort((a, b) => b.backbone - a.backbone).slice(0, WORTH);
   const heading = (key) => columns.find((c) => c.key === key)?.heading;
-  const Head = ({ name, kind = "", view }) => { const cell = cellOf(mean, name); return cell ? html`<a class="head" href=${link({ view })}><span>${heading(name)}</span><strong class=${kind}>${cell.text.split(" [")[0]}</strong><small>${cell.text.includes("[") ? `[${cell.text.split(" [")[1]} · ` : ""}mean of ${single.length} ${single.length === 1 ? "category" : "categories"}</small></a>` : null; };
+  const Head = ({ name, kind = "", view }) => { const cell = cellOf(mean, name); return cell ? html`<a class="head" title=${columns.find((c) => c.key === name)?.help} href=${link({ view })}><span>${heading(name)}</span><strong class=${kind}>${cell.text.split(" [")[0]}</strong><small>${cell.text.includes("[") ? `[${cell.text.split(" [")[1]} · ` : ""}mean of ${single.length} ${single.length === 1 ? "category" : "categories"}</small></a>` : null; };
   const total = countCase(run, list, "backbone", "right-wrong");
   return html`<div class="overview">
     <section class="heads" aria-label="At a glance">
       <${Head} name="success.sr" view="episodes" /><${Head} name="backbone.score" kind="backbone" view="map" /><${Head} name="action.score" kind="expert" view="map" />
-      ${parts.includes("backbone") && html`<a class="head alert" href=${link({ view: "episodes", case: "backbone.right-wrong", category: undefined, ep: undefined })}><span>backbone right, arm wrong</span><strong>${total ?? "–"}</strong><small>${total == null ? "no site of the backbone has signal" : "episodes, in categories whose best site has signal"}</small></a>`}
+      ${parts.includes("backbone") && html`<a class="head alert" href=${link({ view: total == null ? "map" : "episodes", case: total == null ? undefined : "backbone.right-wrong", category: undefined, ep: undefined })}><span>backbone right, arm wrong</span><strong>${total ?? "–"}</strong><small>${total == null ? "no site of the backbone has signal" : "episodes, in categories whose best site has signal"}</small></a>`}
       ${run.certificate.same_actions != null && html`<div class="head"><span>certificate</span><strong>${run.certificate.same_actions ? "✓ same actions" : "✗ other actions"}</strong><small>with and without capture${run.certificate.device ? ` · ${run.certificate.device}` : ""}${run.weights ? ` · weights ${run.weights.slice(0, 12)}` : ""}</small></div>`}
     </section>
     ${run.notes.map((note) => html`<p class="remark"><${Text}>${note}<//></p>`)}
@@ -35,7 +35,7 @@ function Overview({ run, list }) {
         ${row.cells.map((cell, i) => { const drawn = html`<${Interval} cell=${cell} chance=${run.chance} kind=${KINDS[columns[i].key]} />`, view = VIEW_OF[columns[i].key]; return html`<td class=${cell.value == null ? "words" : ""}>${view && cell.value != null ? html`<a href=${link({ view, category: row.category, case: undefined, ep: undefined })}>${drawn}</a>` : drawn}</td>`; })}
         ${parts.map((part) => { const count = countCase(run, list, part, "right-wrong", row.category); return html`<td class="number">${count == null ? html`<span class="soft" title="its best site has no signal">–</span>` : html`<a data-count=${`${part} ${row.category}`} href=${link({ view: "episodes", category: row.category, case: `${part}.right-wrong`, ep: undefined })}>${count}</a>`}</td>`; })}</tr>`)}</tbody>
       ${mean && html`<tfoot><tr><th scope="row">mean</th>${mean.cells.map((cell) => html`<td>${cell.text}</td>`)}${parts.map((part) => html`<td class="number">${countCase(run, list, part, "right-wrong") ?? "–"}</td>`)}</tr></tfoot>`}</table></div></section>
-    ${worth.length > 0 && html`<section class="panel"><h2>Backbone right, arm wrong <small>the ${worth.length} largest log-odds</small></h2><div class="worth">${worth.map((one) => html`<${Card} key=${one.number} run=${run.key} one=${one} />`)}</div></section>`}
+    ${worth.length > 0 && html`<section class="panel"><h2>Backbone right, arm wrong <small>${worth.length === total ? "by log-odds" : `the ${worth.length} with the largest log-odds`}</small></h2><div class="worth">${worth.map((one) => html`<${Card} key=${one.number} run=${run.key} one=${one} />`)}</div></section>`}
   </div>`;
 }
 function Card({ run, one }) {

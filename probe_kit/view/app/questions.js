@@ -17,8 +17,9 @@ function Questions({ run, list, place }) {
   const vlm = run.table.vlm_key, [[, answers], trouble] = useLoaded(vlm && `${vlm}/run`, vlm && `${vlm}/episodes`);
   const rows = useMemo(() => {
     const said = new Map(answers ? listOf(vlm).map((one) => [one.pair, one]) : []), items = new Map();
+    const chosen = run.categories.some((c) => c.name === place.category);
     for (const one of list) {
-      if (place.category && one.category !== place.category) continue;
+      if (chosen && one.category !== place.category) continue;
       if (!items.has(one.item)) items.set(one.item, { one, layouts: {} });
       items.get(one.item).layouts[one.layout] = { one, readings: readingsOf(run, one, said.get(one.pair)) };
     }
@@ -38,8 +39,9 @@ function Questions({ run, list, place }) {
   const names = run.categories.map((c) => c.name), first = ROWS * Math.max(0, Math.min(Math.ceil(rows.length / ROWS) - 1, Math.floor(place.from / ROWS) || 0)), shown = rows.slice(first, first + ROWS);
   const Turn = ({ by, words }) => (rows[first + by] ? html` · <a href=${link({ from: first + by || undefined })}>${words}</a>` : null);
   return html`<div class="questions"><nav class="tabs" aria-label="Categories"><a href=${link({ category: undefined, from: undefined })} aria-current=${names.includes(place.category) ? null : "true"}>all</a>${names.map((name) => html`<a href=${link({ category: name, from: undefined })} aria-current=${name === place.category ? "true" : null}>${titleOf(run, name)}</a>`)}</nav>
-    <section class="panel"><h2>Known, encoded, acted on <small>${rows.length.toLocaleString("en")} items, those with most disagreements first · each in the layouts ${LAYOUTS.join(" and ")} · log-odds at the category's best sites; a dash: no signal shown</small></h2>
-    <div class="scroll" tabindex="0" role="region" aria-label="Table by item"><table><thead><tr><th>correct picture</th><th>wrong picture</th><th>category</th>${stages.map(([name, words]) => html`<th colspan="2" key=${name}>${words}</th>`)}${swapped && html`<th colspan="2" title="image swap: the first action goes to the correct picture, and to the other side once the two pictures are swapped">action, pictures swapped</th>`}</tr></thead>
+    <section class="panel"><h2>Known, encoded, acted on <small>${rows.length.toLocaleString("en")} items, those with most disagreements first · log-odds at the category's best sites; a dash: no signal shown</small></h2>
+    <div class="scroll" tabindex="0" role="region" aria-label="Table by item"><table><thead><tr><th rowspan="2">correct picture</th><th rowspan="2">wrong picture</th><th rowspan="2">category</th>${stages.map(([name, words]) => html`<th colspan="2" key=${name}>${words}</th>`)}${swapped && html`<th colspan="2" title="image swap: the first action goes to the correct picture, and to the other side once the two pictures are swapped">action, pictures swapped</th>`}</tr>
+      <tr class="layouts">${[...stages, ...(swapped ? [["swap"]] : [])].flatMap(([name]) => LAYOUTS.map((layout) => html`<th key=${`${name} ${layout}`}>${layout}</th>`))}</tr></thead>
       <tbody>${shown.map((row) => html`<tr key=${row.one.item} data-item=${row.one.item}><th scope="row"><${Text}>${row.one.target ?? row.one.item}<//></th><td><${Text}>${row.one.distractor ?? ""}<//></td><td>${titleOf(run, row.one.category)}</td>
         ${stages.flatMap(([name]) => LAYOUTS.map((layout) => html`<td data-stage=${`${name} ${layout}`}><${Mark} own=${row.layouts[layout]} name=${name} /></td>`))}${swapped && LAYOUTS.map((layout) => html`<td data-stage=${`swap ${layout}`}><${Response} own=${row.layouts[layout]} /></td>`)}</tr>`)}</tbody></table></div>
       ${rows.length > ROWS && html`<p class="note">Items ${(first + 1).toLocaleString("en")} to ${(first + shown.length).toLocaleString("en")} of ${rows.length.toLocaleString("en")}<${Turn} by=${-ROWS} words="previous" /><${Turn} by=${ROWS} words="next" /></p>`}
