@@ -8,7 +8,7 @@ from typing import Any
 from probe_kit.extract import Run
 from probe_kit.extract.store.thumbnails import read_sheet
 from probe_kit.hashing import sha256_json
-from probe_kit.view.payloads.coding import payload_script
+from probe_kit.view.payloads.coding import failure_script, payload_script
 from probe_kit.view.payloads.episode_payload import episode_payload
 from probe_kit.view.payloads.episodes_payload import episodes_payload
 from probe_kit.view.payloads.run_payload import run_payload
@@ -56,8 +56,15 @@ class Catalogue:
 
     def script(self, name: str) -> bytes:
         """The payload of this name as a script. Raises KeyError for any other name."""
-        places = tuple(place for viewed in self.runs.values() for place in viewed.places)
-        return payload_script(name, self._payload(name), places)
+        return payload_script(name, self._payload(name), self._places)
+
+    def failure(self, name: str, error: Exception) -> bytes:
+        """The script that says why a payload cannot be made, without paths of this machine."""
+        return failure_script(name, str(error), self._places)
+
+    @property
+    def _places(self) -> tuple[str, ...]:
+        return tuple(place for viewed in self.runs.values() for place in viewed.places)
 
     def stamp(self, name: str) -> str:
         """A hash that changes with the commits and probes that a payload is made of. Raises KeyError.

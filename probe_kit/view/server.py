@@ -124,14 +124,20 @@ class _Pages:
                 return self._payload(request, own)
         except KeyError:
             return _missing()
-        except ProbeKitError as error:
+        except (ProbeKitError, OSError) as error:
             return PlainTextResponse(str(error), 500)
 
     def _payload(self, request: Request, name: str) -> Response:
+        """The payload, or a script that says why it cannot be made: the page cannot read the text of an error."""
         # Of this server alone: behind the same port, a later one may have other runs, interventions or labels.
         tag = f"{self._session}-{self._catalogue.stamp(name)}"
         known = request.headers.get("if-none-match") == f'"{tag}"'
-        return _tagged(request, b"" if known else self._catalogue.script(name), tag, _KINDS["js"])
+        try:
+            script = b"" if known else self._catalogue.script(name)
+        except (ProbeKitError, OSError) as error:
+            script = self._catalogue.failure(name, error)
+            return Response(script, headers={"cache-control": "no-store"}, media_type=_KINDS["js"])
+        return _tagged(request, script, tag, _KINDS["js"])
 
     def prepare(self) -> None:
         """Compute the tables of the runs, while the browser that will ask for them starts."""

@@ -4,6 +4,7 @@ import gzip
 import http.client
 import json
 import re
+import shutil
 import socket
 import threading
 from collections.abc import Iterator, Mapping
@@ -181,6 +182,24 @@ def test_what_the_browser_has_is_not_sent_again_and_large_payloads_are_packed(se
             assert packed_headers["content-encoding"] == "gzip"
             assert gzip.decompress(packed) == content
             assert len(packed) < len(content)
+
+
+def test_a_page_is_told_why_an_episode_of_a_damaged_run_cannot_be_shown(little_runs: Path, tmp_path: Path) -> None:
+    run = tmp_path / "<b>" / "damaged"
+    shutil.copytree(little_runs / "run", run)
+    with served([open_run(run)]) as damaged:
+        damaged.admit()
+        picture = run / "frames" / "00000000.webp"
+        picture.write_bytes(picture.read_bytes()[:-1])
+        status, headers, content = damaged.ask("/data/damaged/e/00000.js")
+        assert (status, headers["content-type"]) == (200, "text/javascript; charset=utf-8")
+        said = re.fullmatch(rb'refuse\("damaged/e/00000",(".*")\)\n', content)
+        assert said, content
+        assert json.loads(said[1]).startswith("damaged/frames/00000000.webp has ")
+        assert str(tmp_path).encode() not in content
+        assert b"<" not in content
+        assert damaged.ask("/data/damaged/e/00001.js")[2].startswith(b"put(")
+        assert damaged.ask("/data/damaged/f/00000.webp")[0] == 500
 
 
 def test_what_a_browser_has_of_a_former_server_is_sent_again(server: Client, little_runs: Path) -> None:

@@ -1,9 +1,11 @@
 // Payloads are scripts that call put(name, value): the same files open from file:// and from a server.
 "use strict";
 const SCHEMA = 1, KEPT = 64;
-const store = new Map(), pending = new Map(), decoded = new Map();
+const store = new Map(), pending = new Map(), decoded = new Map(), refused = new Map();
 
-function put(name, value) { store.set(name, value); }
+function put(name, value) { store.set(name, value); refused.delete(name); }
+/* What a server says of data that it cannot make, such as those of a damaged run. */
+function refuse(name, words) { refused.set(name, words); }
 
 function load(name, again = false) {
   if (store.has(name) && !again) return Promise.resolve(store.get(name));
@@ -11,7 +13,7 @@ function load(name, again = false) {
     const tag = document.createElement("script");
     const end = (settle) => { pending.delete(name); tag.remove(); settle(); };
     tag.src = `data/${name.split("/").map(encodeURIComponent).join("/")}.js${again ? `?n=${++requests}` : ""}`;
-    tag.onload = () => end(() => (store.has(name) ? done(store.get(name)) : fail(new Error(`data/${name}.js holds something else`))));
+    tag.onload = () => end(() => (refused.has(name) || !store.has(name) ? fail(new Error(refused.get(name) ?? `data/${name}.js holds something else`)) : done(store.get(name))));
     tag.onerror = () => end(() => fail(new Error(`data/${name}.js is missing or cannot be read`)));
     document.head.append(tag);
   }));

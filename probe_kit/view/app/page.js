@@ -21,7 +21,7 @@ function useGrowth(known) {
       const now = JSON.parse(event.data), shown = store.get(`${now.run}/run`);
       if (shown && shown.committed !== now.committed) {
         const maps = [...store.keys()].filter((name) => name.startsWith(`${now.run}/map/`));
-        await Promise.all([`${now.run}/run`, `${now.run}/episodes`, ...maps].map((name) => load(name, true)));
+        await Promise.all([`${now.run}/run`, `${now.run}/episodes`, ...maps].map((name) => load(name, true))).catch(() => {}); // what was read stays; a view that needs the rest says why
       }
       set((before) => ({ ...before, [now.run]: now }));
     };

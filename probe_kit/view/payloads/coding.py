@@ -57,8 +57,17 @@ def payload_script(name: str, value: Any, places: tuple[str, ...] = ()) -> bytes
     Text of `value` has visible signs in place of control and direction characters, and the last part alone of
     `places` and other absolute paths. No `<` is left, so that no text can end the script.
     """
-    text = json.dumps(_shown(value, places), separators=(",", ":"), allow_nan=False)
-    return f"put({json.dumps(name)},{text})\n".replace("<", "\\u003c").encode("ascii")
+    return _script("put", name, _shown(value, places))
+
+
+def failure_script(name: str, words: str, places: tuple[str, ...] = ()) -> bytes:
+    """The script `refuse(name, words)`: why there is no payload of this name, for the page to show."""
+    return _script("refuse", name, _shown(words, places))
+
+
+def _script(function: str, name: str, value: Any) -> bytes:
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    return f"{function}({json.dumps(name)},{text})\n".replace("<", "\\u003c").encode("ascii")
 
 
 def _shown(value: Any, places: tuple[str, ...]) -> Any:
