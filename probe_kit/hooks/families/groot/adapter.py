@@ -100,6 +100,7 @@ class Groot(LerobotPolicy):
 
     family = "groot"
     config_type = "groot"
+    known_steps = None
     interventions = INTERVENTIONS
     draws_noise = True
     unread = (_HEAD,)

@@ -8,7 +8,6 @@ Source: arXiv 2605.02881, through lerobot's `MolmoAct2Policy`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -28,6 +27,8 @@ from probe_kit.hooks.contract.sites import Site, Stream, kv_stream
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.molmoact2 import EXPERT, LAYERWISE
 from probe_kit.hooks.families.molmoact2.packing import PackedRow, Packing, padded_labels
+from probe_kit.hooks.families.molmoact2.steps import in_packed_order, read_steps
+from probe_kit.hooks.families.molmoact2.units import SteppedUnits
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser, Units
@@ -35,41 +36,6 @@ from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, LerobotPolicy
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.prompt_kv import kv_tap
 from probe_kit.models.lerobot.molmoact2 import build_molmoact2, flow_actions, network_config, uses_cuda_graphs
-
-
-@dataclass(frozen=True)
-class ClampedUnits:
-    """Units with numbers between −1 and 1, and numbers that stay as they are. mask: False for those."""
-
-    units: Normaliser
-    mask: NDArray[np.bool_]
-
-    @property
-    def mode(self) -> str:
-        """The kind of map."""
-        return self.units.mode
-
-    @property
-    def source(self) -> str:
-        """The file the statistics come from."""
-        return self.units.source
-
-    def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Physical units to the numbers the network reads; (..., D)."""
-        return np.where(self.mask, self.units.normalise(values).clip(-1, 1), values).astype(np.float32)
-
-    def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Network output to physical units; (..., D)."""
-        inside = values.clip(-1, 1)
-        return np.where(self.mask, self.units.restore(inside), inside).astype(np.float32)
-
-    def slope(self, numbers: int) -> NDArray[np.float32]:
-        """(D,) of `restore`, where it does not clip."""
-        return np.where(self.mask, self.units.slope(numbers), 1).astype(np.float32)
-
-    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D): as without the clamp; numbers that stay as they are have no statistics."""
-        return np.asarray(self.units.unusual(values) & self.mask)
 
 
 class ExpertStack(Stack):
@@ -100,6 +66,7 @@ class MolmoAct2(LerobotPolicy):
 
     family = "molmoact2"
     config_type = "molmoact2"
+    known_steps = None
     interventions = LAYERWISE
     draws_noise = True
     unread = ("model.lm_head.weight",)
@@ -117,6 +84,17 @@ class MolmoAct2(LerobotPolicy):
     # -- loading -----------------------------------------------------------------------------------------
 
     @classmethod
+    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+        """lerobot's configuration, with what the processor files say: lerobot packs as they do."""
+        config = super().parse_config(folder, evaluation)
+        if config.type == cls.config_type:
+            config.steps = read_steps(folder, config)
+            for name, value in config.steps.packing.items():
+                setattr(config, name, value)
+            config.input_features = in_packed_order(config, folder)
+        return config
+
+    @classmethod
     def build(cls, config: Any, folder: Path) -> nn.Module:
         """lerobot's policy of the size that the VLM's configuration has. Raises CheckpointError."""
         if config.enable_lora_vlm:
@@ -126,7 +104,15 @@ class MolmoAct2(LerobotPolicy):
         config.model_dtype = config.dtype = getattr(config, "dtype", None) or config.model_dtype
         config.inference_action_mode = "continuous"
         place = network_folder(folder, config.checkpoint_path)
-        network: nn.Module = build_molmoact2(config, network_config(place), place)
+        try:
+            network: nn.Module = build_molmoact2(config, network_config(place), place)
+        except (FileNotFoundError, ValueError) as error:
+            if not config.norm_tag:
+                raise
+            raise CheckpointError(
+                f"{folder} names the statistics {config.norm_tag!r}, which {place} does not have ({error}). Put "
+                "its norm_stats.json there"
+            ) from error
         return network
 
     @classmethod
@@ -139,14 +125,18 @@ class MolmoAct2(LerobotPolicy):
         return {**super().side_files(), **side_files(Path(self.config.checkpoint_path), "vlm/")}
 
     def own_units(self, feature: str, kind: str) -> Units | None:
-        """Clamped, and without the numbers that a mask leaves as they are."""
-        units = super().own_units(feature, kind)
-        if units is None or units.mode == "IDENTITY":
-            return units
+        """As lerobot's steps have them: numbers that a mask leaves as they are, clamps, and frames of joints."""
+        units, steps = super().own_units(feature, kind), self.config.steps
+        if units is None:
+            return None
         assert isinstance(units, Normaliser)
-        stored = load_file(self.folder / units.source).get(f"{feature}.mask")
-        mask = np.ones(units.low.shape, bool) if stored is None else stored.astype(bool)
-        return ClampedUnits(units, mask)
+        numbers = self._state_numbers if kind == "STATE" else self._action_numbers
+        stored = load_file(self.folder / units.source) if units.mode != "IDENTITY" else {}
+        unscaled = _of_width(~stored.get(f"{feature}.mask", np.ones(0, bool)).astype(bool), numbers)
+        if kind != "STATE":
+            return SteppedUnits(units, unscaled, steps.clamps_action, unscaled, steps.action_frame)
+        unclamped = unscaled if steps.unclamped is None else _of_width(steps.unclamped, numbers)
+        return SteppedUnits(units, unscaled, steps.clamps_state, unclamped, steps.state_frame)
 
     # -- acting ------------------------------------------------------------------------------------------
 
@@ -275,6 +265,11 @@ class MolmoAct2(LerobotPolicy):
         if stream is self.prompt_kv:
             return kv_tap(self.network._backbone().prompt_kv, site)
         return self.stacks[site.stream].tap(site)
+
+
+def _of_width(marked: NDArray[np.bool_], numbers: int) -> NDArray[np.bool_]:
+    """(numbers,), or nothing marked where it is of another width, as in lerobot."""
+    return marked if marked.shape == (numbers,) else np.zeros(numbers, bool)
 
 
 def network_folder(folder: Path, named: str) -> Path:

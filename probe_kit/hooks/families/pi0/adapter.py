@@ -28,6 +28,7 @@ class Pi0(PaliGemmaPolicy, EvaluatedPi0):
 
     family = "pi0"
     config_type = "pi0"
+    known_steps: ClassVar[tuple[str, ...]] = ("pi0_new_line_processor",)
     unread = tuple(f"model.paligemma_with_expert.{part}.lm_head.weight" for part in ("paligemma", "gemma_expert"))
 
     other_roles: ClassVar[tuple[str, ...]] = ("language", "special")

@@ -37,6 +37,7 @@ class Pi05(StatePrompt, Pi0):
 
     family = "pi05"
     config_type = "pi05"
+    known_steps = ("pi05_prepare_state_tokenizer_processor_step",)
 
     prompt_end = "Action: "
     suffix_roles = ("action",)

@@ -58,6 +58,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     family = "pi0-fast"
     config_type = "pi0_fast"
+    known_steps = ("pi0_fast_prepare_state_tokenizer_processor_step", "action_tokenizer_processor")
     interventions = FAST
 
     acting_stream = "action"

@@ -30,6 +30,7 @@ class SmolVLA(LerobotFlow):
 
     family = "smolvla"
     config_type = "smolvla"
+    known_steps = ("smolvla_new_line_processor",)
     unread = ("model.vlm_with_expert.vlm.lm_head.weight",)
 
     other_roles = ("language", "state", "special")

@@ -90,6 +90,7 @@ class Xvla(LerobotPolicy):
 
     family = "xvla"
     config_type = "xvla"
+    known_steps = None
     interventions = INTERVENTIONS
     draws_noise = True
 

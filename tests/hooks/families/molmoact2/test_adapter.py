@@ -1,25 +1,26 @@
 """MolmoAct2 keeps the contract, gives lerobot's actions, and refuses CUDA graphs while it is captured."""
 
+import json
 import shutil
+from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from lerobot.policies.molmoact2.processor_molmoact2 import (
-    make_molmoact2_pre_post_processors,
-)
 from safetensors.torch import load_file, save_file
 
-from probe_kit.errors import CaptureError, CheckpointError, InstructionError, WeightsError
+from probe_kit.errors import CaptureError, CheckpointError, InstructionError, ObservationError, WeightsError
 from probe_kit.hooks import Observation, capture
 from probe_kit.hooks.families.molmoact2.adapter import MolmoAct2, check_molmoact2_words, load_molmoact2
 from probe_kit.hooks.testing import AdapterContract
 from probe_kit.models.lerobot import molmoact2 as network
-from tests.support.molmoact2_checkpoints import MASK, write_molmoact2
-from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST
+from tests.support.lerobot_pipelines import changed, raw, save_pipelines
+from tests.support.molmoact2_checkpoints import write_molmoact2
+from tests.support.pi05_checkpoints import HIGH, LOW
 
 
 @pytest.fixture(scope="module")
@@ -66,31 +67,90 @@ def test_actions_are_those_of_lerobots_own_policy_bit_for_bit(
     assert theirs.abs().max() > 0.1
 
 
-def test_the_network_reads_what_lerobots_processors_make(molmoact2: MolmoAct2, seen: list[Observation]) -> None:
-    """From the raw observation: units, clamped numbers, words, pictures, and back to metres."""
-    statistics = {"observation.state": {"q01": LOW, "q99": HIGH}, "action": {"q01": LEAST, "q99": MOST}}
-    config = copy(molmoact2.config)
-    config.action_mode = "continuous"  # the other one reads a FAST tokenizer on the hub
-    config.dataset_feature_names = {"action": [*"xyzabc", "gripper"]}
-    tensors = {
-        key: {name: torch.from_numpy(own) for name, own in rows.items()} for key, rows in statistics.items()
-    }
-    before, behind = make_molmoact2_pre_post_processors(config, tensors)
-    one = seen[0]
-    theirs = before(
-        {
-            "observation.images.image": torch.from_numpy(one.image).permute(2, 0, 1),
-            "observation.state": torch.from_numpy(np.asarray(one.state, np.float32)),
-            "task": one.instruction,
-        }
-    )
-    ours = molmoact2.batch([one])
-    for name in ("input_ids", "attention_mask", "token_type_ids", "pixel_values", "image_token_pooling"):
-        torch.testing.assert_close(ours[name], theirs[name], rtol=0, atol=0)
-    chunk = torch.linspace(-1.5, 1.5, 28).reshape(1, 4, 7)
-    restored = molmoact2.action_units.restore(chunk.numpy())
-    np.testing.assert_allclose(restored, behind(chunk).numpy(), atol=1e-6)
-    assert (restored[..., ~MASK] == chunk.numpy()[..., ~MASK].clip(-1, 1)).all()
+NAMES = {"action": [*"xyzabc", "gripper"], "observation.state": [*"xyzabcd", "gripper"]}
+MODES = {"VISUAL": "IDENTITY", "STATE": "QUANTILES", "ACTION": "QUANTILES"}
+FRAME = {"joint_signs": [1, -1, 1, 1, -1, 1], "joint_offsets": [0.0, 0.1, 0.0, -0.2, 0.0, 0.3]}
+
+
+def _without_clamps(steps: list[dict[str, Any]]) -> None:
+    steps[:] = [step for step in steps if "clamp" not in step["registry_name"]]
+
+
+@pytest.mark.parametrize(
+    ("fields", "change"),
+    [
+        ({}, None),
+        ({"dataset_feature_names": NAMES}, None),
+        ({"image_keys": ["observation.images.wrist", "observation.images.image"]}, None),
+        (FRAME, None),
+        ({"dataset_feature_names": NAMES, **FRAME}, _without_clamps),
+        ({"normalization_mapping": MODES | {"ACTION": "IDENTITY"}}, None),
+        ({"normalization_mapping": MODES | {"STATE": "MEAN_STD", "ACTION": "MIN_MAX"}}, None),
+        ({}, changed("molmoact2_pack_inputs", setup_type="a single arm", control_mode="absolute pose")),
+        ({}, changed("molmoact2_pack_inputs", num_state_tokens=8, normalize_language=False)),
+        ({}, changed("molmoact2_pack_inputs", add_setup_tokens=False, add_control_tokens=False)),
+    ],
+)  # fmt: skip
+def test_actions_are_those_of_lerobots_saved_pipelines_and_policy(
+    tmp_path: Path, seen: list[Observation], fields: dict[str, Any], change: Any
+) -> None:
+    """From the raw pictures and state to metres: what the saved steps say counts, not the configuration."""
+    write_molmoact2(tmp_path, cameras=("image", "wrist"))
+    place = str(tmp_path / "vlm")  # the other action mode reads a FAST tokenizer on the hub
+    before, behind = save_pipelines(tmp_path, change, action_mode="continuous", checkpoint_path=place, **fields)
+    ours = load_molmoact2(str(tmp_path))
+    ours = ours.showing(ours.cameras)
+    theirs = network.lerobots_policy(copy(ours.config), network.network_config(Path(place)), Path(place))
+    theirs.load_state_dict(load_file(tmp_path / "model.safetensors"))
+    states = np.array([LOW + 0.3 * (HIGH - LOW), LOW - 0.1 * (HIGH - LOW)], np.float32)
+    states[:, 7] = np.abs(states[:, 7])
+    for seed, (one, state) in enumerate(zip(seen, states, strict=True)):
+        pictures = {"image": one.image, "wrist": one.image[:, ::-1].copy()}
+        packed = before(raw(replace(one, state=state), pictures))
+        first, second = ours.cameras
+        given = replace(one, state=state, image=pictures[first], cameras={second: pictures[second]})
+        for name in ("input_ids", "pixel_values"):
+            torch.testing.assert_close(ours.batch([given])[name], packed[name], rtol=0, atol=0)
+        metres = behind(theirs.predict_action_chunk(packed, generator=torch.Generator().manual_seed(seed)))
+        np.testing.assert_allclose(ours.act([given], [seed]), metres.numpy(), atol=1e-6)
+
+
+def test_a_gripper_that_stays_as_it_is_must_lie_between_its_bounds(
+    tmp_path: Path, seen: list[Observation]
+) -> None:
+    """lerobot refuses it too."""
+    write_molmoact2(tmp_path)
+    save_pipelines(tmp_path, action_mode="continuous", checkpoint_path=str(tmp_path / "vlm"),
+                   dataset_feature_names=NAMES)  # fmt: skip
+    policy = load_molmoact2(str(tmp_path))
+    state = np.array([0.3, 0, 0.1, 0, 0, 0, 0, 1.5], np.float32)
+    with pytest.raises(ObservationError, match=r"number 7 of the state is 1\.5"):
+        policy.act([replace(seen[0], state=state)], [0])
+
+
+@pytest.mark.parametrize(
+    ("fields", "change", "message"),
+    [
+        ({}, lambda steps: steps.insert(0, {"registry_name": "evo1_pad_state_processor"}), "evo1_pad_state"),
+        ({}, changed("molmoact2_pack_inputs", image_keys=["observation.images.top"]), "top, which its config"),
+        ({"joint_signs": [2.0], "joint_offsets": [0.0]}, None, "expected 1 or -1"),
+        ({"norm_tag": "libero"}, None, "names the statistics 'libero'"),
+    ],
+)  # fmt: skip
+def test_pipelines_that_say_something_else_are_refused(
+    folder: Path, tmp_path: Path, fields: dict[str, Any], change: Any, message: str
+) -> None:
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    tag = fields.pop("norm_tag", None)
+    with suppress(KeyError, ImportError, ValueError, TypeError):
+        save_pipelines(tmp_path, change, action_mode="continuous", checkpoint_path=str(tmp_path / "vlm"), **fields)
+    if tag is not None:
+        path = tmp_path / "config.json"
+        path.write_text(
+            json.dumps(json.loads(path.read_text(encoding="utf-8")) | {"norm_tag": tag}), encoding="utf-8"
+        )
+    with pytest.raises(CheckpointError, match=message):
+        load_molmoact2(str(tmp_path))
 
 
 def test_cuda_graphs_are_off_and_an_error_while_they_are_on(folder: Path, seen: list[Observation]) -> None:
@@ -173,8 +233,6 @@ def test_a_prompt_that_does_not_fit_is_refused_and_never_cut(
 def test_what_the_flow_expert_cannot_do_is_refused(
     folder: Path, tmp_path: Path, field: str, value: object
 ) -> None:
-    import json
-
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     config = json.loads((tmp_path / "config.json").read_text(encoding="utf-8"))
     config |= {field: value, "inference_action_mode": None}

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file
 
-from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
+from probe_kit.hooks.families.shared.lerobot.pipelines import NORMALISERS, reads_state_as_it_is, saved_steps
 from probe_kit.models.bounds import check_bounds, check_deviations
 from probe_kit.models.lerobot.pi0_keys import STATISTICS
 
@@ -22,13 +22,17 @@ USUAL_DEVIATIONS = 5.0
 _ROUNDING = 1e-3
 """Share of the range by which a value may lie outside of its bounds."""
 _STEPS = (
-    "normalizer_processor",
-    "unnormalizer_processor",
+    *NORMALISERS,
     "molmoact2_masked_normalizer",
     "molmoact2_masked_unnormalizer",
 )
 # The two statistics each mode needs, as (offset-like, scale-like).
-_NEEDED = {"MEAN_STD": ("mean", "std"), "MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99")}
+_NEEDED = {
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
 
 
 class Units(Protocol):
@@ -59,7 +63,7 @@ class Units(Protocol):
 class Normaliser:
     """An affine map per dimension, in lerobot's conventions (`NormalizerProcessorStep`, lerobot 0.6).
 
-    mode: MEAN_STD, MIN_MAX, QUANTILES or IDENTITY. low, high: the two statistics, (D,) float32.
+    mode: MEAN_STD, MIN_MAX, QUANTILES, QUANTILE10 or IDENTITY. low, high: the two statistics, (D,) float32.
     source: the file they come from.
     Raises CheckpointError for statistics that are not finite, or whose scale is not positive.
     """
@@ -125,15 +129,13 @@ def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Nor
     path = folder / f"{pipeline}.json"
     if not path.is_file():
         raise CheckpointError(f"{path} is missing: without it the units of {feature} are unknown")
-    steps = read_json_object(path, CheckpointError, "Download the checkpoint again").get("steps")
-    for step in steps if isinstance(steps, list) else ():
-        if step["registry_name"] in _STEPS:
-            config = step["config"]
-            mode = config["norm_map"].get(kind, "IDENTITY")
-            if mode == "IDENTITY":
-                return Normaliser(mode, np.zeros(0, np.float32), np.zeros(0, np.float32), 0.0, path.name)
-            low, high = _statistics(folder, step.get("state_file"), feature, mode)
-            return Normaliser(mode, low, high, float(config.get("eps", 1e-8)), step["state_file"])
+    for step in saved_steps(folder, pipeline):
+        if step.name in _STEPS:
+            mode = (step.config.get("norm_map") or {}).get(kind, "IDENTITY")
+            if mode == "IDENTITY" or (kind == "STATE" and reads_state_as_it_is(step, feature)):
+                return Normaliser("IDENTITY", np.zeros(0, np.float32), np.zeros(0, np.float32), 0.0, path.name)
+            low, high = _statistics(folder, step.state, feature, mode)
+            return Normaliser(mode, low, high, float(step.config.get("eps", 1e-8)), str(step.state))
     raise CheckpointError(f"{path} has no normaliser step: the units of {feature} are unknown")
 
 

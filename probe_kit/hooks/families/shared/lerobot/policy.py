@@ -28,10 +28,20 @@ from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.normaliser import (
+    Normaliser,
     Units,
     from_buffers,
     read_buffers,
     read_normaliser,
+)
+from probe_kit.hooks.families.shared.lerobot.pipelines import (
+    CROP,
+    NORMALISERS,
+    RELATIVE,
+    TOKENIZER,
+    adds_state,
+    check_steps,
+    text_length,
 )
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
@@ -53,6 +63,8 @@ class LerobotPolicy(Policy):
     config_type: ClassVar[str]
     unread: ClassVar[tuple[str, ...]] = ()
     """Parameters that inference never reads and a file may lack."""
+    known_steps: ClassVar[tuple[str, ...] | None] = ()
+    """Steps of lerobot's processors that only this family has; None where it reads the pipelines itself."""
     other_roles: ClassVar[tuple[str, ...]]
     """What positions of the backbone hold besides pictures and padding."""
     acting_stream: ClassVar[str]
@@ -199,6 +211,10 @@ class LerobotPolicy(Policy):
                 f"{folder} reads the last {frames} observations (n_obs_steps); every inference here is given one. "
                 "Take a checkpoint with n_obs_steps 1"
             )
+        if cls.known_steps is not None:
+            check_steps(folder, (*NORMALISERS, *RELATIVE, TOKENIZER, CROP, *cls.known_steps))
+            # lerobot tokenises as the saved step says, whatever the configuration has.
+            config.tokenizer_max_length = text_length(folder) or config.tokenizer_max_length
         # Compiled graphs drop hooks, and real-time chunking mixes in actions of the chunk before.
         config.compile_model = False
         config.rtc_config = None
@@ -229,6 +245,8 @@ class LerobotPolicy(Policy):
 
     def _units(self) -> str:
         """Where the statistics come from that turn actions into metres, or why there are none."""
+        if self._lacks_state:
+            return "actions are changes relative to the state, which nothing here adds"
         try:
             action, state = self.action_units, self.state_units
         except CheckpointError as error:
@@ -280,8 +298,12 @@ class LerobotPolicy(Policy):
 
     @property
     def predicts_relative(self) -> bool:
-        """As the configuration says: lerobot adds the state behind the policy, which is not done here."""
-        return bool(getattr(self.config, "use_relative_actions", False))
+        """As the configuration or a step says: lerobot then adds the state, which is not done here."""
+        return self._lacks_state
+
+    @cached_property
+    def _lacks_state(self) -> bool:
+        return bool(getattr(self.config, "use_relative_actions", False)) or adds_state(self.folder)
 
     def embodiment_mismatch(self) -> str | None:
         """Other actions than an end-effector delta, another state, or no units for either."""
@@ -295,6 +317,8 @@ class LerobotPolicy(Policy):
         dimensions = self.config.output_features["action"].shape[0]
         if dimensions != _DIMENSIONS:
             return f"{self.checkpoint} acts in {dimensions} dimensions; the arm needs a 7-DoF end-effector delta"
+        if self._lacks_state:
+            return f"{self.checkpoint} predicts changes relative to the state, and nothing here adds the state"
         return _problem(lambda: self.action_units)
 
     def _state_misfit(self) -> str | None:
@@ -437,8 +461,16 @@ class LerobotPolicy(Policy):
         """What the checkpoint itself says: its processor files, or old buffers; None if it normalises nothing."""
         pipeline = "policy_preprocessor" if kind == "STATE" else "policy_postprocessor"
         if (self.folder / f"{pipeline}.json").is_file():
-            return read_normaliser(self.folder, pipeline, feature, kind)
-        return from_buffers(self._buffers, self.config.normalization_mapping, feature, kind, self.checkpoint)
+            found: Normaliser | None = read_normaliser(self.folder, pipeline, feature, kind)
+        else:
+            found = from_buffers(self._buffers, self.config.normalization_mapping, feature, kind, self.checkpoint)
+        numbers = self._state_numbers if kind == "STATE" else int(self.config.output_features["action"].shape[0])
+        if found is not None and found.mode != "IDENTITY" and found.low.shape != (numbers,):
+            raise CheckpointError(
+                f"{self.checkpoint} has statistics of shape {found.low.shape} for its {feature}, which has "
+                f"{numbers} numbers ({found.source}). Take the statistics of the data set it was trained on"
+            )
+        return found
 
     @cached_property
     def _buffers(self) -> dict[str, NDArray[np.float32]]:
