@@ -29,16 +29,41 @@ from probe_kit.models.lerobot.pi05 import Gate
 from probe_kit.models.prompt_kv import PromptKV
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+RELEASED: dict[str, Any] = {
+    "text_config": {
+        "hidden_size": 2560, "intermediate_size": 9728, "num_hidden_layers": 36, "num_attention_heads": 32,
+        "num_key_value_heads": 8, "head_dim": 128, "vocab_size": 154624, "additional_vocab_size": 128,
+        "qkv_bias": False, "use_qk_norm": True, "qk_norm_type": "qwen3", "max_position_embeddings": 16384,
+        "rope_theta": 5000000.0,
+    },
+    "vit_config": {
+        "hidden_size": 1152, "intermediate_size": 4304, "num_hidden_layers": 27, "num_attention_heads": 16,
+        "num_key_value_heads": 16, "head_dim": 72, "image_default_input_size": [378, 378],
+        "image_patch_size": 14, "image_num_pos": 729,
+    },
+    "adapter_config": {
+        "hidden_size": 1152, "text_hidden_size": 2560, "intermediate_size": 9728, "num_attention_heads": 16,
+        "num_key_value_heads": 16, "head_dim": 72, "vit_layers": [-3, -9],
+    },
+    "action_expert_config": {
+        "hidden_size": 768, "num_heads": 8, "num_layers": 36, "mlp_ratio": 4.0, "ffn_multiple_of": 256,
+        "timestep_embed_dim": 256,
+    },
+    "max_action_dim": 32, "max_action_horizon": 30,
+}  # fmt: skip
+"""What the released configurations say of sizes: Molmo2-ER on Qwen3-4B, an expert of 0.58 billion parameters."""
 _PARTS = ("msa", "mca", "mlp")
 """What a block of the expert adds: self-attention, attention to the prompt, MLP."""
 
 
 def network_config(place: Path | None = None) -> NetworkConfig:
-    """The configuration in the VLM's own folder; without one, lerobot's default."""
+    """The configuration in the VLM's own folder; without one, that of the released sizes."""
     with warnings.catch_warnings():
         # lerobot calls a check that transformers announces to remove; no user can change that.
         warnings.filterwarnings("ignore", "`rope_config_validation`", FutureWarning)
-        found: NetworkConfig = NetworkConfig() if place is None else NetworkConfig.from_pretrained(str(place))
+        found: NetworkConfig = (
+            NetworkConfig(**RELEASED) if place is None else NetworkConfig.from_pretrained(str(place))
+        )
     return found
 
 
@@ -85,7 +110,7 @@ def lerobots_policy(
 
 
 def full_size_molmoact2() -> MolmoAct2Policy:
-    """The size that lerobot's configuration has by default, on the meta device."""
+    """The released size, on the meta device."""
     picture = PolicyFeature(FeatureType.VISUAL, (3, 256, 256))
     config = MolmoAct2Config(device="cpu", input_features={"observation.images.image": picture})
     return build_molmoact2(config, network_config(), Path(), device="meta")

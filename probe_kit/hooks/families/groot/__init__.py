@@ -1,8 +1,9 @@
 """GR00T N1.7 through lerobot."""
 
+from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, backbone, expert
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.contract.sites import QUANTITIES
+from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.capabilities import MERGED
 from probe_kit.hooks.family import Family
 
@@ -24,13 +25,13 @@ FAMILIES = (
     Family(
         "groot",
         "GR00T N1.7 (Qwen3-VL cut behind layer 16, bridge, diffusion transformer) through lerobot",
-        None,
+        "nvidia/GR00T-N1.7-3B",
         "probe_kit.hooks.families.groot.adapter:load_groot",
-        streams="backbone 17 layers, bridge 5 layers, expert 33 layers x 4 steps at the default size",
+        streams="backbone 17 layers, bridge 5 layers, expert 33 layers x 4 steps",
         embodiment="as the checkpoint's statistics",
-        needs_checkpoint=True,
+        hub=(("nvidia/Cosmos-Reason2-2B", "tokenizer.json"),),
         notes=(
-            "Pass a checkpoint of lerobot, or one in NVIDIA's own layout with -M embodiment=TAG. It names a "
+            "A checkpoint of lerobot, or one in NVIDIA's own layout with -M embodiment=TAG. It names a "
             "vision-language model, whose tokenizer and processor files are fetched, not its weights, or given as "
             "-M vlm=FOLDER. No remote code. One observation per call: its bridge reads padding"
         ),
@@ -38,6 +39,15 @@ FAMILIES = (
         config_types=("groot", "Gr00tN1d7"),
         words="probe_kit.hooks.families.groot.adapter:check_groot_words",
         full_size="probe_kit.models.lerobot.groot:full_size_groot",
+        declared={
+            "": (
+                backbone(17, 2048, 110, camera="image", sums=False),
+                DeclaredStream(
+                    Stream("bridge", 5, 2048, part="bridge", quantities=BRIDGE), 110, ("image.image", *TEXT)
+                ),
+                expert(33, 1536, 4, 41, ("state", "action")),
+            )
+        },
         packages=(("diffusers", "groot"),),
         options=(
             Option("embodiment", str, "Tag in NVIDIA's layout, such as libero_sim.", "the only one"),

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.families.shared.capabilities import FLOW, MERGED
 from probe_kit.hooks.family import Family
@@ -21,20 +22,26 @@ FAMILIES = (
     Family(
         "molmoact2",
         "MolmoAct2 (Molmo2-ER, flow-matching expert on the keys and values of each layer) through lerobot",
-        None,
+        "allenai/MolmoAct2-LIBERO-LeRobot",
         "probe_kit.hooks.families.molmoact2.adapter:load_molmoact2",
-        streams="backbone and expert have the layers of the checkpoint's configuration, expert x flow steps",
-        embodiment="as fine-tuned",
-        needs_checkpoint=True,
+        streams="backbone 37 layers, expert 37 layers x 10 flow steps",
+        embodiment="LIBERO end-effector delta; other fine-tunes in lerobot's layout as --checkpoint",
+        hub=(("allenai/MolmoAct2-LIBERO", "tokenizer.json"),),
         notes=(
-            "Pass a checkpoint in lerobot's layout, such as allenai/MolmoAct2-LIBERO-LeRobot. It names a second, "
-            "whose configuration and tokenizer are fetched, not its weights. lerobot measured 12 GiB in bfloat16. "
-            "Acts by its flow expert; discrete actions are refused. CUDA graphs are off"
+            "A checkpoint names a second one, whose configuration and tokenizer are fetched, not its weights. 5.4 "
+            "billion parameters, 11 GB in bfloat16; lerobot measured 12 GiB. Acts by its flow expert; discrete "
+            "actions are refused. CUDA graphs are off"
         ),
         verifier="probe_kit.hooks.families.molmoact2.verify:verify_molmoact2",
         config_types=("molmoact2",),
         words="probe_kit.hooks.families.molmoact2.adapter:check_molmoact2_words",
         full_size="probe_kit.models.lerobot.molmoact2:full_size_molmoact2",
+        declared={
+            "": (
+                backbone(37, 2560, 310, "state", camera="image"),
+                expert(37, 768, 10, 30, ("action",), quantities=EXPERT, sums=False),
+            )
+        },
         interventions=LAYERWISE,
     ),
 )

@@ -32,7 +32,7 @@ from probe_kit.hooks.families.molmoact2.units import SteppedUnits
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser, Units
-from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, LerobotPolicy
+from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, LerobotPolicy, checked_steps
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.prompt_kv import kv_tap
 from probe_kit.models.lerobot.molmoact2 import build_molmoact2, flow_actions, network_config, uses_cuda_graphs
@@ -249,6 +249,7 @@ class MolmoAct2(LerobotPolicy):
         backbone = self.network._backbone()
         text, expert, tower = backbone.transformer, backbone.action_expert, backbone.vision_backbone.image_vit
         steps = int(self.config.num_inference_steps or backbone.config.flow_matching_num_steps)
+        checked_steps(steps, self.folder)
         last = expert.final_layer.norm
         return {
             "backbone": Stack(text.blocks, text.ln_f, text.config.hidden_size, None, "attn_norm"),

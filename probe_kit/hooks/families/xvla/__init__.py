@@ -1,7 +1,9 @@
 """X-VLA through lerobot."""
 
+from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, expert
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.families.shared.capabilities import MERGED
 from probe_kit.hooks.family import Family
 
@@ -23,13 +25,13 @@ FAMILIES = (
     Family(
         "xvla",
         "X-VLA (Florence-2 encoder, soft-prompted transformer) through lerobot",
-        None,
+        "lerobot/xvla-base",
         "probe_kit.hooks.families.xvla.adapter:load_xvla",
-        streams="backbone 13 layers, expert 25 layers x 10 steps with Florence-2 large",
+        streams="backbone 13 layers, expert 25 layers x 10 steps",
         embodiment="as the checkpoint's action space; the released ones are absolute poses",
-        needs_checkpoint=True,
+        hub=(("facebook/bart-large", "tokenizer.json"),),
         notes=(
-            "Pass a checkpoint in lerobot's layout. Its configuration holds Florence-2's; the tokenizer "
+            "A checkpoint in lerobot's layout. Its configuration holds Florence-2's; the tokenizer "
             "facebook/bart-large is fetched where no tokenizer.json lies beside it. -M domain=N chooses the soft "
             "prompts of another robot. Absolute poses cannot act here: --no-act"
         ),
@@ -37,6 +39,14 @@ FAMILIES = (
         config_types=("xvla",),
         words="probe_kit.hooks.families.xvla.adapter:check_xvla_words",
         full_size="probe_kit.models.lerobot.xvla:full_size_xvla",
+        declared={
+            "": (
+                DeclaredStream(
+                    Stream("backbone", 13, 1024, quantities=BLOCK, sums=False), 114, ("image.image", *TEXT)
+                ),
+                expert(25, 1024, 10, 276, ("action", "image.image", *TEXT, "soft_prompt"), quantities=BLOCK),
+            )
+        },
         options=(
             Option("domain", int, "Number of the robot's soft prompts.", "as policy_preprocessor.json says"),
         ),

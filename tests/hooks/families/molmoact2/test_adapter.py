@@ -251,17 +251,6 @@ def test_weights_without_an_expert_are_refused(folder: Path, tmp_path: Path) -> 
         load_molmoact2(str(tmp_path))
 
 
-@pytest.mark.slow  # seconds for a network of 48 layers, on the meta device
-def test_the_default_size_has_the_tensors_of_lerobots_network() -> None:
-    """Gates add no parameter. The released configuration is on the hub."""
-    ours = network.full_size_molmoact2().state_dict()
-    with torch.device("meta"):
-        theirs = network.MolmoAct2ForConditionalGeneration(network.network_config()).state_dict()
-    assert {name: tensor.shape for name, tensor in ours.items()} == {
-        f"model.{name}": tensor.shape for name, tensor in theirs.items()
-    }
-
-
 def test_half_precision_acts_as_captured_and_is_named_in_the_card(folder: Path, seen: list[Observation]) -> None:
     policy = load_molmoact2(str(folder), dtype="bfloat16")
     assert policy.card.dtype == "bfloat16"

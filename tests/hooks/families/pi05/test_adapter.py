@@ -1,5 +1,7 @@
 """pi0.5 keeps the contract, reads its state as digits, and adds what its gates let through."""
 
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from lerobot.policies.pi05.processor_pi05 import Pi05PrepareStateTokenizerProcessorStep
 from safetensors.torch import load_file, save_file
 
-from probe_kit.errors import InstructionError, WeightsError
+from probe_kit.errors import CheckpointError, InstructionError, WeightsError
 from probe_kit.hooks import Observation, capture
 from probe_kit.hooks.families.pi05.adapter import Pi05, load_pi05
 from probe_kit.hooks.testing import AdapterContract
@@ -174,3 +176,23 @@ def test_the_released_size_has_the_tensors_of_lerobots_policy() -> None:
     assert {name: tensor.shape for name, tensor in ours.items()} == {
         name: tensor.shape for name, tensor in lerobots.items()
     }
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("num_inference_steps", 0, "makes 0 flow steps"),
+        ("num_inference_steps", -1, "makes -1 flow steps"),
+        ("tokenizer_max_length", None, "reads None tokens"),
+        ("tokenizer_max_length", 10**7, "reads 10000000 tokens"),
+    ],
+)
+def test_counts_with_which_no_action_is_made_are_refused(
+    folder: Path, tmp_path: Path, field: str, value: object, message: str
+) -> None:
+    """Without a step the action would be the noise."""
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | {field: value}), encoding="utf-8")
+    with pytest.raises(CheckpointError, match=message):
+        load_pi05(str(tmp_path))

@@ -18,7 +18,7 @@ from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site, kv_stream
 from probe_kit.hooks.families.shared.capabilities import FLOW
-from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
+from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy, checked_steps
 from probe_kit.hooks.families.shared.prompt_kv import attach_prompt_kv, kv_tap
 
 
@@ -31,6 +31,7 @@ class LerobotFlow(LerobotPolicy):
 
     def __init__(self, network: Any, folder: Path) -> None:
         super().__init__(network, folder)
+        checked_steps(self.iterations, folder)
         self._kept = attach_prompt_kv(self._joint, len(self.stacks["backbone"].layers))
         self.prompt_kv = kv_stream(len(self._kept.keys), self._kv_width)
 

@@ -49,6 +49,8 @@ from probe_kit.models.initialisation import initialise
 
 IMAGES, STATE = "observation.images.", "observation.state"
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
+MOST_TOKENS = 1 << 16
+"""Of a prompt: far beyond any policy, and no memory without end."""
 _DIMENSIONS = 7
 """Of the arm's actions."""
 
@@ -214,7 +216,12 @@ class LerobotPolicy(Policy):
         if cls.known_steps is not None:
             check_steps(folder, (*NORMALISERS, *RELATIVE, TOKENIZER, CROP, *cls.known_steps))
             # lerobot tokenises as the saved step says, whatever the configuration has.
-            config.tokenizer_max_length = text_length(folder) or config.tokenizer_max_length
+            length = config.tokenizer_max_length = text_length(folder) or config.tokenizer_max_length
+            if type(length) is not int or not 1 <= length <= MOST_TOKENS:
+                raise CheckpointError(
+                    f"{folder} reads {length} tokens of text (tokenizer_max_length); expected 1 to {MOST_TOKENS}. "
+                    "Take the original configuration"
+                )
         # Compiled graphs drop hooks, and real-time chunking mixes in actions of the chunk before.
         config.compile_model = False
         config.rtc_config = None
@@ -513,6 +520,13 @@ class LerobotPolicy(Policy):
         """The ids of each instruction, without padding."""
         tokens, mask = self.tokenise(instructions)
         return [tuple(row[kept].tolist()) for row, kept in zip(tokens, mask, strict=True)]
+
+
+def checked_steps(steps: int, folder: Path) -> int:
+    """The number of flow steps. Raises CheckpointError for none, with which the action would be the noise."""
+    if steps < 1:
+        raise CheckpointError(f"{folder} makes {steps} flow steps: its action would be noise. Expected 1 or more")
+    return steps
 
 
 def _problem(read: Callable[[], object]) -> str | None:
