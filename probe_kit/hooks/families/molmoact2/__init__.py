@@ -11,9 +11,7 @@ EXPERT = ("residual", "attention", "cross_attention", "mlp", "final_norm")
 LAYERWISE = replace(
     FLOW,
     edits={"backbone": QUANTITIES, "expert": EXPERT},
-    attention=False,
     tiles=False,
-    gradients=False,
     instead={"tiles": f"{MERGED}Its tower reads overlapping crops. Exchange all of `image`"},
 )
 """Block n of the expert reads the keys and values of block n of the backbone, and nothing else of it."""

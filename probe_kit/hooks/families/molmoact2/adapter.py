@@ -8,6 +8,7 @@ Source: arXiv 2605.02881, through lerobot's `MolmoAct2Policy`.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,6 +20,7 @@ from safetensors.numpy import load_file
 from torch import Tensor, nn
 
 from probe_kit.errors import CaptureError, CheckpointError
+from probe_kit.hooks.capturing.gradients import frozen
 from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, side_files
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
@@ -29,9 +31,10 @@ from probe_kit.hooks.families.molmoact2 import EXPERT, LAYERWISE
 from probe_kit.hooks.families.molmoact2.packing import PackedRow, Packing, padded_labels
 from probe_kit.hooks.families.molmoact2.steps import in_packed_order, read_steps
 from probe_kit.hooks.families.molmoact2.units import SteppedUnits
+from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights, shares
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
-from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser, Units
+from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, LerobotPolicy, checked_steps
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.prompt_kv import kv_tap
@@ -124,7 +127,7 @@ class MolmoAct2(LerobotPolicy):
         """Also the VLM's configuration and tokenizer."""
         return {**super().side_files(), **side_files(Path(self.config.checkpoint_path), "vlm/")}
 
-    def own_units(self, feature: str, kind: str) -> Units | None:
+    def own_units(self, feature: str, kind: str) -> SteppedUnits | None:
         """As lerobot's steps have them: numbers that a mask leaves as they are, clamps, and frames of joints."""
         units, steps = super().own_units(feature, kind), self.config.steps
         if units is None:
@@ -156,6 +159,27 @@ class MolmoAct2(LerobotPolicy):
         with torch.inference_mode():
             end = flow_actions(self.network, batch, noise, batch["action_dim_is_pad"])
         return end[..., : self._action_numbers]
+
+    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
+        """The actions of `act`, bit for bit, with a graph of the whole flow; see the contract."""
+        self.check(seen, seeds)
+        if (reason := self._action_misfit()) is not None:
+            raise CheckpointError(reason)
+        self._check_graphs()
+        with frozen(self.network):
+            batch = self.batch(seen)
+            end = flow_actions(self.network, batch, self.noise(seeds), batch["action_dim_is_pad"])
+            own, units = end[..., : self._action_numbers].float(), self.own_units("action", "ACTION")
+            if units is None:
+                raise CheckpointError(f"{self.checkpoint} does not say what its actions are in metres")
+            values = own.detach().cpu().numpy()
+            metres, slopes = (torch.from_numpy(of(values)).to(own.device) for of in (units.restore, units.slopes))
+            return metres + slopes * (own - own.detach())
+
+    def record_attention(self, note: Note) -> AbstractContextManager[None]:
+        """Computed once more: block n of the expert on the keys of block n of the backbone."""
+        blocks = self.network._backbone().action_expert.blocks
+        return recording_weights([block.cross_attn for block in blocks], note, _on_the_prompt)
 
     def noise(self, seeds: Sequence[int]) -> Tensor:
         """(B, chunk, 32) float32 flow noise, a row per seed, the same on every device."""
@@ -266,6 +290,15 @@ class MolmoAct2(LerobotPolicy):
         if stream is self.prompt_kv:
             return kv_tap(self.network._backbone().prompt_kv, site)
         return self.stacks[site.stream].tap(site)
+
+
+def _on_the_prompt(attention: Any, inputs: tuple[Any, ...], given: dict[str, Any], _: Any) -> Tensor:
+    """(B, H, chunk, T): weights of the expert's actions on the prompt, whose kernel returns none."""
+    queries = attention.q_proj(inputs[0]).unflatten(-1, (attention.num_heads, -1)).transpose(1, 2)
+    if attention.q_norm is not None:
+        queries = attention.q_norm(queries)
+    keys = attention._as_heads(given["kv_k"]).transpose(1, 2)
+    return shares(queries, keys, attention.head_dim**-0.5, {"attention_mask": given.get("attn_mask")})
 
 
 def _of_width(marked: NDArray[np.bool_], numbers: int) -> NDArray[np.bool_]:

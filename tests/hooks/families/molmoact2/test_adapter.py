@@ -183,6 +183,34 @@ def test_every_block_of_the_expert_reads_the_keys_and_values_of_its_own_layer(
         assert not torch.equal(plain[read[layer]], changed[read[layer]])
 
 
+def test_recorded_attention_on_the_values_is_what_the_block_reads(
+    molmoact2: MolmoAct2, seen: list[Observation]
+) -> None:
+    """Weights times values, projected, is the block's cross-attention, which a fused kernel computes."""
+    recorded: dict[tuple[int, int], torch.Tensor] = {}
+    read: list[torch.Tensor] = []
+    attention = molmoact2.network._backbone().action_expert.blocks[1].cross_attn
+    handle = attention.register_forward_hook(
+        lambda _, __, given, output: (read.append(output), values.append(given["kv_v"]), None)[-1],
+        with_kwargs=True,
+    )
+    values: list[torch.Tensor] = []
+    try:
+        with molmoact2.record_attention(lambda *own: recorded.update({own[:2]: own[2]})):
+            molmoact2.act(seen, [0, 1])
+    finally:
+        handle.remove()
+    assert recorded.keys() == {(block, step) for block in range(2) for step in range(3)}
+    for step in range(3):
+        heads = recorded[1, step] @ attention._as_heads(values[step]).transpose(1, 2)
+        ours = attention.out_proj(heads.transpose(1, 2).flatten(2))
+        torch.testing.assert_close(ours, read[step], rtol=0, atol=1e-5)
+    (roles,) = molmoact2.roles(seen[1:])["backbone"]
+    assert recorded[1, 0].shape[-1] >= len(roles)
+    padded = recorded[1, 0][1, :, :, len(roles) :]
+    assert not padded.any()
+
+
 def test_what_a_block_adds_makes_the_next_residual_with_both_attentions(
     molmoact2: MolmoAct2, seen: list[Observation]
 ) -> None:
