@@ -29,7 +29,7 @@ from probe_kit.hooks.contract.sites import Site, Stream, kv_stream
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.molmoact2 import EXPERT, LAYERWISE
 from probe_kit.hooks.families.molmoact2.packing import PackedRow, Packing, padded_labels
-from probe_kit.hooks.families.molmoact2.steps import in_packed_order, read_steps
+from probe_kit.hooks.families.molmoact2.steps import STEPS, in_packed_order, read_steps
 from probe_kit.hooks.families.molmoact2.units import SteppedUnits
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights, shares
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
@@ -69,7 +69,7 @@ class MolmoAct2(LerobotPolicy):
 
     family = "molmoact2"
     config_type = "molmoact2"
-    known_steps = None
+    known_steps = STEPS
     interventions = LAYERWISE
     draws_noise = True
     unread = ("model.lm_head.weight",)

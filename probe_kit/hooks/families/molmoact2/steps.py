@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.families.molmoact2.units import SAME_FRAME, JointFrame
-from probe_kit.hooks.families.shared.lerobot.pipelines import NORMALISERS, check_steps, every_step
+from probe_kit.hooks.families.shared.lerobot.pipelines import every_step
 from probe_kit.hooks.families.shared.lerobot.policy import STATE
 
 MASKED = ("molmoact2_masked_normalizer", "molmoact2_masked_unnormalizer")
@@ -20,6 +20,7 @@ _PACK, _CLAMP_STATE, _CLAMP_ACTION = (
     "molmoact2_clamp_action",
 )
 _FRAMES = ("molmoact2_state_frame_transform", "molmoact2_action_frame_transform")
+STEPS = (*MASKED, _PACK, _CLAMP_STATE, _CLAMP_ACTION, *_FRAMES)
 _PACKED = (
     "image_keys", "setup_type", "control_mode", "normalize_language", "add_setup_tokens", "add_control_tokens",
     "num_state_tokens", "max_sequence_length",
@@ -46,9 +47,8 @@ class MolmoAct2Steps:
 def read_steps(folder: Path, config: Any) -> MolmoAct2Steps:
     """The saved steps; without a packing step, those that lerobot makes of the configuration.
 
-    Raises CheckpointError for a step that changes numbers in another way.
+    Raises CheckpointError for frames that are none.
     """
-    check_steps(folder, (*NORMALISERS, *MASKED, _PACK, _CLAMP_STATE, _CLAMP_ACTION, *_FRAMES))
     saved = {step.name: step.config for step in every_step(folder)}
     if _PACK not in saved:
         own = _frame(vars(config), folder)

@@ -17,6 +17,7 @@ from probe_kit.hooks.families.pi0.evaluated import EvaluatedPi0
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights, returned
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
 from probe_kit.hooks.families.shared.lerobot.paligemma import PaliGemmaPolicy, sizes_file
+from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, flow_stacks
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.models.lerobot.pi0 import Pi0Size, build_pi0
@@ -28,7 +29,7 @@ class Pi0(PaliGemmaPolicy, EvaluatedPi0):
 
     family = "pi0"
     config_type = "pi0"
-    known_steps: ClassVar[tuple[str, ...]] = ("pi0_new_line_processor",)
+    known_steps: ClassVar[tuple[str, ...]] = (CROP, "pi0_new_line_processor")
     unread = tuple(f"model.paligemma_with_expert.{part}.lm_head.weight" for part in ("paligemma", "gemma_expert"))
 
     other_roles: ClassVar[tuple[str, ...]] = ("language", "special")

@@ -15,6 +15,7 @@ from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
+from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.lerobot.state_prompt import StatePrompt
 from probe_kit.models.lerobot.pi0 import Pi0Size
@@ -37,7 +38,10 @@ class Pi05(StatePrompt, Pi0):
 
     family = "pi05"
     config_type = "pi05"
-    known_steps = ("pi05_prepare_state_tokenizer_processor_step",)
+    known_steps = (
+        CROP,
+        "pi05_prepare_state_tokenizer_processor_step",
+    )
 
     prompt_end = "Action: "
     suffix_roles = ("action",)

@@ -31,6 +31,7 @@ from probe_kit.hooks.families.pi0_fast.actions import ActionText, DecodedChunk, 
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.paligemma import PaliGemmaPolicy, sizes_file
+from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, TokenStack, flow_stacks
 from probe_kit.hooks.families.shared.lerobot.state_prompt import StatePrompt
@@ -58,7 +59,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     family = "pi0-fast"
     config_type = "pi0_fast"
-    known_steps = ("pi0_fast_prepare_state_tokenizer_processor_step", "action_tokenizer_processor")
+    known_steps = (CROP, "pi0_fast_prepare_state_tokenizer_processor_step", "action_tokenizer_processor")
     interventions = FAST
 
     acting_stream = "action"

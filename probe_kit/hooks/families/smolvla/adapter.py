@@ -21,6 +21,7 @@ from probe_kit.hooks.checkpoints.checkpoint import side_files
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.attention_weights import Note, shares
 from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow
+from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, flow_stacks
 from probe_kit.models.lerobot.smolvla import build_smolvla, current_smolvla_keys, locate_vlm
 
@@ -30,7 +31,10 @@ class SmolVLA(LerobotFlow):
 
     family = "smolvla"
     config_type = "smolvla"
-    known_steps = ("smolvla_new_line_processor",)
+    known_steps = (
+        CROP,
+        "smolvla_new_line_processor",
+    )
     unread = ("model.vlm_with_expert.vlm.lm_head.weight",)
 
     other_roles = ("language", "state", "special")

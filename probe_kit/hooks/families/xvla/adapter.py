@@ -32,7 +32,7 @@ from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE, LerobotPolicy
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.xvla import BLOCK, INTERVENTIONS
-from probe_kit.hooks.families.xvla.steps import XvlaSteps, read_steps
+from probe_kit.hooks.families.xvla.steps import STEPS, XvlaSteps, read_steps
 from probe_kit.models.lerobot.xvla import build_xvla, current_xvla_keys, denoised_actions
 
 SOFT_PROMPT = "soft_prompt"
@@ -90,7 +90,7 @@ class Xvla(LerobotPolicy):
 
     family = "xvla"
     config_type = "xvla"
-    known_steps = None
+    known_steps = STEPS
     interventions = INTERVENTIONS
     draws_noise = True
 

@@ -8,6 +8,7 @@ from typing import Any
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.families.shared.lerobot.pipelines import (
     NORMALISERS,
+    POSTPROCESSOR,
     TOKENIZER,
     check_pipelines,
     check_steps,
@@ -16,6 +17,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
 )
 
 _MEAN, _DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
+STEPS = ("xvla_image_to_float", _MEAN, _DOMAIN)
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ def read_steps(folder: Path, domain: int | None) -> XvlaSteps:
     another way.
     """
     check_pipelines(folder)
-    check_steps(folder, ("xvla_image_to_float", *NORMALISERS, TOKENIZER, _MEAN, _DOMAIN))
+    check_steps(folder, POSTPROCESSOR, (*NORMALISERS, *STEPS))
     found: dict[str, Mapping[str, Any]] = {step.name: step.config for step in every_step(folder)}
     if domain is None and _DOMAIN not in found:
         raise CheckpointError(f"{folder} names no robot; say whose soft prompts are read with -M domain=N")

@@ -12,7 +12,7 @@ from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor", "policy_postprocessor"
-HARMLESS = (
+_HARMLESS = (
     "rename_observations_processor", "to_batch_processor", "to_batch_processor_action",
     "to_batch_processor_observation", "to_batch_processor_complementary_data", "device_processor",
 )  # fmt: skip
@@ -59,16 +59,16 @@ def check_pipelines(folder: Path) -> None:
             raise CheckpointError(f"{path} is missing: without it pictures, state and actions have no meaning")
 
 
-def check_steps(folder: Path, known: Collection[str]) -> None:
+def check_steps(folder: Path, pipeline: str, known: Collection[str]) -> None:
     """Raise CheckpointError for a step whose effect is unknown here, and for pictures that are normalised.
 
     known: names of steps besides the harmless ones.
     """
-    for step in every_step(folder):
-        if step.name not in HARMLESS and step.name not in known:
+    for step in saved_steps(folder, pipeline):
+        if step.name not in _HARMLESS and step.name not in known:
             raise CheckpointError(
                 f"{folder} has the processor step {step.name!r}, which changes numbers in a way probe_kit does "
-                f"not know. Known are {', '.join((*HARMLESS, *known))}"
+                f"not know. Known are {', '.join((*_HARMLESS, *known))}"
             )
         if pictures := _normalised_pictures(folder, step):
             raise CheckpointError(

@@ -37,6 +37,8 @@ from probe_kit.hooks.families.shared.lerobot.normaliser import (
 from probe_kit.hooks.families.shared.lerobot.pipelines import (
     CROP,
     NORMALISERS,
+    POSTPROCESSOR,
+    PREPROCESSOR,
     RELATIVE,
     TOKENIZER,
     adds_state,
@@ -65,7 +67,7 @@ class LerobotPolicy(Policy):
     config_type: ClassVar[str]
     unread: ClassVar[tuple[str, ...]] = ()
     """Parameters that inference never reads and a file may lack."""
-    known_steps: ClassVar[tuple[str, ...] | None] = ()
+    known_steps: ClassVar[tuple[str, ...] | None] = (CROP,)
     """Steps of lerobot's processors that only this family has; None where it reads the pipelines itself."""
     other_roles: ClassVar[tuple[str, ...]]
     """What positions of the backbone hold besides pictures and padding."""
@@ -213,8 +215,8 @@ class LerobotPolicy(Policy):
                 f"{folder} reads the last {frames} observations (n_obs_steps); every inference here is given one. "
                 "Take a checkpoint with n_obs_steps 1"
             )
-        if cls.known_steps is not None:
-            check_steps(folder, (*NORMALISERS, *RELATIVE, TOKENIZER, CROP, *cls.known_steps))
+        cls._check_steps(folder, PREPROCESSOR)
+        if hasattr(config, "tokenizer_max_length"):
             # lerobot tokenises as the saved step says, whatever the configuration has.
             length = config.tokenizer_max_length = text_length(folder) or config.tokenizer_max_length
             if type(length) is not int or not 1 <= length <= MOST_TOKENS:
@@ -226,6 +228,11 @@ class LerobotPolicy(Policy):
         config.compile_model = False
         config.rtc_config = None
         return config
+
+    @classmethod
+    def _check_steps(cls, folder: Path, pipeline: str) -> None:
+        if cls.known_steps is not None:
+            check_steps(folder, pipeline, (*NORMALISERS, *RELATIVE, TOKENIZER, *cls.known_steps))
 
     @classmethod
     def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
@@ -466,7 +473,8 @@ class LerobotPolicy(Policy):
 
     def own_units(self, feature: str, kind: str) -> Units | None:
         """What the checkpoint itself says: its processor files, or old buffers; None if it normalises nothing."""
-        pipeline = "policy_preprocessor" if kind == "STATE" else "policy_postprocessor"
+        pipeline = PREPROCESSOR if kind == "STATE" else POSTPROCESSOR
+        self._check_steps(self.folder, pipeline)  # behind the policy only actions depend on them
         if (self.folder / f"{pipeline}.json").is_file():
             found: Normaliser | None = read_normaliser(self.folder, pipeline, feature, kind)
         else:

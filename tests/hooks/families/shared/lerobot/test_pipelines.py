@@ -1,5 +1,6 @@
 """From the raw picture and state to metres as lerobot does it, and no step of its pipelines passes unread."""
 
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -131,6 +132,20 @@ def test_a_step_that_would_change_numbers_unread_is_refused_by_name(
         save_pipelines(folder, change)
     with pytest.raises(CheckpointError, match=message):
         load_pi05(str(folder))
+
+
+def test_an_unknown_step_behind_the_policy_forbids_to_act_and_not_to_capture(folder: Path) -> None:
+    save_pipelines(folder)
+    path = folder / "policy_postprocessor.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    _inserted(content["steps"])
+    path.write_text(json.dumps(content), encoding="utf-8")
+    policy = load_pi05(str(folder))
+    seen = AdapterContract.examples(policy, "put the cube on the star")
+    with pytest.raises(CheckpointError, match="vla_jepa_binarize_gripper"):
+        policy.act(seen, [0])
+    assert "vla_jepa_binarize_gripper" in str(policy.embodiment_mismatch())
+    assert policy.infer_without_acting(seen, [0]).shape == (1, 4, 7)
 
 
 def test_pictures_that_lerobot_would_normalise_are_refused(folder: Path) -> None:
