@@ -16,6 +16,11 @@ def test_the_workflow_installs_the_newest_and_runs_a_script_over_tests_that_exis
     workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "upstream.yml").read_text(encoding="utf-8"))
     commands = [step["run"] for step in workflow["jobs"]["conformance"]["steps"] if "run" in step]
     assert any("--upgrade" in command and "lerobot" in command for command in commands)
+    # lerobot bounds transformers, so that a newer one is only installed without it
+    assert any("--upgrade-package transformers" in command and "lerobot" not in command for command in commands)
+    conditions = [step["if"] for step in workflow["jobs"]["conformance"]["steps"] if "if" in step]
+    (chosen,) = workflow["jobs"]["conformance"]["strategy"]["matrix"].values()
+    assert all(any(f"'{value}'" in condition for value in chosen) for condition in conditions)
     assert (ROOT / commands[-1].split()[0]) == SCRIPT
     assert os.access(SCRIPT, os.X_OK)
     named = re.findall(r"tests/[\w/.]+", SCRIPT.read_text(encoding="utf-8"))
@@ -51,3 +56,17 @@ def test_the_report_says_what_broke(tmp_path: Path, output: str, code: int, said
     assert said in text
     assert "- lerobot 9.9" in text
     assert ("Nothing broke." in text) == (code == 0)
+
+
+def test_the_report_comes_first_where_the_output_is_a_file(tmp_path: Path) -> None:
+    """The end of pytest's output does not overwrite it."""
+    python, out = tmp_path / "python", tmp_path / "out.txt"
+    python.write_text('#!/bin/sh\necho "FAILED tests/x.py::test_y - width $COLUMNS"\nexit 1\n', encoding="utf-8")
+    python.chmod(0o755)
+    variables = {name: value for name, value in os.environ.items() if name != "GITHUB_STEP_SUMMARY"}
+    with out.open("w", encoding="utf-8") as file:
+        ended = subprocess.run([str(SCRIPT)], env={**variables, "PYTHON": str(python)}, stdout=file)
+    assert ended.returncode == 1
+    text = out.read_text(encoding="utf-8")
+    assert text.startswith("### Adapters on the newest lerobot and transformers")
+    assert "- FAILED tests/x.py::test_y - width 300" in text
