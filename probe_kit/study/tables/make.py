@@ -4,8 +4,9 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
+from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import NoProbesError, UsageError
 from probe_kit.extract.store.provenance import differences
@@ -61,9 +62,19 @@ def make_table(study: LoadedStudy, name: str, partial: bool = False) -> NamedTab
 
 
 def _named_runs(numbers: Sequence[Number], runs: StoredRuns) -> tuple[Number, ...]:
-    """Numbers with runs as the plan names them: a location says where a run lies now, or where it was unpacked."""
+    """Numbers with runs as the plan names them: a location says where a run lies now, or where it was unpacked.
+
+    What is not defined is None, because JSON has no NaN.
+    """
     names = {one.place: one.cell.name for one in runs.found}
-    return tuple({**one, "run": names[one["run"]]} if one.get("run") in names else one for one in numbers)
+    defined = ({name: _defined(value) for name, value in one.items()} for one in numbers)
+    return tuple({**one, "run": names[one["run"]]} if one.get("run") in names else one for one in defined)
+
+
+def _defined(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return type(value)(map(_defined, value))
+    return None if isinstance(value, float) and not isfinite(value) else value
 
 
 def _categories(table: TableTable) -> tuple[str, ...] | None:

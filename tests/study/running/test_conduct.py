@@ -289,7 +289,9 @@ def test_probes_of_the_file_are_fitted_once_and_shown(small_suite: Suite, tmp_pa
     (missing,) = fit_probes(plan_study(study))
     assert (missing.run, missing.stage) == ("broken/short", "waiting")
     made = make_table(study, "probing", partial=True)
-    assert [cells[:2] for cells in made.text.cells] == [("expert", "mean"), ("idle", "mean")]
+    assert [cells[:3] for cells in made.text.cells] == [
+        (name, "mean", category) for name in ("expert", "idle") for category in ("Color", "mean")
+    ]
     stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("probes/*/*") if path.name == "scores.csv"}
     assert len(stored) == 2
     fit_probes(plan_study(study))
