@@ -1,6 +1,7 @@
 """What a study file may say: its tables and their fields. Values are checked here, references elsewhere."""
 
 from typing import Annotated, Any, Literal, get_args
+from unicodedata import category
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -23,7 +24,7 @@ def _each_once[Value](values: list[Value]) -> list[Value]:
 
 def _printable(text: str) -> str:
     """The text. Raises ValueError where a terminal or file name could not show it."""
-    if not text.isprintable():
+    if any(category(one) in ("Zl", "Zp") or category(one).startswith("C") for one in text):
         raise ValueError("a line break or control character is not allowed")
     return text
 
