@@ -107,10 +107,16 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         return {"captured_tokens": str(self.decoding.captured), "temperature": repr(self.temperature)}
 
     def _notes(self) -> tuple[str, ...]:
-        most = self.config.max_decoding_steps
+        most, chunk, executed = (
+            int(getattr(self.config, name)) for name in ("max_decoding_steps", "chunk_size", "n_action_steps")
+        )
+        other = (
+            f"decodes the trained chunk of {chunk} actions; lerobot decodes {executed}, which is another transform"
+        )
         return (
             *super()._notes(),
             f"of up to {most} action tokens the first {self.decoding.captured} are captured",
+            *((other,) if executed != chunk else ()),
         )
 
     def side_files(self) -> dict[str, Path]:

@@ -85,6 +85,15 @@ def test_tokens_are_those_of_lerobots_sampling(untrained: Pi0Fast, seen: list[Ob
     assert ours.unique().numel() > 5
 
 
+def test_the_card_says_where_lerobot_decodes_another_number_of_actions(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "config.json"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace('"n_action_steps": 4', '"n_action_steps": 2'), encoding="utf-8")
+    notes = [load_pi0_fast(str(place)).card.notes for place in (folder, tmp_path)]
+    assert [any("lerobot decodes 2" in note for note in one) for one in notes] == [False, True]
+
+
 def test_a_chunk_that_does_not_end_is_flagged_and_warned_of(folder: Path, seen: list[Observation]) -> None:
     cut = load_pi0_fast(str(folder))
     cut.config.max_decoding_steps = 12

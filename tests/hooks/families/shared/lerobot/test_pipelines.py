@@ -56,10 +56,21 @@ def seen() -> list[Observation]:
     ]
 
 
-@pytest.mark.parametrize("mode", ["QUANTILES", "QUANTILE10", "MEAN_STD", "MIN_MAX"])
-def test_pi05_acts_as_lerobots_own_loading_processors_and_policy_bit_for_bit(folder: Path, mode: str) -> None:
+@pytest.mark.parametrize(
+    ("mode", "dtype"),
+    [
+        ("QUANTILES", "bfloat16"),
+        ("QUANTILES", "float32"),
+        ("QUANTILE10", "float32"),
+        ("MEAN_STD", "float32"),
+        ("MIN_MAX", "float32"),
+    ],
+)
+def test_pi05_acts_as_lerobots_own_loading_processors_and_policy_bit_for_bit(
+    folder: Path, mode: str, dtype: str
+) -> None:
     modes = {"VISUAL": "IDENTITY", "STATE": mode, "ACTION": mode}
-    before, behind = save_pipelines(folder, normalization_mapping=modes)
+    before, behind = save_pipelines(folder, normalization_mapping=modes, dtype=dtype)
     with resized(modeling_pi05, Pi0Size.from_file(folder / "dims.json")):
         theirs = modeling_pi05.PI05Policy.from_pretrained(folder).eval()
     every = load_pi05(str(folder))
@@ -69,7 +80,7 @@ def test_pi05_acts_as_lerobots_own_loading_processors_and_policy_bit_for_bit(fol
             pictures = {"base": one.image, **one.cameras}
             packed = before(raw(one, {name: pictures[name] for name in shown}))
             chunk = theirs.predict_action_chunk(packed, noise=ours.noise([seed]))
-            metres = torch.stack([behind(own) for own in chunk.unbind(1)], 1)
+            metres = torch.stack([behind(own) for own in chunk.float().unbind(1)], 1)
             np.testing.assert_array_equal(ours.act([one], [seed]), metres.numpy())
 
 
