@@ -293,13 +293,13 @@ def probed_direction(session: WiredSession, name: str, site: Site) -> np.ndarray
     return (weights / np.linalg.norm(weights)).astype(np.float32)
 
 
-def tie_of(session: WiredSession, name: str, layer: int) -> str:
-    """At the words of one layer of the backbone."""
+def tie_of(session: WiredSession, name: str, layer: int, called: str = "mean-difference") -> str:
+    """At the words of one layer of the backbone. called: as what the direction is stored."""
     (place,) = resolve_sites(f"backbone.{layer:02d}", session.policy)
     direction = OneDirection(probed_direction(session, name, place.only_site))
     roles = ("language", "all", "image", "state")
     conditions: list[Condition] = [PatchedFromSource(place, role, place.sites) for role in roles]
-    conditions += patches_within("probe", direction, place, "language", place.sites)
+    conditions += patches_within(called, direction, place, "language", place.sites)
     rows = patch_effects(outcomes_of(session, [name], conditions), SUITE)
     layer, along = rows[: len(roles)], rows[len(roles) :]
     return tie_at_site(layer[0], [row for row in along if not row.is_control], layer)
@@ -325,6 +325,11 @@ def test_the_copy_that_probes_read_is_told_from_the_one_that_is_used(
     wired: WiredSession, name: str, ties: dict[int, str]
 ) -> None:
     assert {layer: tie_of(wired, name, layer) for layer in ties} == ties
+
+
+def test_a_probe_alone_does_not_show_another_code(wired: WiredSession) -> None:
+    """`--direction probe` carries 0.05 of a copy that is read, and was *another code*."""
+    assert tie_of(wired, "code", 1, called="probe") == "not tested"
 
 
 def test_the_tie_of_all_sites_is_said_in_one_sentence() -> None:

@@ -7,6 +7,7 @@ read there are others that nothing reads.
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Literal
 
+from probe_kit.intervene.edits.pooled_directions import MEAN_DIFFERENCE
 from probe_kit.intervene.edits.sites import ALL, list_places
 from probe_kit.intervene.kinds.joint.effects import NOTHING, is_read_jointly, stored_joint_places
 from probe_kit.intervene.kinds.site_effects import LOCALISATION_SHARE, PatchEffect
@@ -38,6 +39,9 @@ def tie_at_site(
 ) -> TieAtSite:
     """The tie at one place and role. whole: its tokens patched in full. along: within subspaces, no controls.
 
+    Weights of a probe point away from what else varies, and may carry nothing of a copy that is read. That it is
+    another code is said only where a direction of the class means carries nothing either.
+
     layer: the same place at every role. A role that carries nothing alone can be one of several parts that decide
     together. It is unread if all tokens of the layer carry nothing either, or another role carries the effect.
     """
@@ -50,8 +54,12 @@ def tie_at_site(
     tested = [row.effect_ci for row in along if row.effect_ci is not None]
     if not tested:
         return "not tested"
+    if not all(map(_is_nothing, tested)):
+        return "in part"
+    if not any(row.direction.startswith(MEAN_DIFFERENCE) for row in along):
+        return "not tested"
     carries = whole.effect is not None and whole.effect >= LOCALISATION_SHARE
-    return "another code" if carries and all(map(_is_nothing, tested)) else "in part"
+    return "another code" if carries else "in part"
 
 
 def _without_others(whole: PatchEffect, layer: Sequence[PatchEffect]) -> TieAtSite:
