@@ -15,6 +15,7 @@ from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.extract.run_layout import PROBES
 from probe_kit.extract.store.format.bundles import Bundle, complete_key, write_bundle
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.train.choices import TARGETS
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.labels.label_results import LabelControls, LabelCurve, LabelResults
 from probe_kit.train.labels.label_settings import LabelSettings
@@ -64,6 +65,11 @@ def load_label_results(run: RunReader, key: str | None = None, target: str | Non
     current, count = _current(run)
     current = [bundle for bundle in current if target in (None, bundle.head["settings"].get("target"))]
     if not current:
+        if target in TARGETS:
+            raise NoProbesError(
+                f"{run.location} has no probes of a label {target!r}, which is the name of a side. Leave --target "
+                "out for the retention of sides"
+            )
         of = "" if target is None else f" {target!r}"
         raise NoProbesError(
             f"{run.location} has no probes of a label{of} on its episodes (of {count} stored). Run "

@@ -99,6 +99,8 @@ def test_probes_of_sides_keep_key_and_bytes_and_neither_kind_reads_the_other(run
         load_label_results(run, sides.key)
     with pytest.raises(NoProbesError, match="--target COLUMN"):
         load_label_results(run, target="other")
+    with pytest.raises(NoProbesError, match="'correct', which is the name of a side"):
+        load_label_results(run, target="correct")
 
 
 def test_another_value_group_stratum_or_window_is_another_key(run: Run) -> None:
