@@ -1,5 +1,6 @@
 """The whole pipeline on the embedded policy: what `probe-kit demo` runs."""
 
+import shlex
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,7 +50,8 @@ class Demo:
 
     def viewer(self) -> Text:
         """The command that shows both runs episode by episode."""
-        return marked("[bold]Open[/]    probe-kit view {} {}", self.run.path, self.asked.path)
+        runs = (shlex.quote(str(run.path)) for run in (self.run, self.asked))
+        return marked("[bold]Open[/]    probe-kit view {} {}", *runs)
 
 
 def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:
