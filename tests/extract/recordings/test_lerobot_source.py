@@ -136,7 +136,8 @@ def test_an_older_format_is_refused_with_the_converter(tmp_path: Path) -> None:
 def test_trap_8_without_the_extra_it_is_named_with_its_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str
 ) -> None:
-    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "episodes").mkdir(parents=True)
+    (tmp_path / "meta" / "tasks.parquet").touch()
     (tmp_path / "meta" / "info.json").write_text('{"codebase_version": "v3.0"}', encoding="utf-8")
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(MissingExtraError, match=r"\[datasets\]|--extra datasets"):
