@@ -229,6 +229,7 @@ RUNS = {
     "docs/qwen-vla.md": ("RUN_XIAOMI", "RUN_INTERNVLA", "RUN_PI0"),
     "docs/report.md": ("runs/a", "runs/b"),
     "docs/spatialvla.md": ("RUN_SPATIALVLA", "RUN_OPENVLA", "RUN_PI0"),
+    "docs/storage.md": ("runs/pi0",),
     "docs/success-rate.md": ("RUN",),
     "docs/view.md": ("runs/mine",),
 }
@@ -253,6 +254,11 @@ STAND_INS = {
     "docs/protocols.md": {
         r"--model pi0 --checkpoint lerobot/pi0_base": "--model pi0-tiny --categories color --items 12",
         r"train runs/pi0-base": "train runs/pi0-base --permutations 20",
+    },
+    "docs/storage.md": {
+        r"backbone\.07": "backbone.02",
+        r"--format hf": "--format parquet",
+        r"tokens:image": "mean:image",
     },
     "docs/suite.md": {r"(--model pi0-tiny)": r"\1 --max-steps 4"},
 }

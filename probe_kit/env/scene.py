@@ -90,6 +90,7 @@ class Scene:
         self.client.stepSimulation()
         self._shown = {side: self.textures.load(pictures[side]) for side in SIDES}
         self._show()
+        self._frames = 0
         if self.spec.tile_mass > 0:
             for side in SIDES:
                 self._put(self.tiles[side], self._tile_start(side), self.spec.tile_yaw)
@@ -186,23 +187,26 @@ class Scene:
         return any(self.touches_tile(side) for side in SIDES)
 
     def frame(self) -> Frame:
-        """Robot, cube and tiles as the camera sees them, without the table. Small pictures do not change it.
+        """Robot, cube and tiles as the camera sees them, without the table.
 
         PyBullet normalises the normals of a mesh in place whenever it draws them. The last bit of some alternates,
-        and with it a colour by 1 of 255. So small pictures are made an even number.
+        and with it a colour by 1 of 255. So frame n of an episode always has the same parity of drawings before
+        it, whatever former episodes and small pictures drew.
         """
         if self.spec.tile_mass > 0:
             self._lay_pictures()
-        if self._small_drawn % 2:
+        if (self._drawn - self._frames) % 2:
             self.camera.at_height(1).render(self.client, self.spec.light, self.spec.light_level)
-            self._small_drawn += 1
+            self._drawn += 1
+        self._frames += 1
+        self._drawn += 1
         return self._draw()
 
     def small_picture(self, height: int) -> Picture:
         """The finished picture (height, w, 3), drawn with fewer pixels, so that edges are less smooth."""
         if self.spec.tile_mass > 0:
             self._lay_pictures()
-        self._small_drawn += 1
+        self._drawn += 1
         camera, spec = self.camera.at_height(height), self.spec
         return self._film.picture(camera, spec.light, spec.light_level, tuple(self._shown.values()))
 
@@ -244,7 +248,7 @@ class Scene:
         self.arm = Arm(client, model, spec.physics, spec.arm_urdf or model.urdf(folder))
         resting = (*self.tiles.values(), *self.quads.values())
         self._film = FilmCamera(client, self.backdrop, resting, (self.cube, self.arm.body))
-        self._small_drawn = 0
+        self._drawn = self._frames = 0
         self.home_q = self._find_home()
         self.arm.place(self.home_q, spec.home_opening)
         if spec.tile_mass > 0:

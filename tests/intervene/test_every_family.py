@@ -49,7 +49,7 @@ def made(
         scene=SceneSpec(max_steps=2), options=tiny.options, env_workers=0,
     )  # fmt: skip
     run = extract_run(settings, tmp_path_factory.mktemp("families") / request.param)
-    return run, ReplaySource(small_suite.folder, checkpoint, tiny.options)
+    return run, ReplaySource(small_suite.folder, options=tiny.options)  # it loads the folder that the run names
 
 
 def asked_of(run: Run, kind: str) -> Intervention:

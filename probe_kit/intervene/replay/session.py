@@ -52,7 +52,8 @@ class ReplaySource:
     """Where a run's policy, pictures and files are found again; what is found must have the run's hashes.
 
     suite: folder; None for the embedded suite, which is drawn again if need be. checkpoint, options, weights_seed,
-    device: as for `probe-kit extract`. files: of the scene, by field, such as `background`.
+    device: as for `probe-kit extract`; without a checkpoint, the run's own folder if it is still there. files: of
+    the scene, by field, such as `background`.
     """
 
     suite: Path | None = None
@@ -229,7 +230,7 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
 
     return load_policy(
         run.model,
-        source.checkpoint,
+        source.checkpoint or _folder_of(run),
         source.device,
         run.settings["dtype"],
         run.random_weights,
@@ -238,10 +239,22 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
     )
 
 
+def _folder_of(run: Run) -> str | None:
+    """The checkpoint folder from which the run was made, if it exists here. A hub id of a run is never fetched."""
+    made = _checkpoint_of(run)
+    is_folder = made != "" and not run.random_weights and Path(made).expanduser().is_dir()
+    return made if is_folder else None
+
+
+def _checkpoint_of(run: Run) -> str:
+    """The checkpoint as it was named when the run was made; empty if unknown."""
+    return str(run.certificate.get("policy", {}).get("checkpoint", ""))
+
+
 def _check_policy(run: Run, policy: "Policy") -> None:
     card = policy.card
     if card.weights_sha256 != run.weights_sha256:
-        made = run.certificate.get("policy", {}).get("checkpoint", "unknown")
+        made = _checkpoint_of(run) or "an unknown checkpoint"
         raise SettingsMismatchError(
             f"the weights of {card.checkpoint} are {card.weights_sha256[:12]}; {run.location} was made with "
             f"{str(run.weights_sha256)[:12]}, loaded from {made}. Give that --checkpoint (or --weights-seed)"

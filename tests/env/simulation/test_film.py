@@ -52,19 +52,26 @@ def test_tiles_that_settle_on_the_table_are_drawn_within_a_few_pixels(make_env):
         assert differs.sum() <= 8, f"of {differs.size}"
 
 
-def test_small_pictures_in_between_change_no_bit_of_the_frames_of_a_policy(make_env):
-    """In this posture of the Panda, one pixel in 17,000 alternates between two drawings."""
-    env, random = make_env(), np.random.default_rng(1)
+def alternating_frames(env, count):
+    """Frames of a posture of the Panda in which one pixel in 17,000 alternates between two drawings."""
+    random = np.random.default_rng(1)
     env.reset(seed=1)
     for _ in range(2):
         env.advance(
             np.r_[random.uniform(-0.08, 0.08, 3), random.uniform(-0.5, 0.5, 3), float(random.random() > 0.5)]
         )
-    alone = [env.scene.frame().rgb for _ in range(4)]
-    between = []
-    for small in (0, 1, 3, 2):
+    return [env.scene.frame().rgb for _ in range(count)]
+
+
+def test_neither_small_pictures_nor_former_episodes_change_a_bit_of_the_frames_of_a_policy(make_env):
+    env = make_env()
+    alone = alternating_frames(env, 3)
+    assert (alone[0] != alone[1]).any(), "no pixel alternates: choose another posture"
+    for frames in (1, 2):
+        np.testing.assert_array_equal(alternating_frames(env, frames), alone[:frames])
+    between = alternating_frames(env, 1)
+    for small in (1, 2):
         for _ in range(small):
             env.scene.small_picture(HEIGHT)
         between.append(env.scene.frame().rgb)
-    assert (alone[0] != alone[1]).any(), "no pixel alternates: choose another posture"
     np.testing.assert_array_equal(between, alone)
