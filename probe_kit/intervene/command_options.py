@@ -34,6 +34,14 @@ KindName = Annotated[
     str,
     typer.Option("--kind", parser=one_of(KINDS), metavar=choices(KINDS), help="Kind of intervention; see below."),
 ]
+Checkpoint = Annotated[
+    str | None,
+    typer.Option(
+        "--checkpoint",
+        help="Checkpoint folder or Hugging Face id. Default: the folder that the run names, else the family's "
+        "released checkpoint.",
+    ),
+]
 Sites = Annotated[
     Names | None,
     _inside_option(

@@ -56,7 +56,7 @@ def intervene(
     seed: common.Seed = 0,
     readout: own.ReadoutName = "first-chunk",
     suite: common.SuiteFolder = None,
-    checkpoint: common.Checkpoint = None,
+    checkpoint: own.Checkpoint = None,
     model_options: common.ModelOptions = None,
     weights_seed: common.WeightsSeed = 0,
     scene_files: own.SceneFiles = None,
