@@ -36,11 +36,7 @@ KindName = Annotated[
 ]
 Checkpoint = Annotated[
     str | None,
-    typer.Option(
-        "--checkpoint",
-        help="Checkpoint folder or Hugging Face id. Default: the folder that the run names, else the family's "
-        "released checkpoint.",
-    ),
+    typer.Option("--checkpoint", help="Checkpoint folder or Hugging Face id. Default: the folder of the run."),
 ]
 Sites = Annotated[
     Names | None,
