@@ -70,6 +70,8 @@ class Scene:
         self.camera = Camera(spec.camera)
         self._folder = tempfile.TemporaryDirectory(prefix="probe-kit-scene-")
         self._closed: tuple[tuple[int, float, bytes, bytes], int] | None = None
+        self._drawn = 0
+        self._frames = 0
         try:
             self._build()
         except BaseException:
@@ -248,7 +250,8 @@ class Scene:
         self.arm = Arm(client, model, spec.physics, spec.arm_urdf or model.urdf(folder))
         resting = (*self.tiles.values(), *self.quads.values())
         self._film = FilmCamera(client, self.backdrop, resting, (self.cube, self.arm.body))
-        self._drawn = self._frames = 0
+        self._drawn = 0
+        self._frames = 0
         self.home_q = self._find_home()
         self.arm.place(self.home_q, spec.home_opening)
         if spec.tile_mass > 0:
