@@ -5,11 +5,12 @@ read there are others that nothing reads.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import starmap
 from typing import TYPE_CHECKING, Literal
 
 from probe_kit.intervene.edits.pooled_directions import MEAN_DIFFERENCE
 from probe_kit.intervene.edits.sites import ALL, list_places
-from probe_kit.intervene.kinds.joint.effects import NOTHING, is_read_jointly, stored_joint_places
+from probe_kit.intervene.kinds.joint.effects import NOTHING, carries_nothing, is_read_jointly, stored_joint_places
 from probe_kit.intervene.kinds.site_effects import LOCALISATION_SHARE, PatchEffect
 from probe_kit.intervene.results.site_maps import (
     BACKBONE,
@@ -49,12 +50,12 @@ def tie_at_site(
         return "read"
     if whole is None or whole.effect_ci is None:
         return "not tested"
-    if _is_nothing(whole.effect_ci):
+    if carries_nothing(*whole.effect_ci):
         return "unread" if whole.role == ALL else _without_others(whole, layer)
     tested = [row.effect_ci for row in along if row.effect_ci is not None]
     if not tested:
         return "not tested"
-    if not all(map(_is_nothing, tested)):
+    if not all(starmap(carries_nothing, tested)):
         return "in part"
     if not any(row.direction.startswith(MEAN_DIFFERENCE) for row in along):
         return "not tested"
@@ -69,7 +70,7 @@ def _without_others(whole: PatchEffect, layer: Sequence[PatchEffect]) -> TieAtSi
     every = next((row for row in layer if row.role == ALL and row.effect_ci is not None), None)
     if every is None or every.effect_ci is None:
         return "not tested"
-    return "unread" if _is_nothing(every.effect_ci) else "in part"
+    return "unread" if carries_nothing(*every.effect_ci) else "in part"
 
 
 def describe_tie(sites: Sites, is_joint: bool = False) -> str:
@@ -145,11 +146,6 @@ def _role_of(view: str) -> str | None:
 
 def _at(rows: Iterable[PatchEffect], place: str, role: str) -> list[PatchEffect]:
     return [row for row in rows if (row.place, row.role) == (place, role)]
-
-
-def _is_nothing(limits: tuple[float, float]) -> bool:
-    """Whether an interval excludes, on both sides of 0, what would matter."""
-    return limits[0] > -NOTHING and limits[1] < NOTHING
 
 
 def _low(row: PatchEffect) -> float:

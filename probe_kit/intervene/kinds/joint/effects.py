@@ -232,16 +232,16 @@ class _Category:
         return share_of_swap(outcomes, moved, self.suite)
 
 
-def carries_nothing(share: SwapShare) -> bool:
-    """Whether its interval excludes, on both sides, what would matter."""
-    return share.low > -NOTHING and share.high < NOTHING
+def carries_nothing(low: float, high: float) -> bool:
+    """Whether an interval of a share of the swap excludes, on both sides of 0, what would matter."""
+    return low > -NOTHING and high < NOTHING
 
 
 def _finding_of_all(every: SwapShare | None) -> str:
     """What all cells together are."""
     if every is None:
         return "n/a"
-    if carries_nothing(every):
+    if carries_nothing(every.low, every.high):
         return "past it"
     if every.high < -NOTHING:
         return "opposes it"
@@ -255,10 +255,14 @@ def finding_of_cell(alone: SwapShare | None, needed: SwapShare | None, every: Sw
     carries = alone.value >= CARRIES and p < SIGNIFICANCE
     if carries and needed.value >= CARRIES:
         return "read here"
-    if carries and carries_nothing(needed):
+    if carries and carries_nothing(needed.low, needed.high):
         return "enough alone"
-    if carries_nothing(alone) and needed.value >= CARRIES:
+    if carries_nothing(alone.low, alone.high) and needed.value >= CARRIES:
         return "needed, not enough"
     if max(alone.high, needed.high) < -NOTHING:
         return "opposes it"
-    return "nothing alone" if carries_nothing(alone) and carries_nothing(needed) else "in part"
+    return (
+        "nothing alone"
+        if carries_nothing(alone.low, alone.high) and carries_nothing(needed.low, needed.high)
+        else "in part"
+    )
