@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.gradients import frozen
 from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, side_files
 from probe_kit.hooks.contract.model import Tap
@@ -237,14 +237,10 @@ class Groot(LerobotPolicy):
 
     def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
         """The actions of `act`, bit for bit, with a graph of the whole flow; see the contract."""
-        self.check(seen, seeds)
-        if (reason := self._action_misfit()) is not None:
-            raise CheckpointError(reason)
+        self.check_acting(seen, seeds)
         with frozen(self.network):
-            own = self._of_robot(flow_actions(self.network, self.batch(seen), self.noise(seeds))).float()
-            units, values = self.own_units("action", "ACTION"), own.detach().cpu().numpy()
-            metres, slopes = (torch.from_numpy(of(values)).to(own.device) for of in (units.restore, units.slopes))
-            return metres + slopes * (own - own.detach())
+            actions = flow_actions(self.network, self.batch(seen), self.noise(seeds))
+            return self.restored(self._of_robot(actions))
 
     def _of_robot(self, actions: Tensor) -> Tensor:
         """The steps and numbers that this embodiment has."""

@@ -162,19 +162,12 @@ class MolmoAct2(LerobotPolicy):
 
     def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
         """The actions of `act`, bit for bit, with a graph of the whole flow; see the contract."""
-        self.check(seen, seeds)
-        if (reason := self._action_misfit()) is not None:
-            raise CheckpointError(reason)
+        self.check_acting(seen, seeds)
         self._check_graphs()
         with frozen(self.network):
             batch = self.batch(seen)
             end = flow_actions(self.network, batch, self.noise(seeds), batch["action_dim_is_pad"])
-            own, units = end[..., : self._action_numbers].float(), self.own_units("action", "ACTION")
-            if units is None:
-                raise CheckpointError(f"{self.checkpoint} does not say what its actions are in metres")
-            values = own.detach().cpu().numpy()
-            metres, slopes = (torch.from_numpy(of(values)).to(own.device) for of in (units.restore, units.slopes))
-            return metres + slopes * (own - own.detach())
+            return self.restored(end[..., : self._action_numbers])
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Computed once more: block n of the expert on the keys of block n of the backbone."""

@@ -51,6 +51,10 @@ class Bounds:
         found[-1] = 0
         return found
 
+    def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(..., D): `slope` everywhere."""
+        return self.slope(values.shape[-1]) * np.ones_like(values)
+
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(..., D): outside the bounds, where `normalise` clips."""
         return outside(values, self.low, self.high)

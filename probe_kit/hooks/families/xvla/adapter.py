@@ -196,14 +196,9 @@ class Xvla(LerobotPolicy):
 
     def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
         """The actions of `act`, bit for bit, with a graph of the whole denoising; see the contract."""
-        self.check(seen, seeds)
-        if (reason := self._action_misfit()) is not None:
-            raise CheckpointError(reason)
+        self.check_acting(seen, seeds)
         with frozen(self.network):
-            own = denoised_actions(self.network, self.batch(seen), self.noise(seeds)).float()
-            metres = torch.from_numpy(self.action_units.restore(own.detach().cpu().numpy())).to(own.device)
-            slope = torch.from_numpy(self.action_units.slope(own.shape[-1])).to(own.device)
-            return metres + slope * (own - own.detach())
+            return self.restored(denoised_actions(self.network, self.batch(seen), self.noise(seeds)))
 
     def noise(self, seeds: Sequence[int]) -> Tensor:
         """(B, chunk, widest action) float32 noise, a row per seed, the same on every device."""

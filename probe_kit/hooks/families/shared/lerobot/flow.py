@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.errors import CheckpointError
 from probe_kit.hooks.capturing.gradients import frozen
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation
@@ -58,16 +57,11 @@ class LerobotFlow(LerobotPolicy):
 
     def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
         """The actions of `act`, bit for bit, with a graph of the whole flow; see the contract."""
-        self.check(seen, seeds)
-        if (reason := self._action_misfit()) is not None:
-            raise CheckpointError(reason)
+        self.check_acting(seen, seeds)
         batch, noise = self.batch(seen), self.noise(seeds)
         with frozen(self.network), _with_graph(self.network.model):
             chunk: Tensor = undecorated(self.network.predict_action_chunk)(batch, noise=noise)
-            own = chunk.float()
-            metres = torch.from_numpy(self.action_units.restore(own.detach().cpu().numpy())).to(own.device)
-            slope = torch.from_numpy(self.action_units.slope(own.shape[-1])).to(own.device)
-            return metres + slope * (own - own.detach())
+            return self.restored(chunk)
 
     def infer(self, batch: dict[str, Tensor], noise: Tensor) -> Tensor:
         """(B, chunk, D) normalised actions for a batch in lerobot's keys.

@@ -55,6 +55,9 @@ class Units(Protocol):
     def slope(self, numbers: int) -> NDArray[np.float32]:
         """(D,) by how much `restore` changes per unit of the network's output; 0 for a number that jumps."""
 
+    def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(..., D) the same at these outputs of the network; 0 where `restore` clips them."""
+
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(..., D) which physical values lie far from those of the statistics, also where `normalise` clips."""
 
@@ -103,6 +106,10 @@ class Normaliser:
         ends = (np.full((1, numbers), value, np.float32) for value in (0, 1))
         low, high = (self.restore(values)[0] for values in ends)
         return np.asarray(high - low, np.float32)
+
+    def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(..., D): `slope` everywhere."""
+        return self.slope(values.shape[-1]) * np.ones_like(values)
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(..., D): more than five deviations from the mean, or outside the bounds."""

@@ -271,10 +271,24 @@ class LerobotPolicy(Policy):
 
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation; see the contract."""
+        self.check_acting(seen, seeds)
+        return self.action_units.restore(self.put_out(self.batch(seen), seeds))
+
+    def check_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> None:
+        """Also raise CheckpointError for a checkpoint whose actions the arm cannot execute."""
         self.check(seen, seeds)
         if (reason := self._action_misfit()) is not None:
             raise CheckpointError(reason)
-        return self.action_units.restore(self.put_out(self.batch(seen), seeds))
+
+    def restored(self, own: Tensor) -> Tensor:
+        """(..., D) float32 actions, bit for bit those of `act`, with the graph of the network's output `own`."""
+        values = own.float()
+        plain = values.detach().cpu().numpy()
+        actions, slopes = (
+            torch.from_numpy(of(plain)).to(values.device)
+            for of in (self.action_units.restore, self.action_units.slopes)
+        )
+        return actions + slopes * (values - values.detach())
 
     def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """(B, chunk, action numbers) as the network puts them out, without units."""
