@@ -240,15 +240,16 @@ def _streams(row: RetentionRow) -> list[str]:
 def _in_stream(name: str, part: StreamPart, what: str) -> str:
     """One stream. what: how the answer is called there."""
     score, most = f"{_whole(part.score)} %", f"{_whole(part.at_most)} %"
+    open_to = f"{score}; its best site could have up to {most}"
     if part.verdict == "shown":
         return f"{name} holds {what} ({_accuracy(part)})"
     if part.verdict == "absent":
-        return f"{name} does not hold {what} ({score}, at most {most})"
+        return f"{name} does not hold {what} ({score}; its best site has at most {most})"
     if part.exceeds.get("chance") is None:
-        return f"whether {name} holds {what} was not tested against chance ({score}, could be up to {most})"
+        return f"whether {name} holds {what} was not tested against chance ({open_to})"
     missed = [_CONTROLS.get(name, name) for name, better in part.exceeds.items() if better is False]
     beyond = f" beyond {' and '.join(missed)}" if part.exceeds["chance"] else ""
-    return f"{name} is not shown to hold {what}{beyond} ({score}, could be up to {most})"
+    return f"{name} is not shown to hold {what}{beyond} ({open_to})"
 
 
 def _accuracy(part: StreamPart) -> str:
