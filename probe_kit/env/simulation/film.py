@@ -47,7 +47,8 @@ class FilmCamera:
             return backdrop.under(camera.render(self._client, light, level))
 
     def _backdrop(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> Backdrop:
-        places = np.array([np.concatenate(self._place(body)) for body in self._resting])
+        states = (self._client.getBasePositionAndOrientation(body) for body in self._resting)
+        places = np.array([np.concatenate(state) for state in states])
         drawn, shape = self._drawn, (camera.spec.height, camera.spec.width)
         if (
             drawn is None
@@ -59,10 +60,6 @@ class FilmCamera:
                 frame = camera.render(self._client, light, level)
             self._drawn = drawn = _Resting(_over(self._empty.at_size(camera.spec), frame), places, pictures)
         return drawn.backdrop
-
-    def _place(self, body: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        position, quaternion = self._client.getBasePositionAndOrientation(body)
-        return position, quaternion
 
     @contextmanager
     def _without(self, bodies: Iterable[int]) -> Iterator[None]:
