@@ -7,6 +7,7 @@ from rich.text import Text
 
 from probe_kit._terminal.console import marked, out, print_json
 from probe_kit._terminal.options import AsJson
+from probe_kit.hooks.contract.card import EMBEDDED
 
 if TYPE_CHECKING:
     from probe_kit.hooks.family import Family
@@ -92,7 +93,7 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
         {
             "model": family.name,
             "description": family.description,
-            "checkpoint": family.default_checkpoint or ("your own" if family.needs_checkpoint else "embedded"),
+            "checkpoint": family.default_checkpoint or ("your own" if family.needs_checkpoint else EMBEDDED),
             "streams": family.streams,
             "embodiment": family.embodiment,
             "scene": str(family.home),

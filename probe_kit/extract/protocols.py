@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, PLAIN, ProtocolRow, as_text
 
 if TYPE_CHECKING:
@@ -171,7 +172,7 @@ def _defaults(settings: ProtocolSettings, row: ProtocolRow) -> dict[str, str]:
     family = find_family(settings.model)
     known = {f"-M {option.name}": option.default for option in family.options}
     known |= {
-        "checkpoint": family.default_checkpoint or "embedded",
+        "checkpoint": family.default_checkpoint or EMBEDDED,
         "execute": "the checkpoint's",
         "rotation": PLAIN,
         "dtype": "the checkpoint's",

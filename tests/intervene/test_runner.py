@@ -30,7 +30,7 @@ from probe_kit.intervene import (
     stored_interventions,
 )
 from probe_kit.intervene.replay.rollout import planned_of
-from probe_kit.intervene.replay.session import ReplaySession, open_session
+from probe_kit.intervene.replay.session import ReplaySession, load_policy_of, open_session
 from probe_kit.intervene.runner import too_few_groups
 from probe_kit.retention import retention_table
 
@@ -241,6 +241,14 @@ def test_another_policy_another_suite_another_category_are_refused(
         run_intervention(copy, ImageSwap(categories=("colour",)), source, load=lambda *_: twin)
     with pytest.raises(UsageError, match="at least 1"):
         ImageSwap(items=0)
+
+
+def test_a_folder_called_embedded_is_not_taken_for_the_checkpoint_of_the_package(
+    copy: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "embedded").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert load_policy_of(copy, ReplaySource()).card.weights_sha256 == copy.weights_sha256
 
 
 @pytest.mark.parametrize("where", ["drawn again", "found among more items"])

@@ -4,6 +4,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+EMBEDDED = "embedded"
+"""The checkpoint of a model whose weights come with the package."""
+
 
 @dataclass(frozen=True)
 class SourceWeights:

@@ -25,6 +25,7 @@ from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite.counterparts import counterparts_of
 from probe_kit.suite.items import Episode, Item, Layout, Side
@@ -242,7 +243,7 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
 def _folder_of(run: Run) -> str | None:
     """The checkpoint folder from which the run was made, if it exists here. A hub id of a run is never fetched."""
     made = _checkpoint_of(run)
-    is_folder = made != "" and not run.random_weights and Path(made).expanduser().is_dir()
+    is_folder = made not in ("", EMBEDDED) and Path(made).expanduser().is_dir()
     return made if is_folder else None
 
 

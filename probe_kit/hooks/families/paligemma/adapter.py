@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from transformers import PaliGemmaConfig
 
+from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.families.shared.vlm.adapter import Pictures
 from probe_kit.hooks.families.shared.vlm.loading import Recipe
@@ -75,5 +76,5 @@ def load_vlm_tiny(
     """The embedded VLM: PaliGemma at 0.61 million parameters, trained on the prompts of `probe-kit ask`."""
     place = checkpoint or str(embedded_checkpoint("vlm-tiny"))
     vlm = PaliGemma.load(place, device, dtype, random_weights, weights_seed=weights_seed)
-    vlm.card = replace(vlm.card, family="vlm-tiny", checkpoint=checkpoint or "embedded")
+    vlm.card = replace(vlm.card, family="vlm-tiny", checkpoint=checkpoint or EMBEDDED)
     return vlm

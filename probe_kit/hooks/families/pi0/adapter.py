@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
+from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.families.pi0.evaluated import EvaluatedPi0
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights, returned
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
@@ -124,7 +125,7 @@ def load_pi0_tiny(
     """
     place = checkpoint or str(embedded_checkpoint(name))
     policy = Pi0.load(place, device, dtype, random_weights, weights_seed)
-    policy.card = replace(policy.card, family=name, checkpoint=checkpoint or "embedded")
+    policy.card = replace(policy.card, family=name, checkpoint=checkpoint or EMBEDDED)
     return policy
 
 
