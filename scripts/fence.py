@@ -206,8 +206,9 @@ def add_retention(fence: Fence, name: str, title: str, *arguments: object) -> No
 
 def add_intervention(fence: Fence, name: str, folder: str, kind: str, *arguments: object) -> None:
     """Store the effects of an intervention, as printed and as Python loads them."""
-    effects = table("intervene", folder, "--kind", kind, *arguments)["effects"]
-    loaded = pk.load_effects(pk.open_run(folder), kind=kind).table
+    printed = table("intervene", folder, "--kind", kind, *arguments)
+    effects, key = printed["effects"], printed["key"]
+    loaded = pk.load_effects(pk.open_run(folder), key).table
     if len(loaded) != len(effects):
         raise SystemExit(f"fence: {kind} prints {len(effects)} rows; load_effects has {len(loaded)}")
     if kind == "attention":  # a row per head and iteration: thousands
@@ -272,6 +273,9 @@ def decode_labels(fence: Fence) -> None:
 def compare_answers_and_actions(fence: Fence) -> None:
     """Compare the VLM's answers, the policy's probes and its actions."""
     add_retention(fence, "comparison", "VLM and VLA", ASKED, "acting", "--vlm-vla", "--details", "all")
+    # Cubes end within 1 cm of the middle, so that only small zones tell a radius from another.
+    small_zones = ("--epsilons", "0.004,0.006,0.008", "--last-steps", 2)
+    add_retention(fence, "acting", "retention in small zones", "acting", *small_zones)
     printed = json.loads(call("stages", ASKED, "acting", "--json"))
     fence.add("comparison", "stages", printed if isinstance(printed, list) else [printed])
 
@@ -382,7 +386,7 @@ def play_more_kinds(fence: Fence) -> None:
     edit = ("--sites", "backbone.03", "--direction", "none", "--roles", "all")
     add_intervention(fence, "longer", "longer", "closed-loop", *color, 4, *edit)
     add_retention(fence, "longer", "retention", "longer", "--details", "all")
-    rule = ("--rule", "box", "--last-steps", 3, "--epsilons", "0.05,0.1")
+    rule = ("--rule", "box", "--last-steps", 3)
     add_retention(fence, "longer", "retention by the rule box", "longer", *rule)
 
 
@@ -441,7 +445,7 @@ views = ["mean"]
 permutations = 39
 controls = ["random-features"]
 [comparisons.light]
-pairs = { conditions = ["plain", "dark"] }
+pairs = { conditions = ["plain", "dark"], models = ["base"] }
 [tables.success]
 kind = "success"
 runs = ["main"]

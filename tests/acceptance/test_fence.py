@@ -69,14 +69,13 @@ def test_a_larger_run_gives_the_numbers_that_are_stored(
 def _changed(column: str, change: Any, platform: str | None = None) -> list[str]:
     """Change one column of the first row that has a value in it, and compare."""
     new = copy.deepcopy(STORED)
-    rows = [
-        row for table in new["runs"]["acting"].values() for row in table.values() if row.get(column) is not None
-    ]
+    tables = [table for run in ("acting", "comparison") for table in new["runs"][run].values()]
+    rows = [row for table in tables for row in table.values() if row.get(column) is not None]
     assert rows, f"no row has the column {column}"
     rows[0][column] = change(rows[0][column])
     if platform:
         new["platform"]["torch"] = platform
-    return differences(STORED, new, "acting")
+    return [line for run in ("acting", "comparison") for line in differences(STORED, new, run)]
 
 
 @pytest.mark.parametrize(
@@ -94,7 +93,7 @@ def _changed(column: str, change: Any, platform: str | None = None) -> list[str]
 )
 def test_a_changed_number_is_listed_with_its_path_and_both_values(column: str, change: Any) -> None:
     (line,) = _changed(column, change)
-    assert line.startswith("acting / ")
+    assert line.startswith(("acting / ", "comparison / "))
     assert f" / {column}: " in line
     assert " → " in line
 
