@@ -178,7 +178,7 @@ def add_activations(fence: Fence, name: str, run: pk.Run, tokens: bool = False) 
                     fence.add(name, "activations", [about | fingerprint(numbers)])
             if tokens:
                 numbers, mask = run.tokens(site)
-                about = {"site": str(site), "chosen_tokens": int(mask.sum())}
+                about = {"site": str(site), "tokens_in_mask": int(mask.sum())}
                 fence.add(name, "tokens", [about | fingerprint(numbers)])
 
 
@@ -310,8 +310,8 @@ def show_recordings(fence: Fence) -> None:
 
 def play_own_environment(fence: Fence) -> None:
     """Act in an environment of `fence_environment.py`."""
-    own = ("--env", "fence_environment:BlockTable", "--captured-calls", 2, "--execute", 2)
-    call("extract", "--model", "pi0-tiny", *own, "--label", "environment", "--out", "environment")
+    acting = ("--env", "fence_environment:BlockTable", "--captured-calls", 2, "--execute", 2)
+    call("extract", "--model", "pi0-tiny", *acting, "--label", "environment", "--out", "environment")
     run = pk.open_run("environment")
     add_episodes(fence, "environment", run)
     add_activations(fence, "environment", run)
@@ -537,8 +537,8 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, help="an empty folder that keeps the runs")
     options = parser.parse_args()
     parts = SLOW_PARTS if options.slow else PARTS
-    chosen = options.only.split(",") if options.only else list(parts)
-    if unknown := sorted(set(chosen) - set(parts)):
+    selected = options.only.split(",") if options.only else list(parts)
+    if unknown := sorted(set(selected) - set(parts)):
         parser.error(f"--only names {', '.join(unknown)}; the parts are {', '.join(parts)}")
     file, fence = options.file.resolve(), Fence()
     warnings.simplefilter("ignore")
@@ -553,7 +553,7 @@ def main() -> None:
         stack.enter_context(contextlib.chdir(folder))
         os.environ["PROBE_KIT_CACHE"] = str(Path(folder, "cache"))
         os.environ["HF_HOME"] = str(Path(folder, "hugging-face"))
-        for part in chosen:
+        for part in selected:
             for play in parts[part]:
                 play(fence)
     file.write_text(as_text(numeric_platform(), fence.runs), encoding="utf-8")
