@@ -11,8 +11,8 @@ from probe_kit.retention import command_options as own
 from probe_kit.retention.label_commands import save_all, say_report
 
 if TYPE_CHECKING:
-    from probe_kit.retention.formats.as_paper import PaperTable
     from probe_kit.retention.choices import Section, TableFormat
+    from probe_kit.retention.formats.as_paper import PaperTable
     from probe_kit.retention.table import RetentionTable
 
 
@@ -77,7 +77,7 @@ def retention(
         refused = {
             "--group": group, "--against": against, "--epsilons": epsilons, "--absent-below": absent_below != 0.65,
             "--score order-balanced": score == "order-balanced", "--vlm-vla": vlm_vla, "--details": details,
-            "--html": html, "--figures": figures,
+            "--html": html is not None, "--figures": figures is not None,
         }  # fmt: skip
         common.check_no_others(refused, "the paper's own numbers (--as-paper)")
     check_epsilons(rule, epsilons is not None)

@@ -103,13 +103,13 @@ def paper_table(rows: Sequence[RetentionRow], means: Sequence[RetentionRow], out
 def _category_numbers(row: RetentionRow) -> dict[str, Any]:
     success, margin = row.success.sr, row.success.chance_margin_episodes
     backbone, action = row.backbone.peak, row.action.peak
-    acted = success is not None and margin is not None
+    of_band = None if success is None or margin is None else paper_regime(success, margin)
     return {
         **_identity(row),
         "episodes": row.success.n_episodes,
         "sr": success,
         "margin": margin,
-        "regime": str(paper_regime(success, margin)) if acted else None,
+        "regime": None if of_band is None else str(of_band),
         "normalised_score": None,
         "backbone": backbone,
         "action": action,
