@@ -30,6 +30,7 @@ ROOMY_DISK = 20e9
 DEMO_MEMORY = 2e9
 PATIENCE = 120
 """Seconds a trial may take."""
+TRY_AGAIN = "The machine is busy. Run `probe-kit doctor` again when it is quiet; the demo will be slow until then"
 HUB_TIMEOUT = 3
 TOKENIZERS = {"pi0": "google/paligemma-3b-pt-224", "smolvla": "HuggingFaceTB/SmolVLM2-500M-Video-Instruct"}
 _PYTHONS = ((3, 12), (3, 14))  # from, and below
@@ -169,10 +170,10 @@ def let_policy_act() -> dict[str, Any]:
 
 
 def _scene() -> list[Finding]:
-    found, complaint = _try("draw_scene")
-    if found is None:
-        advice = "pybullet is compiled on installation: it needs a C++ compiler, and numpy at that time"
-        return [Finding("simulator", "missing", complaint, advice)]
+    advice = "pybullet is compiled on installation: it needs a C++ compiler, and numpy at that time"
+    found = _trial("simulator", "draw_scene", advice)
+    if isinstance(found, Finding):
+        return [found]
     simulator = Finding("simulator", "ok", f"pybullet {found['pybullet']} with numpy")
     if not found["numpy"]:
         advice = f"Build it again beside numpy: `{install_command(rebuild='pybullet')}`"
@@ -185,9 +186,9 @@ def _scene() -> list[Finding]:
 
 
 def _policy() -> list[Finding]:
-    found, complaint = _try("let_policy_act")
-    if found is None:
-        return [Finding("policy", "missing", complaint, f"Install again: `{install_command()}`")]
+    found = _trial("policy", "let_policy_act", f"Install again: `{install_command()}`")
+    if isinstance(found, Finding):
+        return [found]
     acted = f"pi0-tiny acts (torch {found['torch']}, lerobot {found['lerobot']})"
     return [Finding("policy", "ok", acted), _gpu(found["gpus"])]
 
@@ -200,8 +201,12 @@ def _gpu(gpus: list[dict[str, Any]]) -> Finding:
     return Finding("gpu", "ok", seen)
 
 
-def _try(function: str) -> tuple[dict[str, Any] | None, str]:
-    """What a function of this module returns in a process of its own; or None and its last words."""
+def _trial(subject: str, function: str, advice: str) -> "dict[str, Any] | Finding":
+    """Return what a function of this module returns in a process of its own, or the finding that it failed.
+
+    advice: what to do where it failed. A trial without an answer in time is no failure: the machine is busy, and
+    installing again would not help.
+    """
     code = f"import json, probe_kit.doctor as d; print('\\n' + json.dumps(d.{function}()))"
     try:
         done = subprocess.run(
@@ -209,12 +214,17 @@ def _try(function: str) -> tuple[dict[str, Any] | None, str]:
             timeout=PATIENCE, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        return None, f"no answer within {PATIENCE} s"
+        return Finding(subject, "note", f"not known: no answer within {PATIENCE} s{_load()}", TRY_AGAIN)
     if done.returncode != 0:
         words = done.stderr.strip().splitlines() or ["no message"]
-        return None, f"ended with code {done.returncode}: {words[-1]}"
-    found: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
-    return found, ""
+        return Finding(subject, "missing", f"ended with code {done.returncode}: {words[-1]}", advice)
+    answer: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    return answer
+
+
+def _load() -> str:
+    """Return the number of processes that wanted a core in the last minute, where the system counts them."""
+    return f", with {os.getloadavg()[0]:.0f} processes at work" if hasattr(os, "getloadavg") else ""
 
 
 # -- what can be downloaded or added ---------------------------------------------------------------------------

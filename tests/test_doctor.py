@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from collections import namedtuple
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -76,10 +77,16 @@ def test_a_trial_that_crashes_is_a_finding_with_its_last_words(monkeypatch: pyte
     assert "C++ compiler" in finding.advice
 
 
-def test_a_trial_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("trial", [doctor._scene, doctor._policy])
+def test_a_trial_without_an_answer_in_time_says_that_the_machine_is_busy_and_not_to_install_again(
+    trial: Callable[[], list[Finding]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(doctor, "PATIENCE", 0.01)
-    (finding,) = doctor._policy()
-    assert (finding.state, finding.seen) == ("missing", "no answer within 0.01 s")
+    (finding,) = trial()
+    assert finding.state == "note"
+    assert finding.seen.startswith("not known: no answer within 0.01 s")
+    assert "busy" in finding.advice
+    assert "nstall" not in finding.advice
 
 
 @pytest.mark.parametrize(("free", "state"), [(1e6, "missing"), (1e9, "note"), (1e12, "ok")])

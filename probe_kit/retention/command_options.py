@@ -186,6 +186,14 @@ Details = Annotated[
     ),
 ]
 NO_DETAILS = Names()
+AsPaper = Annotated[
+    bool,
+    typer.Option(
+        "--as-paper",
+        help="Print the paper's own numbers by its own formulas: regimes by Δ over episodes alone, retention of "
+        "maxima with ε over all categories. No intervals, no controls.",
+    ),
+]
 Style = Annotated[TableFormat, typer.Option("--format", help="Format of the result.")]
 Html = Annotated[
     Path | None,

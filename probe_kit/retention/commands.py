@@ -11,7 +11,9 @@ from probe_kit.retention import command_options as own
 from probe_kit.retention.label_commands import save_all, say_report
 
 if TYPE_CHECKING:
-    from probe_kit.retention.choices import Section
+    from probe_kit.retention.choices import Section, TableFormat
+    from probe_kit.retention.formats.as_paper import PaperTable
+    from probe_kit.retention.table import RetentionTable
 
 
 def retention(
@@ -33,6 +35,7 @@ def retention(
     vlm_vla: own.VlmVla = False,
     with_side_words: own.SideWords = False,
     details: own.Details = own.NO_DETAILS,
+    as_paper: own.AsPaper = False,
     style: own.Style = "table",
     html: own.Html = None,
     figures: own.Figures = None,
@@ -54,6 +57,7 @@ def retention(
             "--group": group, "--against": against, "--rule": rule != "disc", "--last-steps": last_steps != 1,
             "--epsilons": epsilons, "--score": score != "text", "--vlm-vla": vlm_vla,
             "--with-side-words": with_side_words, "--details": details, "--absent-below": absent_below != 0.65,
+            "--as-paper": as_paper,
         }  # fmt: skip
         common.check_no_others(refused)
         if not runs:
@@ -69,6 +73,13 @@ def retention(
         return
     if family != "label":
         raise UsageError("--family is for labels of your own; give --target COLUMN too, or leave it out")
+    if as_paper:
+        refused = {
+            "--group": group, "--against": against, "--epsilons": epsilons, "--absent-below": absent_below != 0.65,
+            "--score order-balanced": score == "order-balanced", "--vlm-vla": vlm_vla, "--details": details,
+            "--html": html is not None, "--figures": figures is not None,
+        }  # fmt: skip
+        common.check_no_others(refused, "the paper's own numbers (--as-paper)")
     check_epsilons(rule, epsilons is not None)
     if bool(runs) == bool(group):
         raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
@@ -87,6 +98,9 @@ def retention(
         rule=rule, last_steps=last_steps, absent_below=absent_below, score=score, vlm_vla=vlm_vla,
         with_side_words=with_side_words, against=against,
     )  # fmt: skip
+    if as_paper:
+        _print(table.as_paper, style, table.notes)
+        return
     shown = [scored(run, score, with_side_words) for run in listed]
     if figures is not None:
         from probe_kit.retention.displays import collect_figures
@@ -101,10 +115,18 @@ def retention(
     if style == "table":
         out.print(table.to_rich("all" if "all" in details else cast("tuple[Section, ...]", details)))
     else:
+        _print(table, style, table.notes)
+
+
+def _print(table: "RetentionTable | PaperTable", style: "TableFormat", notes: Sequence[str]) -> None:
+    """Print a table in a format, and its notes beside it, where a program does not read them."""
+    if style == "table":
+        out.print(table.to_rich())
+    else:
         show = print_json_text if style == "json" else print_text
         show(getattr(table, f"to_{style}")())
-        for note in table.notes:
-            say(marked("[yellow]note:[/] {}", note))
+    for note in notes:
+        say(marked("[yellow]note:[/] {}", note))
 
 
 def _check_places(html: Path | None, figures: Path | None) -> None:

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Group
 
+    from probe_kit.retention.formats.as_paper import PaperTable
+
 
 @dataclass(frozen=True, repr=False)
 class RetentionTable:
@@ -181,6 +183,14 @@ class RetentionTable:
     def summary(self) -> list[RunSummary]:
         """Per run a row and a sentence for every category: what the table found."""
         return summarise_runs(self.all_rows)
+
+    @property
+    def as_paper(self) -> "PaperTable":
+        """The paper's own numbers by its own formulas, see `probe_kit.retention.formats.as_paper`."""
+        from probe_kit.retention.formats.as_paper import paper_table
+
+        steps = f" over the last {self.last_steps} control steps" if self.last_steps > 1 else ""
+        return paper_table(self.rows, self.means, f"outcome rule {self.rule}{steps}")
 
     def to_rich(self, details: Collection[Section] | Literal["all"] = ()) -> "Group":
         """The summary for a rich console: one table, and a sentence per category as the last lines.

@@ -48,7 +48,18 @@ Even = Annotated[int, Field(ge=2, le=1_000_000, multiple_of=2)]
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Size = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,3}x[1-9][0-9]{0,3}$")]
 TableKind = Literal[
-    "success", "sides", "ablation", "vlms", "vlm-vla", "probing", "groups", "chain", "score", "stages", "drift"
+    "success",
+    "sides",
+    "ablation",
+    "vlms",
+    "vlm-vla",
+    "probing",
+    "as-paper",
+    "groups",
+    "chain",
+    "score",
+    "stages",
+    "drift",
 ]
 Control = Literal["untrained"] | Baseline
 FigureKind = Literal["curves", "sides", "dose", "overview"]

@@ -1,5 +1,6 @@
 """What `probe-kit retention` refuses, and how it names probes, before it reads a run."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +9,8 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
+from probe_kit.extract import open_run
+from probe_kit.retention import retention_table
 from probe_kit.retention.commands import _keys
 from probe_kit.train import ArrayRun
 from probe_kit.train.results.inventory import inventory
@@ -73,3 +76,26 @@ def test_the_inventory_names_the_probes_of_a_table(
     run = probed_run({"color": ([0.5, 0.9], [[0.6]])})
     (probes,) = inventory(run).probes
     assert (probes.state, probes.views, probes.permutations) == ("used", ("mean",), 99)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [["--group", "a=b"], ["--score", "order-balanced"], ["--vlm-vla"], ["--details", "all"], ["--html", "r.html"]],
+    ids=lambda options: options[0],
+)
+def test_the_papers_own_numbers_refuse_what_the_paper_does_not_have(options: list[str]) -> None:
+    result = CliRunner().invoke(app, ["retention", "nowhere", "--as-paper", *options])
+    assert result.exit_code == 2
+    assert "--as-paper" in result.stderr
+
+
+@pytest.mark.parametrize("style", ["table", "json", "csv", "markdown", "latex"])
+def test_the_papers_own_numbers_are_printed_in_every_format(little_runs: Path, style: str) -> None:
+    result = CliRunner().invoke(app, ["retention", str(little_runs / "run"), "--as-paper", "--format", style])
+    assert result.exit_code == 0, result.stderr
+    assert "color" in result.stdout.lower()
+    if style == "json":
+        rows = json.loads(result.stdout)
+        table = retention_table([open_run(little_runs / "run")])
+        assert [row["backbone"] for row in rows] == [row.backbone.peak for row in table.all_rows]
+        assert all(row["margin"] == pytest.approx(0.98 / row["episodes"] ** 0.5, rel=1e-4) for row in rows[:1])

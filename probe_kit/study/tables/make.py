@@ -26,7 +26,14 @@ from probe_kit.study.tables.compared import difference_table, group_table, stage
 from probe_kit.study.tables.drifts import drift_table
 from probe_kit.study.tables.formats import table_of_record
 from probe_kit.study.tables.named_table import NamedTable, Number
-from probe_kit.study.tables.rates import probing_table, score_table, sides_table, success_table, vlm_table
+from probe_kit.study.tables.rates import (
+    as_paper_table,
+    probing_table,
+    score_table,
+    sides_table,
+    success_table,
+    vlm_table,
+)
 from probe_kit.study.tables.stored_runs import StoredRun, StoredRuns, of_blocks, stored_runs
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results
@@ -38,6 +45,10 @@ _OF_RUNS: Mapping[str, Callable[[RetentionTable], NamedTable]] = {
     "success": success_table,
     "vlms": vlm_table,
     "sides": sides_table,
+}
+_OF_PROBED_RUNS: Mapping[str, Callable[[RetentionTable], NamedTable]] = {
+    "probing": probing_table,
+    "as-paper": as_paper_table,
 }
 
 
@@ -111,9 +122,9 @@ def _made(study: LoadedStudy, table: TableTable, runs: StoredRuns, name: str) ->
     if table.kind == "vlm-vla":
         read = [scored(run, "text") for run in opened]
         return vlm_vla_table(vlm_vla_differences(read, labels, _sources(study, runs.found)))
-    if table.kind == "probing":
+    if table.kind in _OF_PROBED_RUNS:
         probed, chosen = [one.probed.in_wording() for one in runs.found], _categories(table)
-        return probing_table(retention_table(probed, labels=labels, pairs=(), categories=chosen))
+        return _OF_PROBED_RUNS[table.kind](retention_table(probed, labels=labels, pairs=(), categories=chosen))
     if table.kind == "drift":
         return _drift(study, study.study.drift[table.drift or ""], runs, labels, name)
     if table.kind == "stages":

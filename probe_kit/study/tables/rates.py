@@ -208,6 +208,11 @@ def probing_table(table: RetentionTable) -> NamedTable:
     return NamedTable(TextTable("Probes", caption(table, note), columns, cells, names=3), tuple(numbers))
 
 
+def as_paper_table(table: RetentionTable) -> NamedTable:
+    """Return the paper's own numbers by its own formulas, see `probe_kit.retention.formats.as_paper`."""
+    return NamedTable(table.as_paper.text, table.as_paper.numbers)
+
+
 def once_per_run(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
     """Rows of the first view of each run and category; rates do not depend on views."""
     return list({(row.run.location, row.category): row for row in reversed(rows)}.values())[::-1]
