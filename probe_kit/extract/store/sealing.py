@@ -1,5 +1,6 @@
 """Sealing: turns pooled rows into one block per site and view, and roles into a column."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from probe_kit.extract.run_layout import COLUMNS, SEALED, StoredStream, VectorKind
 from probe_kit.extract.store.format.arrays import codecs
-from probe_kit.extract.store.format.columns import write_seal
+from probe_kit.extract.store.format.columns import STAMP_DIGITS, seal_key, write_seal
 from probe_kit.extract.store.format.recording import RecordingStore
 from probe_kit.extract.store.format.rows import Rows
 from probe_kit.extract.store.locations.locate import locate
@@ -19,6 +20,7 @@ from probe_kit.extract.store.run import Run, read_run
 from probe_kit.hooks.contract.views import PADDING
 
 EPISODES_PER_CHUNK = 1024
+_SEAL = re.compile(rf"{SEALED}/[0-9a-f]{{{STAMP_DIGITS}}}\.json")
 # What is held in memory at a time; all rows are read once more for every further slab.
 SLAB_BYTES = 1 << 30
 
@@ -40,6 +42,7 @@ def _seal(run: Run) -> bool:
     if run.root.left_out:
         run.root.refuse_left_out("there is nothing to seal")
     if run.sealed:
+        _remove_former_seals(run)
         return False
     run.location.remove(SEALED)  # nothing counts that is not whole
     with run.location.rebuilding(COLUMNS, run.stamp) as place:
@@ -55,6 +58,13 @@ def _seal(run: Run) -> bool:
     commits = {commit["episode"]: commit for commit in run.commits()}
     write_seal(run.root, commits, store.sums)  # what makes them count, so last
     return True
+
+
+def _remove_former_seals(run: Run) -> None:
+    """Remove seals of other commits, which a process that had seen fewer may have written late to an object store."""
+    for key in run.location.keys(SEALED):
+        if _SEAL.fullmatch(key) and key != seal_key(run.stamp):
+            run.location.delete(key)
 
 
 def _write_vectors(run: "Run", name: str, kind: VectorKind, group: zarr.Group) -> None:
