@@ -1,14 +1,13 @@
 """Extraction: workers play every episode that is not committed; then the run is sealed."""
 
 import json
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit._terminal.notebook import notebook_progress
-from probe_kit.errors import EpisodesFailedError, StoreError, UsageError
+from probe_kit.errors import EpisodesFailedError, UsageError
 from probe_kit.extract.needs import space_needed
 from probe_kit.extract.plan import RowPlan
 from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_answer_model
@@ -45,10 +44,6 @@ Progress = Callable[[int, int, str], None]
 HOPELESS = 3
 
 
-class SingleWriterWarning(UserWarning):
-    """The object store cannot keep two writers apart; this process must stay the only one."""
-
-
 class Extraction(Prepared):
     """A prepared extraction, ready to run; so far nothing is written."""
 
@@ -59,8 +54,9 @@ class Extraction(Prepared):
         progress: called with (episodes done, episodes planned, outcome of the last one); by default a bar in a
         notebook, nothing elsewhere.
         Raises SettingsMismatchError or DiskSpaceError before anything is written, StoreError if `out` lies in an
-        object store that cannot be used so, EpisodesFailedError at the end if episodes were given up, and whatever
-        is wrong with all episodes at once. Committed episodes stay; the same call resumes after them.
+        object store that cannot be used, as one that ignores conditional puts, EpisodesFailedError at the end if
+        episodes were given up, and whatever is wrong with all episodes at once. Committed episodes stay; the same
+        call resumes after them.
         """
         location = locate(out)
         if self.declared:
@@ -71,7 +67,7 @@ class Extraction(Prepared):
                 check_if_full(space_needed(further, self.settings), location)
             writer = self.writer(location)
             with writer.owned():
-                self._check_exclusive(writer)
+                location.check_exclusive(RUN_FILE)
                 if self.settings.label is not None:
                     label_run(location, run_label(self.settings))
                 remaining = writer.remaining()
@@ -100,16 +96,6 @@ class Extraction(Prepared):
         rows = further_rows(root.plan, self.plan.to_json()["episodes"], str(location))
         added = {row["episode_id"] for row in rows}
         return self.plan.only(one for one in self.plan.episodes if one.episode_id in added)
-
-    def _check_exclusive(self, writer: RunWriter) -> None:
-        if writer.several_may_write():
-            return
-        seen = (
-            f"{writer.location}: the store ignores conditional puts (If-None-Match) and keeps no two writers apart"
-        )
-        if self.settings.workers > 1 or self.settings.ray:
-            raise StoreError(f"{seen}. Leave out --workers and --ray, or use another store")
-        warnings.warn(f"{seen}; make sure that no second process extracts here", SingleWriterWarning, stacklevel=3)
 
     def _play(self, writer: RunWriter, remaining: list[int], progress: Progress | None) -> None:
         scheduler = Scheduler(remaining)

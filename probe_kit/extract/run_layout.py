@@ -30,13 +30,9 @@ import numpy as np
 from probe_kit.hooks.contract.sites import QUANTITIES, Part, Site, Stream
 
 SCHEMA_VERSION = 5
-"""The one that is written."""
-READABLE_SCHEMAS = (3, 4, SCHEMA_VERSION)
-"""Those that are read. In runs of former ones no hash bound everything to the root."""
+"""The only one that is written and read."""
 TOKEN_BLOCK = 128
 RUN_FILE, PLANS, CERTIFICATE_FILE = "run.json", "plan", "certificate.json"
-FORMER_PLAN_FILE = "plan.json"
-"""Where runs of schemas 3 and 4 have their plan, which never grows."""
 LABEL_FILE, TIMES, LEFT_OUT_FILE = "label.json", "times", "left-out.json"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
 FRAMES, CERTIFICATES, SEALED, PROBES, PROVENANCE = "frames", "certificates", "sealed", "probes", "provenance"
@@ -148,14 +144,11 @@ class StoredStream:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "StoredStream":
-        """Parse what `to_json` wrote, in this version or before streams declared their part.
-
-        Raises TypeError or KeyError for values of another kind.
-        """
-        for name, value in values.items():
-            if not _STREAM_PARTS[name](value):
-                raise TypeError(f"{name} is {value!r}")
-        lists = {name: tuple(values[name]) for name in ("views", "quantities") if name in values}
+        """Parse what `to_json` wrote. Raises TypeError or KeyError for values of another kind."""
+        for name, is_valid in _STREAM_PARTS.items():
+            if not is_valid(values[name]):
+                raise TypeError(f"{name} is {values[name]!r}")
+        lists = {name: tuple(values[name]) for name in ("views", "quantities")}
         return cls(**{**values, **lists})
 
     def to_json(self) -> dict[str, Any]:

@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from probe_kit.intervene.kinds.attribution.intervention import AttributionPatching
     from probe_kit.intervene.kinds.closed_loop.effects import ClosedLoopEffect
     from probe_kit.intervene.kinds.closed_loop.intervention import ClosedLoop
-    from probe_kit.intervene.kinds.erase.effects import ErasureEffect
-    from probe_kit.intervene.kinds.erase.intervention import ConceptErasure
+    from probe_kit.intervene.kinds.erase import ConceptErasure, ErasureEffect
     from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, stored_image_swaps
     from probe_kit.intervene.kinds.image_swap.intervention import ImageSwap
     from probe_kit.intervene.kinds.image_swap.verdict import (
@@ -101,8 +100,8 @@ __getattr__, __dir__ = lazy_names(
         "ClosedLoop": "kinds.closed_loop.intervention",
         "best_patch_targets": "results.best_targets",
         "InterventionResult": "results.results",
-        "ConceptErasure": "kinds.erase.intervention",
-        "ErasureEffect": "kinds.erase.effects",
+        "ConceptErasure": "kinds.erase",
+        "ErasureEffect": "kinds.erase",
         "ImageSwap": "kinds.image_swap.intervention",
         "ImageSwapEffect": "kinds.image_swap.effects",
         "UseVerdict": "kinds.image_swap.verdict",

@@ -55,14 +55,13 @@ class Pack:
         """The record in a folder. Raises RunDamagedError if it is none, UsageError if it is of another version."""
         try:
             found = parse_json((folder / PACK_FILE).read_bytes())
-            known = cls(**found)
-        except (ValueError, TypeError) as error:
+            if (schema := found["schema"]) != SCHEMA:
+                raise UsageError(f"{folder} is an archive of schema {schema}; this version reads {SCHEMA}")
+            return cls(**found)
+        except (ValueError, TypeError, KeyError) as error:
             raise RunDamagedError(
-                f"{folder / PACK_FILE} is no record of an archive ({error}). {_RESTORE}"
+                f"{folder / PACK_FILE} is no record of an archive ({error!r}). {_RESTORE}"
             ) from error
-        if known.schema != SCHEMA:
-            raise UsageError(f"{folder} is an archive of schema {known.schema}; this version reads {SCHEMA}")
-        return known
 
 
 def open_archive(name: str | Path) -> Path | None:

@@ -12,8 +12,7 @@ from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
 from probe_kit.extract.vqa.templates import find_template
 from probe_kit.hooks.registry import family_names, get_family
 from probe_kit.study.cells import Cell, Selection
-from probe_kit.study.mistakes import Mistake
-from probe_kit.study.places import Place
+from probe_kit.study.mistakes import Mistake, Place
 from probe_kit.study.planned_suite import PlannedSuite, slugs
 from probe_kit.study.schema import AskTable, BlockTable, ConditionTable, ModelTable, Study
 

@@ -8,8 +8,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from probe_kit.study import schema
-from probe_kit.study.mistakes import Mistake
-from probe_kit.study.places import Place, part_in_file
+from probe_kit.study.mistakes import Mistake, Place, part_in_file
 
 _ROUNDS = 5
 """Of leaving out: a value, then its table where that cannot do without it, and so on."""

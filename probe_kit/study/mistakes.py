@@ -1,14 +1,15 @@
-"""Mistakes in a study file: where each stands, what is wrong, and what would be right."""
+"""Mistakes in a study file: the path of each value, what is wrong, and what would be right."""
 
 import json
 import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from typing import Any
 
 from probe_kit.errors import UsageError
-from probe_kit.study.places import Place, line_of
 
+Place = tuple[str | int, ...]
 _BARE = re.compile(r"[\w.-]+")
 _LONGEST = 60
 """Characters of a name or value that a message quotes."""
@@ -44,13 +45,30 @@ def shortened(text: str) -> str:
 
 
 class StudyFileError(UsageError):
-    """A study file has mistakes; the message lists all of them, each with its line."""
+    """A study file has mistakes; the message lists all of them in the order of the file, each with its path."""
 
-    def __init__(self, file: str, text: str, mistakes: Sequence[Mistake]) -> None:
-        self.mistakes = tuple(mistakes)
-        self.lines = tuple(line_of(text, one.path) for one in mistakes)
-        found = sorted(zip(self.lines, mistakes, strict=True), key=lambda pair: pair[0])
-        super().__init__("\n".join(f"{file}:{line}: {one.place}: {one.text}" for line, one in found))
+    def __init__(self, file: str, content: dict[str, Any], mistakes: Sequence[Mistake]) -> None:
+        self.mistakes = tuple(sorted(mistakes, key=lambda mistake: _order(content, mistake.path)))
+        super().__init__("\n".join(f"{file}: {mistake.place}: {mistake.text}" for mistake in self.mistakes))
+
+
+def part_in_file(path: Place, content: Any) -> Place:
+    """The part of a path that leads to a value of the content of a file."""
+    for at, part in enumerate(path):
+        try:
+            content = content[part]
+        except (KeyError, IndexError, TypeError):
+            return path[:at]
+    return path
+
+
+def _order(content: Any, path: Place) -> list[int]:
+    """The position of a value among its neighbours, in every table and list around it."""
+    positions = []
+    for part in part_in_file(path, content):
+        positions.append(part if isinstance(part, int) else list(content).index(part))
+        content = content[part]
+    return positions
 
 
 def unknown(what: str, name: str, known: Collection[str], none: str = "there are none") -> str:

@@ -1,6 +1,5 @@
 """Reading of study files, your own and those of the package."""
 
-import re
 import tomllib
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -16,8 +15,7 @@ from probe_kit.study.archive import RUNS, STUDY_FILE, Pack, open_archive
 from probe_kit.study.cells import Cell
 from probe_kit.study.expansion import expand
 from probe_kit.study.left_over import LeftOver
-from probe_kit.study.mistakes import Mistake, StudyFileError, shortened
-from probe_kit.study.places import Place, part_in_file
+from probe_kit.study.mistakes import Mistake, Place, StudyFileError, part_in_file, shortened
 from probe_kit.study.planned_suite import PlannedSuite, planned_suite
 from probe_kit.study.references import reference_mistakes
 
@@ -66,22 +64,22 @@ def load_study(name: str | Path) -> LoadedStudy:
 
     Paths in the file are relative to the working directory, as on the command line.
     name: a path, the name of a study of the package, or an archive of `pack_study`, as a folder or zip file.
-    Raises UsageError if there is none, StudyFileError, which lists all mistakes with their lines, and
+    Raises UsageError if there is none, StudyFileError, which lists all mistakes with their paths, and
     RunDamagedError for an archive that was changed.
     """
     archive = open_archive(name)
     file = find_study(str(name)) if archive is None else archive / STUDY_FILE
-    text, content = _parsed(file)
+    content = _parsed(file)
     try:
         study = schema.Study.model_validate(content)
     except ValidationError as error:
-        raise StudyFileError(str(file), text, [*_mistakes(error, content), *_further(error, content)]) from None
+        raise StudyFileError(str(file), content, [*_mistakes(error, content), *_further(error, content)]) from None
     if archive is not None:  # its runs are all it has
         study = study.model_copy(update={"reuse": schema.ReuseTable()})
     suite, mistakes = planned_suite(study.suite) if archive is None else (_packed_suite(archive), [])
     cells, found = _checked(study, suite)
     if mistakes := [*mistakes, *found]:
-        raise StudyFileError(str(file), text, mistakes)
+        raise StudyFileError(str(file), content, mistakes)
     if archive is None:
         return LoadedStudy(file, study, suite, tuple(cells))
     keys, home = Pack.read(archive).keys, str(archive / RUNS)
@@ -95,19 +93,16 @@ def _packed_suite(archive: Path) -> PlannedSuite:
     return PlannedSuite(str(suite["identity"]), dict(suite["items"]), None, "the archive", here=False)
 
 
-def _parsed(file: Path) -> tuple[str, dict[str, Any]]:
-    """Text and content of a file. Raises UsageError for what is no TOML."""
+def _parsed(file: Path) -> dict[str, Any]:
+    """The content of a file. Raises UsageError for a text that is no TOML."""
     try:
-        text = file.read_text(encoding="utf-8-sig")
-        return text, tomllib.loads(text)
+        return tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except UnicodeDecodeError as error:
         raise UsageError(f"{file} is no UTF-8 text: {error}") from error
     except RecursionError:
         raise UsageError(f"{file}: its lists or tables nest too deeply") from None
     except tomllib.TOMLDecodeError as error:
-        said, _, place = str(error).removesuffix(")").partition(" (at ")
-        line = found[1] if (found := re.search(r"line (\d+)", place)) else str(text.count("\n") + 1)
-        raise UsageError(f"{file}:{line}: {said} ({place}). The file must be TOML 1.0") from error
+        raise UsageError(f"{file}: {error}. The file must be TOML 1.0") from error
 
 
 def _checked(study: schema.Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]]:

@@ -9,8 +9,7 @@ from probe_kit.hooks.registry import get_family
 from probe_kit.statistics.label_permutations import smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.study.expansion import Member, members
-from probe_kit.study.mistakes import Mistake, each_unknown
-from probe_kit.study.places import Place
+from probe_kit.study.mistakes import Mistake, Place, each_unknown
 from probe_kit.study.planned_suite import PlannedSuite, slugs
 from probe_kit.study.schema import BlockTable, ModelTable, ProbesTable, Study, TableKind, TableTable
 

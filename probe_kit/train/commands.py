@@ -172,14 +172,11 @@ _STATES = {
     "other": "read with --probes RUN=KEY",
     "label": "of a label of your own, read with `probe-kit retention RUN --target COLUMN`",
     "other episodes": "of other episodes than the run has now",
-    "other version": "written by another version of probe_kit, which this one cannot read",
 }
 
 
 def _probes_in_words(probes: "StoredProbes", found: "Inventory") -> str:
     state, fitted = _STATES[probes.state], f"fitted {probes.created[:16].replace('T', ' ')} UTC"
-    if not probes.views:
-        return f"{state}; {fitted}"
     parts = [f"{state}; views {', '.join(probes.views)}", f"target {probes.target}"]
     parts += [f"{probes.permutations} label permutations"]
     parts += [f"{probes.token_permutations} for tokens"] * (probes.token_permutations > 0)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast, overload
+from typing import cast, overload
 
 import numpy as np
 
@@ -286,7 +286,7 @@ def _settings(
     if not run.streams:
         raise NoProbesError(f"{run.location} has no activations to probe: of {run.model!r} no stream was stored.")
     return ProbeSettings(
-        model=_settled_name(run),
+        model=run.model,
         random_weights=run.random_weights,
         weights=run.weights_sha256,
         suite=run.suite,
@@ -302,12 +302,6 @@ def _settings(
         folds=folds,
         incomplete=incomplete,
     )
-
-
-def _settled_name(run: RunReader) -> str:
-    """What never changes of a run's name: a label may. In schema 3 it could not, and keys were made with it."""
-    settings: Mapping[str, Any] = getattr(run, "settings", {})
-    return str(settings.get("label", run.model))
 
 
 def _fit(sweep: _Sweep) -> ProbeResults:

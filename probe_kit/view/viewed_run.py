@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.extract import Run
-from probe_kit.extract.store.format.commits import WITH_CONTROL_STEPS
 from probe_kit.extract.store.recorded.scene_only import check_scene_run
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
@@ -72,11 +71,6 @@ class ViewedRun:
     def view(self) -> str | None:
         """The view whose probes are shown: the first one that was probed."""
         return None if self.results is None else self.results.settings.views[0]
-
-    @property
-    def has_control_steps(self) -> bool:
-        """Whether the run holds the control step of every inference."""
-        return self.run.root.schema >= WITH_CONTROL_STEPS
 
     @cached_property
     def captured_inferences(self) -> NDArray[np.intp]:

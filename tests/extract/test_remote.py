@@ -12,7 +12,6 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import RunDamagedError, RunNotFoundError, SettingsMismatchError, StoreError
 from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, seal, verify_run
-from probe_kit.extract.extraction import SingleWriterWarning
 from probe_kit.extract.run_layout import COLUMNS
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
@@ -111,13 +110,23 @@ def test_other_settings_are_refused_in_a_bucket_too(suite: Suite, bucket: str) -
         extract_run(replace(settings, seed=1), f"{bucket}/run")
 
 
-def test_a_store_that_ignores_conditions_is_refused_for_several_writers(suite: Suite, deaf_bucket: str) -> None:
-    settings = ExtractSettings("expert", suite=suite.folder, items=2, scene=SHORT)
-    with pytest.raises(StoreError, match=r"ignores conditional puts.*--workers"):
-        extract_run(replace(settings, workers=2), f"{deaf_bucket}/run")
-    with pytest.warns(SingleWriterWarning, match="no second process"):
-        run = extract_run(settings, f"{deaf_bucket}/run")
-    assert len(run.episodes) == 4
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_store_that_ignores_conditions_is_refused_before_a_run_is_begun(
+    suite: Suite, deaf_bucket: str, workers: int
+) -> None:
+    settings = ExtractSettings("expert", suite=suite.folder, items=2, scene=SHORT, workers=workers)
+    with pytest.raises(StoreError, match=r"ignores conditional puts.*Use another store, or a folder"):
+        extract_run(settings, f"{deaf_bucket}/run")
+    assert not locate(f"{deaf_bucket}/run").exists("run.json")
+
+
+def test_a_run_is_not_continued_in_a_store_that_ignores_conditions(whole: Path, deaf_bucket: str) -> None:
+    here, there = locate(whole), locate(f"{deaf_bucket}/run")
+    for key in here.keys(""):
+        there.write(key, here.read(key))
+    with pytest.raises(StoreError, match=r"created run\.json a second time"):
+        there.check_exclusive("run.json")
+    here.check_exclusive("run.json")
 
 
 @pytest.mark.slow

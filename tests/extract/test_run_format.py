@@ -1,4 +1,4 @@
-"""What schema 4 stores besides numbers: content of items, control steps of inferences, seconds, and a label."""
+"""The stored facts besides numbers: content of items, control steps of inferences, seconds, and a label."""
 
 import json
 import shutil

@@ -15,7 +15,7 @@ from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hooks import Site
 from probe_kit.intervene.store.answers import find_stored
 from probe_kit.suite import Suite
-from probe_kit.train import load_results, train_probes
+from probe_kit.train import load_results
 from probe_kit.train.results.store import read_probes
 from tests.extract.contents import objects
 from tests.support.little_run import episode, little_plan, little_writer
@@ -119,46 +119,6 @@ def test_reading_with_stale_listings_gives_the_same_or_an_error_by_name(
     for ask, right in zip(readings(kept), expected, strict=True):
         with suppress(ProbeKitError):
             assert ask() in right
-
-
-def test_nothing_is_called_damaged_because_a_listing_misses_it(suite: Suite, bad_server: BadServer) -> None:
-    run = f"{bad_server.url}/run"
-    write(run, suite)
-    data = [key for key in locate(run).keys("") if key.startswith("data.zarr/") and "/c/" in key]
-    for key in data[:3]:
-        locate(run).write(key, locate(run).read(key))  # now they are the newest
-    stale(bad_server, 3)
-    assert verify_run(run).problems == ()
-    assert len(open_run(run).episodes) == EPISODES
-
-
-@pytest.mark.slow
-def test_probes_and_interventions_are_the_same_although_a_store_keeps_parts_and_fails(
-    little_runs: Path, kept: Run, bad_server: BadServer
-) -> None:
-    """Of every object one upload is kept in half; every ninth request is refused."""
-    before = train_probes(open_run(little_runs / "run"), permutations=3).scores
-    seen, count = set[str](), 0
-
-    def ail(method: str, path: str) -> str | None:
-        nonlocal count
-        count += 1
-        if method == "PUT" and path not in seen:
-            seen.add(path)
-            return "half"
-        return "busy" if count % 9 == 0 else None
-
-    bad_server.day.ail = ail
-    for _ in range(30):
-        try:
-            found = train_probes(kept, permutations=3)
-            break
-        except ProbeKitError:
-            continue
-    bad_server.day.ail = lambda *_: None
-    assert bad_server.day.seen["half"] > 5
-    assert found.scores.to_csv() == before.to_csv()
-    assert verify_run(kept.location, deep=True).problems == ()
 
 
 @pytest.mark.parametrize("step", [8, pytest.param(1, marks=pytest.mark.slow)], ids=["an eighth", "all"])

@@ -80,7 +80,7 @@ def drawn(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 @pytest.mark.slow
-def test_nothing_is_clipped_footers_are_one_line_and_the_width_is_used(drawn: Drawn) -> None:
+def test_nothing_is_clipped_and_the_width_is_used(drawn: Drawn) -> None:
     table, figures = drawn
     for name, figure in figures.items():
         figure.draw_without_rendering()
@@ -95,7 +95,9 @@ def test_nothing_is_clipped_footers_are_one_line_and_the_width_is_used(drawn: Dr
                 box = legend.get_window_extent()
                 assert frame.x0 <= box.x0 < box.x1 <= frame.x1, f"{name}: legend"
                 assert frame.y0 <= box.y0 < box.y1 <= frame.y1, f"{name}: legend"
-        assert "\n" not in figure.get_supxlabel(), name
+        below = figure._supxlabel.get_window_extent()  # type: ignore[attr-defined]
+        assert frame.x0 <= below.x0 < below.x1 <= frame.x1, f"{name}: caption"
+        assert all(below.y1 < axes.bbox.y0 for axes in figure.axes if axes.get_visible()), f"{name}: caption"
         suites = {row.run.suite for row in table.rows}
         assert any(suite in figure.caption for suite in suites), name  # type: ignore[attr-defined]
 

@@ -1,4 +1,4 @@
-"""A small study file, and mistakes in it: what is replaced, and what is said of the line marked `# here`."""
+"""A small study file, and mistakes in it: the replaced text, and the message on the field marked `# here`."""
 
 BASE = """\
 schema = 1

@@ -10,7 +10,6 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.retention import retention_table
-from probe_kit.retention.displays.base.style import text_width
 from probe_kit.study import LoadedStudy, make_figures
 from probe_kit.study.figures import draw_overview
 from probe_kit.study.tables.rates import domain_scores
@@ -47,7 +46,6 @@ def test_the_overview_says_what_has_no_episodes_and_takes_names_as_they_are(tmp_
     assert [[text.get_text() for text in axes.texts] for axes in (physical, normative)] == [[], ["no episodes"]]
     figure.savefig(tmp_path / "overview.svg")
     assert name in [text.get_text() for text in physical.get_yticklabels()]
-    assert text_width(name, 8) > text_width("a b", 8)
 
 
 def test_figures_are_drawn_by_name_from_stored_runs(played: LoadedStudy, tmp_path: Path) -> None:

@@ -91,8 +91,8 @@ def _counted(rows: Sequence[Row]) -> str:
 def growth_at(location: Location, asked: Sequence[Row]) -> Growth | None:
     """How the run at `location` would grow by a plan with these rows; None if none is there or has a plan.
 
-    Raises as `further_rows`, SettingsMismatchError for a run of a former schema, and RunDamagedError if what is
-    there was changed.
+    Raises as `further_rows`, ActivationsLeftOutError for a copy without activations, and RunDamagedError if the
+    stored run was changed.
     """
     if not location.exists(RUN_FILE):
         return None

@@ -5,7 +5,7 @@ label.json    a record of its own: the label, and the identity of the run that i
 
 from pathlib import Path
 
-from probe_kit.errors import RunDamagedError, UsageError
+from probe_kit.errors import RunDamagedError
 from probe_kit.extract.run_layout import LABEL_FILE
 from probe_kit.extract.settings import check_label
 from probe_kit.extract.store.format.hashes import as_record, expect, read_record
@@ -13,22 +13,14 @@ from probe_kit.extract.store.format.root import Root, read_root
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 
-_WITH_LABEL_FILE = 4
-"""The first schema with a label outside `run.json`."""
-
 
 def label_run(path: Path | str | Location, label: str) -> None:
     """Give the run at `path` another label; nothing else of it changes.
 
-    label: 1 to 200 printable characters. Raises UsageError for another label or a run of schema 3, whose label is
-    part of its identity, RunNotFoundError if there is no run, RunDamagedError if `run.json` was changed.
+    label: 1 to 200 printable characters. Raises UsageError for another label, RunNotFoundError if there is no run,
+    RunDamagedError if `run.json` was changed.
     """
     root = read_root(locate(path))
-    if root.schema < _WITH_LABEL_FILE:
-        raise UsageError(
-            f"{root.location} has schema {root.schema}, in which the label is part of the run's identity. It "
-            "cannot be changed; extract the run again to have it labelled otherwise"
-        )
     check_label(label)
     root.location.write_record(LABEL_FILE, label_record(root.identity, label))
 
@@ -40,8 +32,6 @@ def label_record(identity: str, label: str) -> bytes:
 
 def read_label(root: Root) -> str:
     """The label of a run. Raises RunDamagedError if its record is missing, was changed, or is of another run."""
-    if root.schema < _WITH_LABEL_FILE:
-        return str(root.settings.get("label", root.settings["model"]))
     name = f"{root.location}/{LABEL_FILE}"
     advice = f"Write it anew: `probe-kit run label {root.location} LABEL`"
     try:

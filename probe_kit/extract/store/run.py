@@ -39,7 +39,6 @@ from probe_kit.extract.store.format.checking import CheckedStore
 from probe_kit.extract.store.format.columns import Columns, find_columns
 from probe_kit.extract.store.format.commits import (
     LENS_MARGINS,
-    WITH_CONTROL_STEPS,
     Commit,
     committed_sums,
     read_commits,
@@ -223,7 +222,7 @@ class Run:
     def suite_parent(self) -> str | None:
         """Content hash of the suite that `suite` was selected from.
 
-        None for a whole suite, and in runs of schema 3, which do not say it.
+        None for a whole suite.
         """
         return self.root.suite_parent
 
@@ -232,7 +231,7 @@ class Run:
         """One row per planned item, played or not: `item_id`, `category`, `group_id`, `pair_id`, `content_sha256`.
 
         Items of two runs are the same where `item_id` and `content_sha256` are equal. The hash is that of
-        `suite.Item.content_sha256`, None in runs of schema 3. Two wordings of an item are one row.
+        `suite.Item.content_sha256`, None in runs that show no suite. Two wordings of an item are one row.
         """
         names = {name: name for name in ("item_id", "category", "group_id", "pair_id")}
         names["item_content_sha256"] = "content_sha256"
@@ -385,8 +384,8 @@ class Run:
         """One row per committed episode: the plan's columns, then the outcome's, then how long it took.
 
         `seconds_inference` and `seconds_simulation` are wall-clock seconds: of the model's calls (of a call for
-        several observations its share), and of setting up, simulating and drawing. NaN in runs of schema 3, and
-        where the folder `times` was deleted. They differ between runs of one identity.
+        several observations its share), and of setting up, simulating and drawing. NaN where the folder
+        `times` was deleted. They differ between runs of one identity.
         """
         plan = self.root.planned
         rows = [
@@ -411,13 +410,7 @@ class Run:
         recordings it is the number of the frame in its episode. N: most
         inferences of an episode; 0 for scripts. Captured inference `call` is column `call`. An episode in which
         nothing moves (`ask`, or without acting) has one inference, at step 0.
-        Raises UsageError for a run of schema 3, which does not hold them.
         """
-        if self.root.schema < WITH_CONTROL_STEPS:
-            raise UsageError(
-                f"{self.location} has schema {self.root.schema}, which does not hold the control steps of "
-                "inferences. Extract it again to have them"
-            )
         stored = [commit["control_steps"] for commit in self.commits()]
         steps = np.full((len(stored), max((len(own) for own in stored), default=0)), -1, np.int64)
         for row, own in enumerate(stored):
@@ -429,7 +422,7 @@ class Run:
         """(E, L) of the logit lens: logit of the letter for left minus that for right, at every layer.
 
         Of questions that are answered by letter, with left named first. The last layer gives the model's answer.
-        None for every other run; NaN for episodes that were asked before probe_kit stored it.
+        None for every other run; NaN for episodes without one.
         """
         stored = [commit.get(LENS_MARGINS, []) for commit in self.commits()]
         layers = max(map(len, stored), default=0)

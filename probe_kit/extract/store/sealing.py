@@ -61,7 +61,7 @@ def _seal(run: Run) -> bool:
 
 
 def _remove_former_seals(run: Run) -> None:
-    """Of other commits: an object store may have listed them too late to be removed when this one was made."""
+    """Remove seals of other commits: a process that saw fewer may have written one late to an object store."""
     for key in run.location.keys(SEALED):
         if _SEAL.fullmatch(key) and key != seal_key(run.stamp):
             run.location.delete(key)

@@ -73,7 +73,7 @@ def read_sheet(run: Path | Location, number: int) -> FrameSheet | None:
     """The picture of episode `number` as it is stored; None if the run keeps none.
 
     Raises RunDamagedError if it is not the one that was stored when the episode was committed, or is lost alone.
-    Pictures of former versions, and those beside arrays that are no run, are bound to nothing.
+    Pictures of arrays that are no run are bound to nothing.
     """
     location, key = locate(run), thumbnail_key(number)
     commit = read_own_commit(location, number)

@@ -203,10 +203,6 @@ class RunWriter:
         """Not in a run that was begun before there were any: all of its episodes stay alike."""
         return has_trajectories(self.root)
 
-    def several_may_write(self) -> bool:
-        """Whether the location keeps the first of two objects of one key, which commits rely on."""
-        return not self.location.create(RUN_FILE, self.location.read(RUN_FILE))
-
     @contextmanager
     def owned(self) -> Iterator[None]:
         """Work on the run while the body runs; failures of earlier attempts are forgotten."""

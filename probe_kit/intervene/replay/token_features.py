@@ -26,7 +26,7 @@ class TokenFeatures:
     """The tokens of one category at one site and role, of N episodes.
 
     episodes, groups: (N,). left: (N,) whether the correct picture lies left. tokens: at position t the role's
-    t-th token, see `train.erasure.Tokens`.
+    t-th token, see `linear_erasure.PaddedTokens`.
     """
 
     episodes: tuple[str, ...]

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from probe_kit.extract.run_layout import INTERVENTIONS
-from probe_kit.extract.store.format.bundles import PARTIAL, Bundle, read_bundles
+from probe_kit.extract.store.format.bundles import PARTIAL, Bundle
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.intervene.kinds.registry import KINDS
-from probe_kit.intervene.store.answers import stored_interventions
-from probe_kit.intervene.store.former_words import current_settings
-from probe_kit.intervene.store.settings import FORMAT
+from probe_kit.intervene.store.answers import read_interventions, stored_interventions
 from probe_kit.train.data.run_reader import RunReader
 
 COMMON = frozenset(
@@ -21,30 +19,26 @@ COMMON = frozenset(
 
 @dataclass(frozen=True)
 class ListedIntervention:
-    """One stored intervention, or what is known of one written by another version.
+    """One stored intervention.
 
     state: `used` by verdicts, tables and figures, or of a kind that none of them reads; `other` if others say all
-    that it says, of more episodes or newly; `other episodes` if the run has others by now; `other version` if this
-    version cannot read it. parameters: the settings of its kind alone, as stored.
+    that it says, of more episodes or newly; `other episodes` if the run has others by now. parameters: the
+    settings of its kind alone, as stored.
     """
 
     key: str
     state: str
     created: str
-    kind: str = ""
-    categories: tuple[str, ...] = ()
-    items: int | None = None
-    wording: str = ""
-    parameters: Mapping[str, Any] | None = None
+    kind: str
+    categories: tuple[str, ...]
+    items: int | None
+    wording: str
+    parameters: Mapping[str, Any]
 
     @property
     def words(self) -> str:
         """In a line."""
-        if not self.kind:
-            return f"written by another version of probe_kit, which this one cannot read; {self._when}"
-        own = [
-            f"{name} {_plain(value)}" for name, value in (self.parameters or {}).items() if value not in (None, [])
-        ]
+        own = [f"{name} {_plain(value)}" for name, value in self.parameters.items() if value not in (None, [])]
         parts = [self.kind, f"of {', '.join(self.categories)}"]
         parts += [f"{self.items} items each"] * (self.items is not None)
         parts += [f"wording {self.wording}"] * bool(self.wording)
@@ -65,7 +59,7 @@ def listed_interventions(run: Any) -> list[ListedIntervention]:
     readers: list[RunReader] = [run.in_wording(name) for name in wordings] or [run]
     current = {one.key for reader in readers for one in stored_interventions(reader)}
     used = {key for reader in readers for key in _used(reader)}
-    found = [_listed(bundle, current, used) for bundle in read_bundles(run.location, INTERVENTIONS).values()]
+    found = [_listed(bundle, current, used) for bundle in read_interventions(run.location).values()]
     return sorted(found, key=lambda one: (one.created, one.key))
 
 
@@ -89,9 +83,7 @@ def _used(run: RunReader) -> set[str]:
 
 
 def _listed(bundle: Bundle, current: set[str], used: set[str]) -> ListedIntervention:
-    settings, created = current_settings(bundle.head["settings"], FORMAT), bundle.times.get("created", "")
-    if settings.get("format") != FORMAT:
-        return ListedIntervention(bundle.key, "other version", created)
+    settings, created = bundle.head["settings"], bundle.times.get("created", "")
     state = "used" if bundle.key in used else "other" if bundle.key in current else "other episodes"
     return ListedIntervention(
         key=bundle.key,

@@ -29,12 +29,6 @@ from probe_kit.extract.store.format.bundles import (
 )
 from probe_kit.extract.store.format.hashes import as_json
 from probe_kit.extract.store.locations.location import Location
-from probe_kit.intervene.store.former_words import (
-    FORMER_FORMAT,
-    current_arrays,
-    current_certificate,
-    current_settings,
-)
 from probe_kit.intervene.store.settings import FORMAT, key_of
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.store import stamp_of_run
@@ -109,11 +103,10 @@ class ConditionOutcomes:
         return file.getvalue()
 
     @classmethod
-    def from_bytes(cls, content: bytes, former_kind: str | None = None) -> "ConditionOutcomes":
-        """Load. former_kind: the kind's name in format 1, if it was stored in that."""
+    def from_bytes(cls, content: bytes) -> "ConditionOutcomes":
+        """Load what `to_bytes` gave."""
         with np.load(BytesIO(content), allow_pickle=False) as arrays:
             found: dict[str, Any] = dict(arrays)
-        found = found if former_kind is None else current_arrays(found, former_kind)
         return cls(**{**found, "conditions": tuple(map(str, found["conditions"]))})
 
 
@@ -131,13 +124,8 @@ class StoredIntervention:
     @property
     def settings(self) -> Mapping[str, Any]:
         """What decided its numbers."""
-        return current_settings(self.bundle.head["settings"], FORMAT)
-
-    @property
-    def _former_kind(self) -> str | None:
-        """The kind's name in format 1; None of today's format."""
-        settings = self.bundle.head["settings"]
-        return str(settings["kind"]) if settings.get("format") == FORMER_FORMAT else None
+        settings: Mapping[str, Any] = self.bundle.head["settings"]
+        return settings
 
     @property
     def created(self) -> str:
@@ -146,12 +134,11 @@ class StoredIntervention:
 
     def outcomes(self) -> ConditionOutcomes:
         """What was measured. Raises RunDamagedError if it was changed."""
-        return ConditionOutcomes.from_bytes(self.bundle.read(EPISODES), self._former_kind)
+        return ConditionOutcomes.from_bytes(self.bundle.read(EPISODES))
 
     def certificate(self) -> dict[str, Any]:
         """What was loaded and checked. Raises RunDamagedError if it was changed."""
-        found = self.bundle.read_json(CERTIFICATE)
-        return found if self._former_kind is None else current_certificate(found, self._former_kind)
+        return self.bundle.read_json(CERTIFICATE)
 
 
 def save(
@@ -179,19 +166,25 @@ def is_stored(run: Location, key: str) -> bool:
     return run.exists(f"{INTERVENTIONS}/{key}/{HEAD}")
 
 
+def read_interventions(run: Location) -> dict[str, Bundle]:
+    """Every complete intervention by key. Raises RunDamagedError if one was changed or has another format."""
+    bundles = read_bundles(run, INTERVENTIONS)
+    for key, bundle in bundles.items():
+        bundle.check_format(FORMAT)
+        if (key_of_settings := key_of(bundle.head["settings"])) != key:
+            raise bundle.head_damaged(f"has the settings of {key_of_settings}")
+    return bundles
+
+
 def stored_interventions(run: RunReader, kind: str | None = None) -> list[StoredIntervention]:
     """Those of the episodes that the run has now, in the wording it is in, oldest first.
 
-    kind: only these. Those of another format, written by another version of probe_kit, are passed over. Raises
-    RunDamagedError if any of the run was changed or lost its settings.
+    kind: only these. Raises RunDamagedError if any of the run was changed, lost its settings or has another
+    format.
     """
-    found = [StoredIntervention(bundle) for bundle in read_bundles(run.location, INTERVENTIONS).values()]
-    for one in found:
-        key = key_of(one.bundle.head["settings"])
-        if key != one.key:
-            raise one.bundle.head_damaged(f"has the settings of {key}")
+    found = [StoredIntervention(bundle) for bundle in read_interventions(run.location).values()]
     wanted = {
-        "format": FORMAT, "stamp": stamp_of_run(run), "run_settings": run.settings_sha256,
+        "stamp": stamp_of_run(run), "run_settings": run.settings_sha256,
         "wording": getattr(run, "wording", None), **({} if kind is None else {"kind": kind}),
     }  # fmt: skip
     fitting = [one for one in found if all(one.settings.get(name) == value for name, value in wanted.items())]

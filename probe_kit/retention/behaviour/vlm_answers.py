@@ -32,14 +32,11 @@ MANY_BY_CLAUSE = 0.05
 """Share of answers found among other words from which the accuracy without them is shown too."""
 
 
-def read_by_clause(episodes: "pd.DataFrame", text: "pd.Series[str]") -> tuple[float | None, float | None]:
+def read_by_clause(episodes: "pd.DataFrame", text: "pd.Series[str]") -> tuple[float, float | None]:
     """The share of answers that were found among other words, and the accuracy with these as unparsable.
 
-    text: outcomes of the answers in text. The accuracy is None where the share is `MANY_BY_CLAUSE` or less; both
-    are None for runs of an earlier version, which do not store it.
+    text: outcomes of the answers in text. The accuracy is None where the share is `MANY_BY_CLAUSE` or less.
     """
-    if "parse_tier" not in episodes:
-        return None, None
     found = episodes["parse_tier"] == "clause"
     share = float(found.mean())
     return share, float(((text == "correct") & ~found).mean()) if share > MANY_BY_CLAUSE else None

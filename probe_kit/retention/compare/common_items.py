@@ -47,7 +47,7 @@ def common_items(runs: Sequence[RunReader]) -> dict[str, CommonItems]:
     """By category that all runs have, the episodes in common, of which there may be none.
 
     Items are the same where id and content hash are equal. Runs of one suite need no hashes. Nothing is in common
-    of runs of several suites if one of them holds no hashes, as runs of schema 3 and arrays do.
+    of runs of several suites if one of them holds no hashes, as arrays do.
     """
     by_content = all(has_item_content(run) for run in runs)
     if not by_content and len({run.suite for run in runs}) > 1:

@@ -91,7 +91,7 @@ class HeatTableDisplay(Display):
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with the key of colours and captions."""
         width = _CELL_WIDTH * len(self.columns) + _NAME_WIDTH * max(map(len, self.rows)) + 0.3
-        height = _ROW_HEIGHT * (len(self.rows) + 1.5) + 0.75
+        height = _ROW_HEIGHT * (len(self.rows) + 1.5) + 0.9
         axes, figure = axes_for(ax, max(6.2, width), height)
         for number, line in enumerate(self.cells):
             for column, cell in enumerate(line):
@@ -100,7 +100,6 @@ class HeatTableDisplay(Display):
         if figure is None:
             axes.set_title(self.title + self.rule_words, fontsize=10, loc="left", pad=34)
         else:
-            figure.suptitle(self.title + self.rule_words, x=0.01, ha="left", fontsize=10)
             self._draw_key(figure)
         caption(figure, *self.certificates)
         self.ax_ = axes
@@ -139,8 +138,9 @@ class HeatTableDisplay(Display):
         labels[0], labels[-1] = f"< {self.scale * 0.2:g}", f"≥ {self.scale * 0.8:g}"
         patches = [Patch(fc=f"#{rgb}", label=label) for (_, _, rgb), label in zip(HEAT, labels, strict=True)]
         figure.legend(
-            handles=patches, loc="outside upper right", ncols=5, fontsize=7, frameon=False, handlelength=1.2,
-            columnspacing=1.2, borderaxespad=0.6, title=self.note, title_fontsize=7, alignment="left",
+            handles=patches, loc="outside upper left", ncols=5, fontsize=7, frameon=False, handlelength=1.2,
+            columnspacing=1.2, title=f"{self.title}{self.rule_words}\n{self.note}", title_fontsize=8,
+            alignment="left",
         )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from functools import partial
 from math import ceil
+from textwrap import fill
 from typing import TYPE_CHECKING
 
 from probe_kit.errors import UsageError
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 
 PARTS = {"backbone": "backbone", "action": "where the action is made"}
 _IN_A_ROW = 4
+_TITLE_LETTERS = 36
+"""Letters of a line above a map, which is 2.4 inches wide."""
 _SIDESTEP = 0.08  # of a layer, so that bars do not hide each other
 
 
@@ -144,7 +147,7 @@ def maps_side_by_side(results: Sequence[ProbeResults], names: Sequence[str], vie
             name, one = shown[place]
             display = IterationMapDisplay.from_results(one, category, view)
             drawn = draw_map(axes, display)
-            axes.set_title(f"{spell(category)}: {name}", fontsize=8, loc="left")
+            axes.set_title(fill(f"{spell(category)}: {name}", _TITLE_LETTERS), fontsize=8, loc="left")
             displays.append(display)
     figure.supylabel("iteration", fontsize=9)
     draw_scale(figure, grid, drawn, displays)

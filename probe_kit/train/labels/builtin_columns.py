@@ -106,8 +106,8 @@ ITEM_COLUMNS = {
 def builtin_column(run: RunReader, name: str) -> BuiltinColumn:
     """The built-in column `name` of a run, for every episode or captured inference that it has.
 
-    Raises UsageError for another name, for a run of which nothing such is stored, and for control steps that runs
-    of former schemas lack; NoTrajectoryError without trajectories.
+    Raises UsageError for another name and for a run of which nothing such is stored; NoTrajectoryError without
+    trajectories.
     """
     if name.startswith(SIM) and name.removeprefix(SIM) in SIM_COLUMNS:
         task, value = SIM_COLUMNS[name.removeprefix(SIM)]

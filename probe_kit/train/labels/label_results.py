@@ -151,12 +151,12 @@ class LabelControls:
         """What `to_json` gave."""
         return cls(
             tuple(
-                LabelControl(**{**one, "ci": tuple(one["ci"]), "by_step": tuple(one.get("by_step", ()))})
+                LabelControl(**{**one, "ci": tuple(one["ci"]), "by_step": tuple(one["by_step"])})
                 for one in stored["scores"]
             ),
             tuple(LabelComparison(**one) for one in stored["comparisons"]),
             stored["left_out"],
-            stored.get("untrained", ""),
+            stored["untrained"],
         )
 
 

@@ -104,7 +104,7 @@ def _current(run: RunReader) -> tuple[list[Bundle], int]:
 
 
 def is_of_label(bundle: Bundle) -> bool:
-    """Whether stored probes are of a label of one's own, in the present format."""
+    """Whether stored probes are of a label of one's own."""
     return bool(bundle.head["settings"].get("format") == LABEL_FORMAT)
 
 

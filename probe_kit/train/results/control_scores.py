@@ -130,34 +130,9 @@ class Controls:
 
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> "Controls":
-        """What `to_json` gave, also by versions with former names of the controls."""
-        stored = _in_present_words(stored)
+        """The controls that `to_json` gave."""
         return cls(
             tuple(BaselineScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["baselines"]),
             tuple(UntrainedScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["untrained"]),
             tuple(ControlComparison(**one) for one in stored["excess"]),
         )
-
-
-_FORMER_WORDS = {
-    "twin": "untrained",
-    "twin_site": "untrained_site",
-    "twin_accuracy": "untrained_accuracy",
-    "binding": "random-features",
-}
-
-
-def _in_present_words(stored: dict[str, Any]) -> dict[str, Any]:
-    """The stored controls with the keys and names of controls of today."""
-    return {
-        _FORMER_WORDS.get(part, part): [
-            {
-                _FORMER_WORDS.get(key, key): _FORMER_WORDS.get(value, value)
-                if key in ("control", "name")
-                else value
-                for key, value in one.items()
-            }
-            for one in scores
-        ]
-        for part, scores in stored.items()
-    }

@@ -17,17 +17,16 @@ from probe_kit.train.results.store import (
     read_probes,
     settings_of,
 )
-from probe_kit.train.settings import LABEL_FORMAT
 
 
 @dataclass(frozen=True)
 class StoredProbes:
-    """One set of probe results, or what is known of a set written by another version.
+    """One set of probe results.
 
     created: when they were fitted. controls: baselines and, last, `untrained: NAME`. state: `used` if `retention`
     reads them by default, `other` if it does so for their key, `label` if they are of a label of one's own,
-    `other episodes` if the run has others by now, `other version` if this version cannot read them. wording: which
-    one of the run's they are of, empty where the run is in its items' own words.
+    `other episodes` if the run has others by now. wording: which one of the run's they are of, empty where the run
+    is in its items' own words.
     """
 
     key: str
@@ -114,10 +113,8 @@ def _used(run: RunReader) -> str | None:
 
 def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str | None]) -> StoredProbes:
     key, created = bundle.key, bundle.times.get("created", "")
-    if bundle.head["settings"].get("format") == LABEL_FORMAT:
-        return _of_label(readers, bundle, created)
     if not is_ours(bundle):
-        return StoredProbes(key, "other version", created)
+        return _of_label(readers, bundle, created)
     settings = settings_of(bundle)
     current = [run for run in readers if is_current(settings, run)]
     state = "used" if key in used else "other" if current else "other episodes"

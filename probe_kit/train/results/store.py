@@ -25,7 +25,6 @@ from probe_kit.extract.store.format.bundles import (
     tidy_bundle,
     write_bundle,
 )
-from probe_kit.extract.store.format.stored_words import in_current_words
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.hooks.contract.sites import Site
@@ -36,7 +35,7 @@ from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_directions import StoredDirections, save_directions
 from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
-from probe_kit.train.settings import FORMAT, ProbeSettings, key_of
+from probe_kit.train.settings import FORMAT, LABEL_FORMAT, ProbeSettings, key_of
 
 SCORES, DECISIONS = "scores.csv", "decisions.npz"
 DIRECTIONS, CONTROLS = PROBE_DIRECTIONS, "controls.json"
@@ -101,9 +100,9 @@ def load_results(run: RunReader, key: str | None = None, target: Target = "corre
     The newest are of the first captured inference; those of later ones are read by their key.
 
     key: as `probe-kit run show` lists it; its beginning will do. Newest: those that were asked for last, whether
-    they were fitted then or loaded. Results of another format, written by another version of probe_kit, are
-    passed over. Raises NoProbesError if there are none, UsageError for a key that is not there, and
-    RunDamagedError if any results of the run were changed, lost their settings, or are of other activations.
+    they were fitted then or loaded. Raises NoProbesError if there are none, UsageError for a key that is not
+    there, and RunDamagedError if any results of the run were changed, lost their settings, have another format, or
+    are of other activations.
     """
     location = run.location
     probes = read_probes(location)
@@ -128,7 +127,7 @@ def is_current(settings: ProbeSettings, run: RunReader) -> bool:
 def _why_none(run: RunReader, target: Target, stored: int) -> str:
     if not run.streams:
         return f"{run.location} has no activations to probe: of {run.model!r} no stream was stored."
-    others = f" (of {stored} stored, none: other episodes, another target or another version)" if stored else ""
+    others = f" (of {stored} stored, none: other episodes or another target)" if stored else ""
     return (
         f"{run.location} has no probes for target {target!r} on its episodes{others}. "
         f"Run `probe-kit train {run.location}`."
@@ -136,9 +135,8 @@ def _why_none(run: RunReader, target: Target, stored: int) -> str:
 
 
 def _rank(bundle: Bundle) -> tuple[str, str, str]:
-    """What is newest has the highest; results of former versions count as asked for when they were made."""
-    created = bundle.times.get("created", "")
-    return bundle.times.get("asked", created), created, bundle.key
+    """A key to sort by: the newest results have the highest."""
+    return bundle.times.get("asked", ""), bundle.times.get("created", ""), bundle.key
 
 
 def _ours(probes: Mapping[str, Bundle]) -> dict[str, Bundle]:
@@ -146,7 +144,7 @@ def _ours(probes: Mapping[str, Bundle]) -> dict[str, Bundle]:
 
 
 def is_ours(bundle: Bundle) -> bool:
-    """Whether stored probes are of this version's format."""
+    """Whether stored probes are of sides, not of a label of one's own."""
     return bool(bundle.head["settings"].get("format") == FORMAT)
 
 
@@ -177,7 +175,7 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
             **{
                 **found,
                 "sites": tuple(Site.parse(str(name)) for name in found["sites"]),
-                "parts": tuple(str(part) for part in found.get("parts", ())),
+                "parts": tuple(str(part) for part in found["parts"]),
             }
         )
         for pair, found in members.items()
@@ -185,17 +183,21 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
 
 
 def read_probes(run: Location) -> dict[str, Bundle]:
-    """Every complete result by key, of whatever version. Raises RunDamagedError for one that was changed."""
+    """Every complete result by key, those of labels too.
+
+    Raises RunDamagedError for one that was changed or has another format.
+    """
     found = read_bundles(run, PROBES)
     for key, bundle in found.items():
         if (own := key_of(bundle.head["settings"])) != key:
             raise bundle.head_damaged(f"has the settings of {own}")
+        bundle.check_format(FORMAT, LABEL_FORMAT)
     return found
 
 
 def settings_of(bundle: Bundle) -> ProbeSettings:
-    """The settings of results of this version's format. Raises RunDamagedError."""
-    stored = in_current_words(bundle.head["settings"], "probes")
+    """The settings of results of sides. Raises RunDamagedError."""
+    stored = bundle.head["settings"]
     try:
         lists = {name: tuple(stored[name]) for name in ("categories", "views")}
         return ProbeSettings(**{**stored, **lists})

@@ -45,7 +45,7 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
     return {
         "number": number,
         "frames": _frames(viewed, number, row),
-        "inferences": _inference_steps(viewed, position, calls),
+        "inferences": _inference_steps(viewed, position),
         "log_odds": None if found is None else pack_log_odds(found.values),
         "refitted": None if found is None else _refitted(viewed, row, calls),
         "held_out": found is None or found.held_out,
@@ -70,10 +70,8 @@ def _lost_words(row: dict[str, Any]) -> int:
     return 0 if lost is None or lost != lost else int(lost)
 
 
-def _inference_steps(viewed: ViewedRun, position: int, calls: int) -> list[int]:
-    """The control step of every inference; of old runs that of the first alone is known, if it was captured."""
-    if not viewed.has_control_steps:
-        return [0][:calls]
+def _inference_steps(viewed: ViewedRun, position: int) -> list[int]:
+    """The control step of every inference of an episode."""
     own = viewed.run.control_steps[position]
     return [int(step) for step in own[own >= 0]]
 

@@ -8,8 +8,7 @@ import pytest
 from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.kinds.closed_loop.effects import ClosedLoopEffect
 from probe_kit.intervene.kinds.closed_loop.table import closed_loop_sentences
-from probe_kit.intervene.kinds.erase.effects import ErasureEffect
-from probe_kit.intervene.kinds.erase.table import erasure_sentences
+from probe_kit.intervene.kinds.erase import ErasureEffect, erasure_sentences
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
 from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict, classify_use
 from probe_kit.intervene.kinds.image_swap.words import image_swap_sentences, instruction_swap_sentences

@@ -8,10 +8,14 @@ import pytest
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
+from probe_kit.errors import RunDamagedError
 from probe_kit.extract import Run, open_run
-from probe_kit.intervene import ConceptErasure, ImageSwap
+from probe_kit.extract.run_layout import INTERVENTIONS
+from probe_kit.extract.store.format.bundles import write_bundle
+from probe_kit.intervene import ConceptErasure, ImageSwap, load_effects
 from probe_kit.intervene.results.inventory import listed_interventions
-from probe_kit.intervene.store.settings import settings_of
+from probe_kit.intervene.store.answers import stored_interventions
+from probe_kit.intervene.store.settings import FORMAT, key_of, settings_of
 from tests.intervene.answers import follower, outcomes_of, store_outcomes
 
 
@@ -60,3 +64,13 @@ def test_what_is_of_other_episodes_or_unfinished_is_said(run: Run) -> None:
     assert "other episodes" in text
     assert "unfinished 0123456789ab" in text
     assert "1 items so far" in text
+
+
+@pytest.mark.parametrize("stored_format", [1, FORMAT + 1, None])
+def test_an_intervention_of_another_format_is_refused_by_its_name(run: Run, stored_format: int | None) -> None:
+    store(run, ImageSwap(items=2))
+    settings = {"format": stored_format, "kind": "follow"}
+    write_bundle(run.location, INTERVENTIONS, key_of(settings), {"settings": settings})
+    for read in (listed_interventions, stored_interventions, load_effects):
+        with pytest.raises(RunDamagedError, match=rf"has format {stored_format}; .* reads format {FORMAT}\. "):
+            read(run)

@@ -218,14 +218,6 @@ def results(run: Run) -> LabelResults:
     return load_label_results(run, target="sim.tool_y")
 
 
-def test_results_stored_before_scores_by_step_were_kept_show_none(results: LabelResults) -> None:
-    stored = results.controls.to_json()
-    for one in stored["scores"]:
-        del one["by_step"]
-    old = results.with_controls(type(results.controls).from_json(stored))
-    assert StepScoresDisplay.from_results(old).controls == {}
-
-
 def test_a_label_of_a_run_without_an_action_has_a_section_that_says_so(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -66,26 +66,3 @@ def test_json_gives_the_same_controls_back() -> None:
     excess = ControlComparison("untrained", "color", "mean", "backbone.01.residual", 0.6, 0.2)
     controls = Controls((baseline("pixels", None),), (untrained("backbone.01.residual", True),), (excess,))
     assert Controls.from_json(json.loads(json.dumps(controls.to_json()))) == controls
-
-
-def test_controls_of_former_versions_are_read_under_the_names_of_today() -> None:
-    excess = ControlComparison("random-features", "color", "mean", "backbone.01.residual", 0.6, 0.2)
-    other = ControlComparison("untrained", "color", "mean", "backbone.01.residual", 0.5, 0.01)
-    today = Controls(
-        (baseline("random-features"), baseline("pixels")),
-        (untrained("backbone.01.residual", True),),
-        (excess, other),
-    )
-    former = json.dumps(today.to_json())
-    for now, before in (
-        ('"random-features"', '"binding"'),
-        ('"control": "untrained"', '"control": "twin"'),
-        ('"untrained": [', '"twin": ['),
-        ('"untrained": "', '"twin": "'),
-        ("untrained_site", "twin_site"),
-        ("untrained_accuracy", "twin_accuracy"),
-    ):
-        assert now in former
-        former = former.replace(now, before)
-    assert "untrained" not in former
-    assert Controls.from_json(json.loads(former)) == today

@@ -1,11 +1,8 @@
-import shutil
 from collections.abc import Callable
 
-from probe_kit.extract.store.format.bundles import write_bundle
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, train_probes
 from probe_kit.train.results.inventory import inventory
-from probe_kit.train.settings import key_of
 
 PlantedRun = Callable[..., ArrayRun]
 
@@ -25,13 +22,9 @@ def test_a_run_lists_its_probes_oldest_first_and_which_are_used(planted_run: Pla
     assert found.streams["expert"] == "2 layers × 2 iterations, width 8; views mean"
 
 
-def test_probes_of_other_episodes_and_other_versions_are_named(planted_run: PlantedRun) -> None:
+def test_probes_of_other_episodes_are_named(planted_run: PlantedRun) -> None:
     run = planted_run()
-    results = train_probes(run, permutations=0)
+    train_probes(run, permutations=0)
     shorter = {pair: array[:60] for pair, array in run.features.items()}
     fewer = ArrayRun(run.path, run.model, run.suite, run.episodes[:60], shorter)
     assert [probes.state for probes in inventory(fewer).probes] == ["other episodes"]
-    shutil.rmtree(run.path / "probes" / results.key)
-    older = {"format": 1}
-    write_bundle(run.location, "probes", key_of(older), {"settings": older}, times={"created": "2020"})
-    assert [(probes.state, probes.views) for probes in inventory(run).probes] == [("other version", ())]

@@ -1,4 +1,3 @@
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -8,13 +7,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.extract.store.format.bundles import write_bundle
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, load_results, save_results, train_probes
-from probe_kit.train.settings import key_of
-from tests.support.rehashing import write_record
+from probe_kit.train.labels.label_store import stored_targets
+from probe_kit.train.results.inventory import inventory
+from probe_kit.train.settings import FORMAT, key_of
 
 PlantedRun = Callable[..., ArrayRun]
 
@@ -127,20 +127,6 @@ def test_the_same_probes_have_the_same_bytes_whenever_they_were_fitted(
     assert (folder / "times.json").read_bytes() != times
 
 
-def test_probes_of_before_times_had_a_record_are_read_and_ranked(planted_run: PlantedRun) -> None:
-    run = planted_run()
-    old, new = train_probes(run, permutations=1), train_probes(run, permutations=2)
-    folder = run.path / "probes" / old.key
-    head = json.loads((folder / "settings.json").read_text(encoding="utf-8"))
-    write_record(folder / "settings.json", {**head, "created": "2020-01-01", "asked": "2999-01-01"})
-    (folder / "times.json").unlink()
-    assert (load_results(run).key, load_results(run).created) == (old.key, "2020-01-01")
-    train_probes(run, permutations=1, controls=("position",))
-    assert load_results(run).created == "2020-01-01"
-    assert not {"created", "asked"} & {*json.loads((folder / "settings.json").read_text(encoding="utf-8"))}
-    assert load_results(run, new.key).key == new.key
-
-
 def test_saving_keeps_what_is_there(planted_run: PlantedRun) -> None:
     run = planted_run()
     results = train_probes(run, permutations=0)
@@ -150,15 +136,17 @@ def test_saving_keeps_what_is_there(planted_run: PlantedRun) -> None:
     assert file.read_text(encoding="utf-8") == "edited by hand"
 
 
-def test_results_of_another_format_are_passed_over(planted_run: PlantedRun) -> None:
-    """An older version's settings have other fields; they must neither be read as ours nor stop us."""
+@pytest.mark.parametrize("stored_format", [1, FORMAT + 1, "labels-0", None])
+def test_results_of_another_format_are_refused_by_its_name(
+    planted_run: PlantedRun, stored_format: int | str | None
+) -> None:
     run = planted_run()
-    older = {"format": 1, "model": "m"}
-    write_bundle(locate(run.path), "probes", key_of(older), {"settings": older, "created": "2026", "asked": ""})
-    with pytest.raises(NoProbesError):
-        load_results(run)
-    newer = train_probes(run, permutations=2)
-    assert load_results(run).key == newer.key
+    train_probes(run, permutations=2)
+    other = {"format": stored_format, "model": "m"}
+    write_bundle(locate(run.path), "probes", key_of(other), {"settings": other})
+    for read in (load_results, inventory, stored_targets):
+        with pytest.raises(RunDamagedError, match=rf"has format {stored_format}; .* reads format 4 or labels-1"):
+            read(run)
 
 
 def test_probes_that_are_asked_for_again_are_the_newest(planted_run: PlantedRun) -> None:

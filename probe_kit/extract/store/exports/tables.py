@@ -9,7 +9,6 @@ import numpy as np
 
 from probe_kit._system.optional_dependencies import require
 from probe_kit.extract.store.exports.vectors import POOLED, Block, StreamChoice, blocks
-from probe_kit.extract.store.format.commits import WITH_CONTROL_STEPS
 from probe_kit.extract.store.run import Run
 
 KEYS = ("episode_id", "item_id", "group_id", "category", "layout", "side_correct", "outcome", "source_episode")
@@ -27,7 +26,7 @@ class Origins:
         self.run = run
         self.keys = [name for name in KEYS if name in run.episodes]
         self.step = "frame" if run.recorded else "control_step"
-        self.steps = run.control_steps if run.root.schema >= WITH_CONTROL_STEPS else None
+        self.steps = run.control_steps
 
     @cached_property
     def pa(self) -> Any:
@@ -39,16 +38,15 @@ class Origins:
         """Names and types of the columns."""
         pa = self.pa
         keys = [(name, pa.int64() if name in NUMBERS else pa.string()) for name in self.keys]
-        steps = [(self.step, pa.int32())] if self.steps is not None else []
-        return [*keys, ("inference", pa.int32()), *steps, ("role", pa.string()), ("token", pa.int32())]
+        numbers = [("inference", pa.int32()), (self.step, pa.int32())]
+        return [*keys, *numbers, ("role", pa.string()), ("token", pa.int32())]
 
     def columns(self, positions: Any, inferences: Any, tokens: Any, roles: Any) -> dict[str, Any]:
         """The columns of n vectors. positions, inferences, tokens: (n,) as in `Block`. roles: (n,)."""
         pa = self.pa
         found = {name: self._cells[name].take(pa.array(positions)) for name in self.keys}
         found["inference"] = pa.array(inferences, pa.int32())
-        if self.steps is not None:
-            found[self.step] = pa.array(self.steps[positions, inferences], pa.int32())
+        found[self.step] = pa.array(self.steps[positions, inferences], pa.int32())
         found["role"] = pa.array(roles, pa.string())
         found["token"] = pa.array(tokens, pa.int32(), mask=np.asarray(tokens) == POOLED)
         return found

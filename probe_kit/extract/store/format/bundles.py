@@ -28,7 +28,6 @@ _MAKERS = {PROBES: "train", INTERVENTIONS: "intervene"}
 HEAD, TIMES, PARTIAL = "settings.json", "times.json", ".partial"
 _KEY = re.compile(r"[0-9a-f]{12}")
 _SHORT = 8
-_TIMES = ("created", "asked")
 
 
 @dataclass(frozen=True)
@@ -111,6 +110,13 @@ class Bundle:
             raise self.damaged(name, f"holds a {type(content).__name__}, not an object")
         return content
 
+    def check_format(self, *readable: int | str) -> None:
+        """Raise RunDamagedError unless the settings say one of these formats."""
+        stored = self.head["settings"].get("format")
+        if stored not in readable:
+            words = " or ".join(map(str, readable))
+            raise self.head_damaged(f"has format {stored}; this version of probe_kit reads format {words}")
+
     def head_damaged(self, problem: str) -> RunDamagedError:
         """What is raised about the head."""
         return RunDamagedError(f"{self.location}/{self.folder}/{HEAD} {problem}. {_advice(self.folder)}")
@@ -183,8 +189,7 @@ def read_bundle(location: Location, home: str, key: str) -> Bundle:
     folder = f"{home}/{key}"
     name, advice = f"{location}/{folder}/{HEAD}", _advice(folder)
     head = _read_own(location, home, key, HEAD)
-    former = {part: head.pop(part) for part in _TIMES if part in head}  # where heads of former versions said it
-    times = former or _read_own(location, home, key, TIMES)
+    times = _read_own(location, home, key, TIMES)
     if strange := [part for part, value in times.items() if not isinstance(value, str)]:
         raise RunDamagedError(f"{location}/{folder} has no time as {strange[0]!r}. {advice}")
     expect(head, {"settings": dict, "files": dict}, name, advice)

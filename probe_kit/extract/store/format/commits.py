@@ -18,7 +18,6 @@ from probe_kit.extract.store.format.hashes import (
 )
 from probe_kit.extract.store.format.left_out import is_left_out
 from probe_kit.extract.store.format.root import Root
-from probe_kit.extract.store.format.stored_words import in_current_words
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.hashing import sha256_json
 
@@ -29,13 +28,10 @@ _PARTS = {
     "episode_id": str,
     "outcome": dict,
     "roles": list,
+    "control_steps": list,
     "provenance": str,
     "objects": dict,
 }
-WITH_CONTROL_STEPS = 4
-"""The first schema whose commits hold the control step of every inference."""
-_WITH_PLANS = 5
-"""The first schema whose commits name the plan record that added their episode."""
 FRAME_COUNT = "frames"
 """In a commit: how many frames its picture holds, where it holds all of the episode."""
 LENS_MARGINS = "lens_margins"
@@ -105,9 +101,6 @@ def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
     name = f"{root.location}/{key}"
     commit = read_record(raw, name, redo(number))
     expect(commit, _PARTS, name, redo(number))
-    if root.schema >= WITH_CONTROL_STEPS:
-        expect(commit, {"control_steps": list}, name, redo(number))
-    commit["outcome"] = in_current_words(commit["outcome"], "outcome")
     planned = root.planned.get(number)
     if planned is None:
         raise RunDamagedError(
@@ -115,9 +108,8 @@ def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
             f"{PLANS} that plans it, or repeat the `probe-kit extract` that let the run grow; a commit of another "
             "run is to be removed"
         )
-    expected = {"run": root.identity, "episode": number, "episode_id": planned["episode_id"]}
-    if root.schema >= _WITH_PLANS:
-        expected["plan"] = root.stored_plan.hash_of(number)
+    plan = root.stored_plan.hash_of(number)
+    expected = {"run": root.identity, "episode": number, "episode_id": planned["episode_id"], "plan": plan}
     if wrong := [f"{part} {commit.get(part)}" for part, value in expected.items() if commit.get(part) != value]:
         raise RunDamagedError(
             f"{name} is the commit of {', '.join(wrong)}; in this place belongs that of episode {number}, "
@@ -164,9 +156,7 @@ def _problems(root: Root, number: int, commit: Commit) -> Iterator[str]:
 
 def _control_step_problem(commit: Commit) -> str | None:
     """What is wrong with the control steps of the inferences: none before the last one, none behind the end."""
-    steps = commit.get("control_steps")
-    if steps is None:
-        return None
+    steps = commit["control_steps"]
     if not all(type(step) is int for step in steps):
         return "has other control steps than numbers"
     ended = commit["outcome"].get("steps")
@@ -212,9 +202,9 @@ def redo_picture(number: int) -> str:
     return f"No number comes from it; to have it again: {redo(number)[0].lower()}{redo(number)[1:]}"
 
 
-def pictures_of(commit: Commit) -> dict[str, Sum] | None:
-    """Sums of the pictures of an episode by key in the run; None in commits that bind none, as former ones."""
-    return read_sums(commit["pictures"]) if "pictures" in commit else None
+def pictures_of(commit: Commit) -> dict[str, Sum]:
+    """The sums of the pictures of an episode, by key in the run."""
+    return read_sums(commit["pictures"])
 
 
 def read_own_commit(location: Location, number: int) -> Commit | None:
@@ -230,7 +220,7 @@ def read_own_commit(location: Location, number: int) -> Commit | None:
 
 
 def _check_pictures(commit: Commit, name: str, advice: str) -> None:
-    pictures = commit.get("pictures", {})
+    pictures = commit.get("pictures")
     if not isinstance(pictures, dict):
         raise RunDamagedError(f"{name} names no pictures by key. {advice}")
     if strange := [key for key in pictures if not _is_picture(key)]:
@@ -249,7 +239,7 @@ def picture_problems(location: Location, commits: Mapping[int, Commit]) -> Itera
     }
     kept = {key.partition("/")[0] for key in there}
     for number, commit in commits.items():
-        for key, known in (pictures_of(commit) or {}).items():
+        for key, known in pictures_of(commit).items():
             if key not in there and key.partition("/")[0] in kept:
                 yield f"{key} is missing. {redo_picture(number)}"
             elif key in there and there[key] != known.length:

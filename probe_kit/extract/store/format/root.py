@@ -2,7 +2,7 @@
 
 It carries settings and streams, the hash of every array's metadata at no episodes, and its own hash, which is the
 run's identity: plans and commits name it, so that none counts in another run. The selection of episodes may grow
-and is in `plans`. In schemas 3 and 4 the root had the selection and the hash of one fixed plan.
+and is in `plans`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,17 +14,14 @@ from probe_kit.errors import (
     ActivationsLeftOutError,
     RunDamagedError,
     RunNotFoundError,
-    SettingsMismatchError,
 )
 from probe_kit.extract.run_layout import (
     DATA,
     DATASET,
     ENVIRONMENT,
-    FORMER_PLAN_FILE,
     INPUTS,
     MEAN_VIEW,
     PLANS,
-    READABLE_SCHEMAS,
     RUN_FILE,
     SCHEMA_VERSION,
     LaterViews,
@@ -46,7 +43,6 @@ from probe_kit.extract.store.format.hashes import (
 )
 from probe_kit.extract.store.format.left_out import read_left_out
 from probe_kit.extract.store.format.plans import RESTORE, Row, StoredPlan, plan_key, read_plans
-from probe_kit.extract.store.format.stored_words import in_current_words
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.locations.summary import what_to_open
 from probe_kit.hashing import sha256_json
@@ -57,6 +53,7 @@ _FURTHER = {"random_weights": bool, "suite": dict, "later_views": str}
 """What the settings of every extracted run say besides, and those of a run that other code wrote may not."""
 _EPISODE = {
     **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "layout", "side_correct"), str),
+    "item_content_sha256": str,
     "episode": int,
 }
 _STRETCH = {
@@ -72,19 +69,15 @@ _PLAYED = {
 _INPUTS = {"inputs": dict, "columns": list, "names": dict}
 _OF_SOURCES = {DATASET: {"meta_blake2b": str, **_INPUTS}, ENVIRONMENT: {"revision": str, **_INPUTS}}
 """What settings say of recordings, or of an environment."""
-_WITH_ITEM_HASHES = 4
-"""The first schema whose plan holds item hashes and the suite's parent."""
-_WITH_PLANS = 5
-"""The first schema whose plan is a list of records, outside the run's identity."""
 
 
 @dataclass(frozen=True)
 class Root:
     """What `run.json` says, checked, and the plan that goes with it.
 
-    card: as it is stored. own_settings: those of the card, in the words of now, without what a selection decides.
-    identity: the hash that was computed of it. own_streams: as it stores them, by name. sums: of the arrays'
-    metadata, at no episodes; in former schemas at all of them, and of the plan.
+    card: as it is stored. own_settings: those of the card, without what a selection decides. identity:
+    the hash that was computed of it. own_streams: as it stores them, by name. sums: of the arrays' metadata, at no
+    episodes.
     """
 
     location: Location
@@ -94,24 +87,10 @@ class Root:
     own_streams: Mapping[str, StoredStream]
     sums: Mapping[str, Sum]
 
-    @property
-    def schema(self) -> int:
-        """The schema that the run was written in."""
-        return int(self.card["schema_version"])
-
     def check_continuable(self) -> None:
-        """Raise SettingsMismatchError unless this version writes runs of this schema.
-
-        Raises ActivationsLeftOutError for a copy without activations.
-        """
+        """Raise ActivationsLeftOutError for a copy without activations."""
         if self.left_out:
             self.refuse_left_out("nothing can be added to it")
-        if self.schema != SCHEMA_VERSION:
-            raise SettingsMismatchError(
-                f"{self.location} holds a run of schema {self.schema}, which an earlier version of probe_kit "
-                f"wrote; this one writes schema {SCHEMA_VERSION} only. The run can be read, probed and "
-                "compared, but not continued. Choose another --out, or finish it with the version that began it"
-            )
 
     @cached_property
     def left_out(self) -> frozenset[str]:
@@ -143,8 +122,6 @@ class Root:
 
     def _problem(self, key: str, content: bytes) -> str | None:
         """What is wrong with an object. An array may still have the room of a former plan record."""
-        if self.schema < _WITH_PLANS:
-            return self.sums[key].problem(content)
         try:
             extent, begun = extent_of(content), at_extent(content, 0)
             spelt = at_extent(content, extent or 0) == content
@@ -177,8 +154,6 @@ class Root:
         """
         inside, planned = f"{DATA}/", len(self.plan)
         stored = {key.removeprefix(inside): one for key, one in self._stored.items() if key.startswith(inside)}
-        if self.schema < _WITH_PLANS:
-            return stored
         return {key: at_extent(content, planned) for key, content in stored.items()}
 
     def widened(self) -> Mapping[str, bytes]:
@@ -209,10 +184,8 @@ class Root:
 
     @cached_property
     def stored_plan(self) -> StoredPlan:
-        """What the plan records say together; of former schemas what the one plan says."""
-        if self.schema >= _WITH_PLANS:
-            return read_plans(self.location, self.identity, self._check_row)
-        return StoredPlan(self._former_plan(), suite_parent=self._former_plan_file.get("suite_parent"))
+        """The plan that all plan records make together."""
+        return read_plans(self.location, self.identity, self._check_row)
 
     @property
     def plan(self) -> Sequence[Row]:
@@ -223,7 +196,7 @@ class Root:
     def suite_parent(self) -> str | None:
         """Content hash of the suite that the run's suite was selected from.
 
-        None for a whole suite, and in runs of schema 3, which do not say it.
+        None for a whole suite.
         """
         return self.stored_plan.suite_parent
 
@@ -255,33 +228,13 @@ class Root:
     def _check_row(self, row: Any, name: str) -> None:
         expect(row if isinstance(row, dict) else {}, self._episode_parts, name, RESTORE)
 
-    def _former_plan(self) -> list[Row]:
-        name = f"{self.location}/{FORMER_PLAN_FILE}"
-        plan: list[Row] = []
-        for episode in self._former_plan_file["episodes"]:
-            row = in_current_words(episode, "plan") if isinstance(episode, dict) else {}
-            self._check_row(row, name)
-            plan.append(row)
-        if len({episode["episode"] for episode in plan}) < len(plan):
-            raise RunDamagedError(f"{name} plans two episodes of one number. {RESTORE}")
-        return plan
-
-    @cached_property
-    def _former_plan_file(self) -> dict[str, Any]:
-        name = f"{self.location}/{FORMER_PLAN_FILE}"
-        content = read_plain(self.read(FORMER_PLAN_FILE), name, RESTORE)
-        expect(content, {"episodes": list}, name, RESTORE)
-        if self.schema >= _WITH_ITEM_HASHES and not isinstance(content.get("suite_parent", ...), str | None):
-            raise RunDamagedError(f"{name} does not say what its suite was selected from. {RESTORE}")
-        return content
-
     @property
     def _episode_parts(self) -> dict[str, type]:
         if DATASET in self.own_settings:
             return _STRETCH
         if ENVIRONMENT in self.own_settings:
             return _PLAYED
-        return _EPISODE if self.schema < _WITH_ITEM_HASHES else {**_EPISODE, "item_content_sha256": str}
+        return _EPISODE
 
     @cached_property
     def planned(self) -> dict[int, dict[str, Any]]:
@@ -348,7 +301,7 @@ def find_root(location: Location) -> Root | None:
     expect(card, _PARTS, name, RESTORE)
     if sha256_json(card["settings"]) != card["settings_sha256"]:
         raise RunDamagedError(f"{name}: the settings do not have the hash stored beside them. {RESTORE}")
-    settings = in_current_words(card["settings"], "settings")
+    settings = dict(card["settings"])
     there = {part: kind for part, kind in _FURTHER.items() if part in settings}
     expect(settings, {**_SETTINGS, **there}, f"{name}: the settings", RESTORE)
     for source, parts in _OF_SOURCES.items():
@@ -358,30 +311,26 @@ def find_root(location: Location) -> Root | None:
     check_sums(card["objects"], name, RESTORE)
     streams = _read_streams(card["streams"], name)
     root = Root(location, card, settings, card[HASH], streams, read_sums(card["objects"]))
-    former = {FORMER_PLAN_FILE} if root.schema < _WITH_PLANS else set()
-    if lost := (former | {f"{DATA}/{array}/zarr.json" for array in root.arrays}) - {*root.sums}:
+    if lost := {f"{DATA}/{array}/zarr.json" for array in root.arrays} - {*root.sums}:
         raise RunDamagedError(f"{name} names no hash of {min(lost)}. {RESTORE}")
     return root
 
 
 def _read_card(raw: bytes, name: str) -> dict[str, Any]:
-    """What `run.json` says. Runs of former versions carried no hash of their own; their schema is named."""
+    """The content of `run.json`. Raises RunDamagedError, which names the schema where it is another one."""
     card = read_record(raw, name, RESTORE) if is_record(raw) else read_plain(raw, name, RESTORE)
-    if (schema := card.get("schema_version")) not in READABLE_SCHEMAS or type(schema) is not int:
-        newer = type(schema) is int and schema > SCHEMA_VERSION
+    schema = card.get("schema_version")
+    if type(schema) is not int or schema != SCHEMA_VERSION:
         raise RunDamagedError(
-            f"{name} has schema {schema}; this version of probe_kit reads schemas "
-            f"{', '.join(map(str, READABLE_SCHEMAS))}. "
-            + ("Update probe_kit" if newer else "Extract the run again, or read it with the version that made it")
+            f"{name} has schema {schema}; this version of probe_kit reads schema {SCHEMA_VERSION}. Extract the "
+            "run again, or read it with the version that made it"
         )
     return read_record(raw, name, RESTORE)
 
 
 def _read_streams(stored: list[Any], name: str) -> dict[str, StoredStream]:
     try:
-        streams = [
-            StoredStream.from_json({"tokens": 1, **in_current_words(dict(one), "stream")}) for one in stored
-        ]
+        streams = [StoredStream.from_json({"tokens": 1, **one}) for one in stored]
     except (TypeError, ValueError, KeyError) as error:
         raise RunDamagedError(f"{name} describes its streams wrongly: {error!r}. {RESTORE}") from error
     if len({stream.name for stream in streams}) < len(streams):

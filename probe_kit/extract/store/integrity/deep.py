@@ -43,7 +43,7 @@ def _committed(commits: Mapping[int, Commit]) -> Iterator[Job]:
     for number, commit in commits.items():
         for key, (length, checksum, *_) in commit["objects"].items():
             yield f"{DATA}/{key}", length, checksum, f" of episode {commit['episode_id']}", redo(number)
-        for key, (length, checksum, _) in (pictures_of(commit) or {}).items():
+        for key, (length, checksum, _) in pictures_of(commit).items():
             yield key, length, checksum, f" of episode {commit['episode_id']}", redo_picture(number)
 
 

@@ -39,7 +39,7 @@ def known_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | Non
         yield seconds_key(number)
         yield f"{PROVENANCE}/{commit['provenance']}.json"
         yield from (f"{DATA}/{key}" for key in commit["objects"])
-        yield from pictures_of(commit) or {}
+        yield from pictures_of(commit)
     yield from certificate_keys(root.location)
     yield from (key for _, key, _ in numbered(root.location, FAILED))
     if columns is not None:

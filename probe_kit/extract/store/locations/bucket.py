@@ -214,9 +214,8 @@ class Bucket(Location):
         return sorted(self._listing(folder))
 
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
-        """From a listing of all that is there; the store is asked for what is not in it, which may be stale."""
+        """From a listing."""
         there, wanted = self._listing(folder), {key: f"{folder}/{key}" for key in keys}
-        there |= self._lengths([full for full in wanted.values() if full not in there])
         return {key: there[full] for key, full in wanted.items() if full in there}
 
     def confirm(self, lengths: Mapping[str, int]) -> None:
@@ -303,15 +302,13 @@ class Bucket(Location):
         if strange and not self.exists(last):
             raise SettingsMismatchError(f"{self} holds {strange[0]} but no run; choose another --out")
         for key, content in objects.items():
-            if key == last or self.create(key, content) or (there := self.read(key)) == content:
-                continue
-            if not content.startswith(there):
+            if key != last and not self.create(key, content) and self.read(key) != content:
                 raise SettingsMismatchError(
                     f"{self} holds the beginning of a run with another {key}: one of other settings, killed early "
                     "or beginning now in another process. Choose another --out, or remove it"
                 )
-            self.write(key, content)  # a store kept a part of it and said that all was well
         self.confirm({key: len(content) for key, content in objects.items() if key != last})
+        self.check_exclusive(next(key for key in objects if key != last))
         self.create_record(last, objects[last])
 
     @contextmanager

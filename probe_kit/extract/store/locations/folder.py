@@ -29,12 +29,14 @@ from probe_kit.extract.run_layout import (
     TIMES,
     VIDEOS,
 )
-from probe_kit.extract.store.locations.location import TRIES, Location
+from probe_kit.extract.store.locations.location import Location
 
 # What a killed process leaves: objects and columns that never got their final name.
 _WRITTEN_ASIDE = (PLANS, COMMITS, TIMES, FAILED, CERTIFICATES, PROVENANCE, SEALED, FRAMES, VIDEOS)
 _ORPHANS = ("*.tmp", *(f"{folder}/*.tmp" for folder in _WRITTEN_ASIDE), f"{DATA}/**/*.partial")
 _PIECE = 1 << 20
+_TRIES = 5
+"""Times that a file is written whose folder another process clears or removes meanwhile."""
 
 
 class Folder(Location):
@@ -127,7 +129,7 @@ class Folder(Location):
     def create(self, key: str, content: bytes) -> bool:
         """Written aside, flushed to the disk, then linked to its name."""
         path = self._place(key)
-        for left in reversed(range(TRIES)):
+        for left in reversed(range(_TRIES)):
             try:
                 path.parent.mkdir(exist_ok=True)
                 with _written_aside(path, content, flush=True) as aside:
@@ -143,7 +145,7 @@ class Folder(Location):
     def write(self, key: str, content: bytes) -> None:
         """Written aside, then renamed."""
         path = self._place(key)
-        for left in reversed(range(TRIES)):
+        for left in reversed(range(_TRIES)):
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with _written_aside(path, content, flush=False) as aside:

@@ -15,9 +15,6 @@ from zarr.abc.store import Store
 
 from probe_kit.errors import StoreError
 
-TRIES = 5
-"""Times that a record is written to a store which says that all is well, and holds a part of it."""
-
 
 class Location(ABC):
     """Where a run lies. `str()` gives what the user called it."""
@@ -101,9 +98,9 @@ class Location(ABC):
         """Write an object over whatever is there. Whole or not at all."""
 
     def create_record(self, key: str, record: bytes) -> bool:
-        """`create`, of what nothing written later confirms: where a store kept a part of it, it is written again.
+        """`create`, of what nothing written later confirms.
 
-        Raises StoreError, and leaves nothing, if the store keeps no more of it however often it is asked.
+        Raises StoreError, and leaves nothing, if the store kept a part of it only.
         """
         created = self.create(key, record)
         if created:
@@ -116,14 +113,19 @@ class Location(ABC):
         self._ascertain(key, record)
 
     def _ascertain(self, key: str, record: bytes) -> None:
-        for _ in range(TRIES):
-            try:
-                return self.confirm({key: len(record)})
-            except StoreError as error:
-                refused = error
-            self.write(key, record)
-        self.delete(key)
-        raise refused
+        try:
+            self.confirm({key: len(record)})
+        except StoreError:
+            self.delete(key)
+            raise
+
+    def check_exclusive(self, key: str) -> None:
+        """Raise StoreError unless a second `create` of the object `key` is refused, on which commits rely."""
+        if self.create(key, self.read(key)):
+            raise StoreError(
+                f"{self}: the store created {key} a second time: it ignores conditional puts (If-None-Match), and "
+                "cannot keep two writers apart. Use another store, or a folder"
+            )
 
     @abstractmethod
     def delete(self, key: str) -> None:

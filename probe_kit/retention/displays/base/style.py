@@ -29,7 +29,12 @@ ABOVE_CHANCE = (-30.0, 51.0)
 """The same of accuracies above chance, in points."""
 _CAPTION_SIZE = 6.5
 _LEGEND_SIZE = 8.0
-_USED = 0.97  # of the width, by a caption
+_LETTERS_PER_INCH = 16
+"""Letters of a legend's label on an inch, a low estimate."""
+_MARK = 8
+"""Letters that the mark and the gaps of a legend's entry take."""
+_LEGEND_ROWS, _ROW_HEIGHT = 2, 0.17
+"""Rows of a legend that figures have room for, and inches that each further one adds to their height."""
 
 
 @dataclass(frozen=True)
@@ -137,71 +142,41 @@ def plain(axes: "Axes") -> None:
 
 
 def caption(figure: "Figure | None", *certificates: ProvenanceLine) -> None:
-    """One line under the figure says what it is about; the rest is kept as `figure.caption`.
+    """Write under the figure what it is about: every model once, then the parts that all have in common.
 
-    The line names every model once, then what all have in common, and is cut between its parts where the figure
-    is too narrow for all of them.
+    `figure.caption` has each certificate in full, with its settings.
     """
     if figure is None:
         return
-    known = tuple(dict.fromkeys(certificates))
-    figure.caption = "; ".join(certificate.line for certificate in known)  # type: ignore[attr-defined]
-    figure.supxlabel(_footer(known, figure.get_figwidth()), fontsize=_CAPTION_SIZE, color="0.25")
+    certificates = tuple(dict.fromkeys(certificates))
+    groups = zip(*(certificate.parts for certificate in certificates), strict=True)
+    parts = dict.fromkeys(", ".join(dict.fromkeys(group)) for group in groups)
+    footer(figure, " · ".join(part for part in parts if part.strip(", ")))
+    figure.caption = "; ".join(certificate.line for certificate in certificates)  # type: ignore[attr-defined]
 
 
 def footer(figure: "Figure", text: str) -> None:
-    """A line under a figure that belongs to several runs at once, and its whole caption."""
+    """Write a caption under a figure, on as many lines as its width needs."""
     figure.caption = text  # type: ignore[attr-defined]
-    parts = text.split(" · ")
-    while len(parts) > 1 and text_width(" · ".join(parts), _CAPTION_SIZE) > _USED * figure.get_figwidth():
-        parts.pop()
-    figure.supxlabel(" · ".join(parts), fontsize=_CAPTION_SIZE, color="0.25")
-
-
-def _footer(certificates: Sequence[ProvenanceLine], width: float) -> str:
-    """As many parts as `width` inches hold, the first one always; what all certificates share comes once."""
-    parts = list(
-        dict.fromkeys(
-            ", ".join(dict.fromkeys(group)) for group in zip(*(c.parts for c in certificates), strict=True)
-        )
-    )
-    parts = [part for part in parts if part.strip(", ")]
-    while len(parts) > 1 and text_width(" · ".join(parts), _CAPTION_SIZE) > _USED * width:
-        parts.pop()
-    return " · ".join(parts)
+    figure.supxlabel(text, fontsize=_CAPTION_SIZE, color="0.25", wrap=True)
 
 
 def legend_above(figure: "Figure", handles: "Sequence[Artist]") -> None:
-    """A legend along the upper side, in as many columns as the figure has room for."""
-    labels = [str(handle.get_label()) for handle in handles]
-    widths = [text_width(label, _LEGEND_SIZE) for label in labels]
-    room = _USED * figure.get_figwidth()
-    fitting = [n for n in range(1, len(labels) + 1) if _legend_width(widths, n) <= room]
-    figure.legend(
-        handles=handles, loc="outside upper left", ncols=max(fitting, default=1), fontsize=_LEGEND_SIZE,
-        frameon=False,
-    )  # fmt: skip
+    """A legend along the upper side, in as many columns as the figure has room for; many rows make it higher.
 
-
-def _legend_width(widths: Sequence[float], columns: int) -> float:
-    """Inches of a legend, which fills column by column; each has a mark and gaps of five letters' width."""
-    rows, more = divmod(len(widths), columns)
-    total, start = 0.0, 0
-    for column in range(columns):
-        count = rows + (column < more)
-        total += max(widths[start : start + count]) + 5.2 * _LEGEND_SIZE / 72
-        start += count
-    return total
-
-
-def text_width(text: str, size: float) -> float:
-    """Inches that a line of text of `size` points takes."""
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import TextPath
-
-    return (
-        float(TextPath((0, 0), text.replace("$", r"\$"), prop=FontProperties(size=size)).get_extents().width) / 72
-    )
+    matplotlib fills a legend column by column, and leaves their number to its caller.
+    """
+    lengths = [len(str(handle.get_label())) + _MARK for handle in handles]
+    room = _LETTERS_PER_INCH * figure.get_figwidth()
+    fitting = [
+        columns
+        for columns in range(1, len(lengths) + 1)
+        if sum(int(column.max()) for column in np.array_split(lengths, columns)) <= room
+    ]
+    columns = max(fitting, default=1)
+    rows = ceil(len(lengths) / columns)
+    figure.set_figheight(figure.get_figheight() + _ROW_HEIGHT * max(0, rows - _LEGEND_ROWS))
+    figure.legend(handles=handles, loc="outside upper left", ncols=columns, fontsize=_LEGEND_SIZE, frameon=False)
 
 
 def significance_handles(colour: str = "0.3") -> "list[Line2D]":

@@ -19,7 +19,7 @@ from probe_kit.intervene import (
     run_intervention,
     stored_image_swaps,
 )
-from probe_kit.intervene.kinds.erase.effects import ErasureEffect, erasure_effects
+from probe_kit.intervene.kinds.erase import ErasureEffect, erasure_effects
 from tests.intervene.answers import follower, habit, outcomes_of
 
 pytestmark = pytest.mark.slow

@@ -1,0 +1,450 @@
+"""Concept erasure: the linearly decodable answer is removed from each token, with random controls.
+
+Holds the intervention, its effects and their table. The fits are in `edits.linear_erasure`, which interchange and
+steer share with it (`--direction mean-difference:K`). Erasure is a supplement, and the weakest. A policy may read
+what is not linear. An answer that is erased at one place may pass at another, and what is removed along with it
+disrupts the task. Erasers that know only the mean over tokens blind a probe and leave the behaviour, so that there
+is one per position.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.extract.store.run import Run
+from probe_kit.hooks.capturing.edit_engine import apply_patch
+from probe_kit.hooks.capturing.token_edits import Identity, TokenIndex
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.edits.linear_erasure import Eraser, Method, PaddedTokens
+from probe_kit.intervene.edits.sites import SiteGroup, resolve_sites, roles_of
+from probe_kit.intervene.kinds.base import (
+    ConditionName,
+    EffectRow,
+    Measurement,
+    TableContext,
+    by_category,
+    common_columns,
+    count_edits,
+    test_against_controls,
+)
+from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST, net_interval
+from probe_kit.intervene.kinds.site_effects import LOCALISATION_SHARE
+from probe_kit.intervene.replay.conditions import (
+    CleanRun,
+    Condition,
+    ConditionContext,
+    ConditionResult,
+    Intervention,
+    ReplayBatch,
+)
+from probe_kit.intervene.replay.image_tokens import TILES, role_tokens
+from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.replay.token_features import (
+    TokenFeatures,
+    by_episode,
+    collect_token_features,
+    fit_by_fold,
+)
+from probe_kit.intervene.store.answers import CLEAN, ERASE, PROBE_ACCURACY, ConditionOutcomes
+from probe_kit.intervene.store.settings import FIRST_CHUNK, items_of
+from probe_kit.statistics.folds import Fold
+from probe_kit.statistics.paired_signs import paired_greater_p
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.suite.categories import category_of
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
+
+LEACE = "leace"
+Finding = Literal[
+    "identity patch", "control", "no baseline effect", "controls also disrupt", "effect", "no effect"
+]
+ProbeAccuracies = Mapping[str, Mapping[str, float]]
+"""By condition and category."""
+_NOTHING: ProbeAccuracies = {}
+UNTOUCHED, ZERO = "none", "0"
+"""Direction and coefficient of the condition in which tokens are written back as they are."""
+CHANCE_LIKE = 0.6
+"""Held-out accuracy below which a probe on two sides is said to be blind."""
+_LEGEND = (
+    "goes there: share of episodes whose action goes to the correct picture; kept: of how far, n/a where it does "
+    "not; controls: the mean of random subspaces of the same rank; p: exact, that the action moves away farther "
+    "than under the controls, by item and by group, the larger one; probe accuracy: a fresh probe on the mean "
+    "over tokens; relative change: how far tokens were moved, in their own norms. Weaker evidence than interchange"
+)
+
+
+# -- the intervention --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConceptErasure(Intervention):
+    """Every place and role: written back as it was, erased, and with matched random subspaces taken away instead.
+
+    sites: patterns of places of one site each. roles: whose tokens. method: see `linear_erasure.Method`. controls:
+    so many of the same rank. What erases an episode was fitted on the tokens of the other folds' episodes, of the
+    items that are played. Raises UsageError for a method that does not exist.
+    """
+
+    sites: tuple[str, ...]
+    roles: tuple[str, ...] = ("image",)
+    method: str = LEACE
+    controls: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.readout != FIRST_CHUNK:
+            raise UsageError("what erases is fitted on the first inference; leave --readout out")
+        if not self.sites or not self.roles:
+            raise UsageError("erasing needs at least one site and one role")
+        if tiles := set(self.roles) & set(TILES):
+            raise UsageError(
+                f"{', '.join(sorted(tiles))} is of other patches in every episode, and an eraser is of positions; "
+                "erase `image`, or patch the tile (--kind interchange)"
+            )
+        object.__setattr__(self, "method", str(Method.of(self.method)))
+
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """`direction` is its method. Raises UsageError without sites."""
+        if "sites" not in options:
+            raise UsageError("--kind erase needs --sites, such as --sites backbone.02")
+        method = options.pop("direction", LEACE)
+        return super().from_options(run, method=method, **options)
+
+    @property
+    def kind(self) -> str:
+        """`erase`."""
+        return ERASE
+
+    @property
+    def fits_first(self) -> bool:
+        """Always."""
+        return True
+
+    def parameters(self) -> dict[str, Any]:
+        """Where, how and beside how many controls."""
+        return {
+            "sites": list(self.sites), "roles": list(self.roles), "method": self.method,
+            "controls": self.controls, "seed": self.seed,
+        }  # fmt: skip
+
+    def conditions(self, session: ReplaySession) -> Sequence[Condition]:
+        """Clean, then every place and role untouched, erased and with its controls. Raises UnknownSiteError."""
+        found = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
+        wanted = {place: roles_of(session.policy, place.stream, self.roles) for place in found.values()}
+        if not any(wanted.values()):
+            raise UsageError(f"no token of {', '.join(found)} has the role {', '.join(self.roles)}")
+        cells: dict[tuple[SiteGroup, str], _FittedErasers] = {}
+        for place, role, category, own in collect_token_features(session, items_of(session.run, self), wanted):
+            self._fit(cells.setdefault((place, role), _FittedErasers()), place, role, category, own)
+        return [CleanRun(), *(erased for (place, role), cell in cells.items() for erased in cell.at(place, role))]
+
+    def certificate_entries(self, conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, Any]:
+        """How well a fresh probe reads the answer behind each condition, by category."""
+        del found
+        return {
+            PROBE_ACCURACY: {
+                one.name: dict(one.probe_accuracy) for one in conditions if isinstance(one, ErasedCondition)
+            }
+        }
+
+    def _fit(self, cell: "_FittedErasers", place: SiteGroup, role: str, category: str, own: TokenFeatures) -> None:
+        """Add one category's erasers, and what is readable with each and without."""
+        fits = fit_by_fold(own, place.only_site, role, Method.of(self.method), self.controls, self.seed, category)
+        folds = [fold for fold, _ in fits]
+        cell.probe_accuracy.setdefault(UNTOUCHED, {})[category] = _probe_accuracy(own, folds, None)
+        for name, of_episode in by_episode(own, fits).items():
+            cell.erasers.setdefault(name, {}).update(of_episode)
+            fitted = [by_name[name] for _, by_name in fits]
+            cell.probe_accuracy.setdefault(name, {})[category] = _probe_accuracy(own, folds, fitted)
+
+
+@dataclass(frozen=True)
+class ErasedCondition:
+    """The tokens of one role at one place, without what an eraser takes away.
+
+    erasers: by episode, fitted without it; empty to write back what is there. readable: by category, the held-out
+    accuracy of a probe fitted on what is left, of the mean over tokens.
+    """
+
+    place: SiteGroup
+    role: str
+    what: str
+    erasers: Mapping[str, Eraser] = field(repr=False)
+    probe_accuracy: Mapping[str, float]
+
+    @property
+    def name(self) -> str:
+        """See `ConditionName`."""
+        coefficient = ZERO if self.what == UNTOUCHED else ""
+        return str(ConditionName(self.place.name, self.role, self.what, coefficient))
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """The clean inference without it."""
+        replay_input, session = context.replay_input, context.session
+        tokens = role_tokens(session.policy, replay_input, self.place.stream, self.role, context.memo)
+        change = ApplyEraser(self.erasers[replay_input.episode_id]) if self.erasers else Identity()
+        with apply_patch(session.policy, self.place.sites, tokens, change) as edit_log:
+            chunk = session.act(replay_input.seen, replay_input.seed)
+        return ConditionResult(chunk, edit_log)
+
+
+@dataclass
+class _FittedErasers:
+    """One place and role. erasers: by name and episode. readable: by name and category."""
+
+    erasers: dict[str, dict[str, Eraser]] = field(default_factory=dict)
+    probe_accuracy: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    def at(self, place: SiteGroup, role: str) -> list[ErasedCondition]:
+        """Untouched first, then every eraser."""
+        return [
+            ErasedCondition(place, role, name, self.erasers.get(name, {}), own)
+            for name, own in self.probe_accuracy.items()
+        ]
+
+
+@dataclass(frozen=True)
+class ApplyEraser:
+    """What an eraser leaves; tokens beyond those it was fitted on stay as they are."""
+
+    eraser: Eraser
+
+    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
+        """Computed in float64, as it was fitted."""
+        import torch
+
+        del site, where
+        known = min(own.shape[1], self.eraser.fitted.size)
+        after = own.clone()
+        erased = self.eraser(own[:, :known].double().cpu().numpy())
+        after[:, :known] = torch.from_numpy(erased).to(own)
+        return after
+
+
+def _probe_accuracy(own: TokenFeatures, folds: Sequence[Fold], erasers: Sequence[Eraser] | None) -> float:
+    """Held-out accuracy of a probe on the mean over tokens; chance is one half."""
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import StandardScaler
+
+    right = 0
+    for number, fold in enumerate(folds):
+        pooled = _pooled(own.tokens, None if erasers is None else erasers[number])
+        probe = make_pipeline(StandardScaler(), LogisticRegression(C=0.01, max_iter=1000))
+        probe.fit(pooled[fold.train], own.left[fold.train])
+        right += int((probe.predict(pooled[fold.test]) == own.left[fold.test]).sum())
+    return right / own.left.size
+
+
+def _pooled(tokens: PaddedTokens, eraser: Eraser | None) -> NDArray[np.float64]:
+    """(N, D) mean over the tokens that are there."""
+    values = tokens.values if eraser is None else eraser(tokens.values)
+    here = tokens.present[..., None]
+    return np.asarray(np.where(here, values, 0).sum(axis=1) / here.sum(axis=1))
+
+
+# -- effects -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class ErasureEffect(EffectRow):
+    """What was left of an answer in the action once it was erased at one place, in one category; see `EffectRow`.
+
+    right_before, right: share of episodes whose action goes to the correct picture's side, without and with the
+    edit. kept: of how far actions go to the correct side, the share that is left; None if they do not go there,
+    because a share of noise is noise. net: share of episodes that no longer go there minus those that do now.
+    mean_displacement: metres away from the correct side. control_kept, control_net, control_displacement: means of
+    the controls. p: exact and one-sided, that an item's action moves away from the correct picture farther than
+    under the controls, by items and by groups, the larger one. p_fwe: of the same, by sign flips of whole groups
+    against the largest t of the category. probe_accuracy_before, probe_accuracy: held-out accuracy of a fresh
+    probe on the mean over tokens.
+    """
+
+    right_before: float
+    right: float
+    kept: float | None
+    mean_displacement: float
+    control_kept: float | None
+    control_net: float | None
+    control_displacement: float | None
+    p: float | None
+    p_fwe: float | None
+    probe_accuracy_before: float | None
+    probe_accuracy: float | None
+
+    @property
+    def finding(self) -> Finding:
+        """`effect` if, beyond its controls and chance, enough of the answer is gone from the action."""
+        if self.direction == UNTOUCHED:
+            return "identity patch"
+        if self.is_control:
+            return "control"
+        if self.kept is None:
+            return "no baseline effect"
+        beside = 1.0 if self.control_kept is None else self.control_kept
+        if beside < LOCALISATION_SHARE:
+            return "controls also disrupt"
+        gone = self.p is not None and self.p < SIGNIFICANCE and beside - self.kept >= SMALLEST_EFFECT_OF_INTEREST
+        return "effect" if gone else "no effect"
+
+    @property
+    def name(self) -> str:
+        """What was edited, in a few words."""
+        what = "identity patch" if self.direction == UNTOUCHED else self.direction
+        return " ".join((self.place, self.role, what))
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values and the finding."""
+        return {**super().to_json(), "finding": self.finding}
+
+
+def measured_erasure(measurement: Measurement) -> list[ErasureEffect]:
+    """The effects of a stored erasure."""
+    read = measurement.certificate.get(PROBE_ACCURACY, {})
+    return erasure_effects(measurement.outcomes, measurement.suite, measurement.key, read)
+
+
+def erasure_effects(
+    outcomes: ConditionOutcomes, suite: str, key: str = "", probe_accuracy: ProbeAccuracies = _NOTHING
+) -> list[ErasureEffect]:
+    """One per category and condition. probe_accuracy: as a certificate has it."""
+    return [
+        row
+        for category, own in outcomes.by_category()
+        for row in _of_category(own, category, suite, key, probe_accuracy)
+    ]
+
+
+def erasure_notes(rows: Sequence[ErasureEffect], _: Measurement) -> list[str]:
+    """What a reader must know."""
+    blind = [row for row in rows if row.finding == "no effect" and (row.probe_accuracy or 1.0) < CHANCE_LIKE]
+    broken = [row for row in rows if row.finding == "controls also disrupt"]
+    return [
+        "Erasure is weaker evidence than interchange: what is read need not be linear, and may pass elsewhere. "
+        "Loss beyond the controls is evidence of use. Absence of loss is not evidence against it.",
+        *(f"{row.category}, {row.name}: the probe is at chance, and the action is as before." for row in blind),
+        *(
+            f"{row.category}, {row.name}: random subspaces of the same rank disrupt the action too."
+            for row in broken
+        ),
+    ]
+
+
+def _of_category(
+    outcomes: ConditionOutcomes, category: str, suite: str, key: str, probe_accuracy: ProbeAccuracies
+) -> list[ErasureEffect]:
+    sign = outcomes.correct_sign
+    clean = sign * outcomes.of(CLEAN)
+    conditions = [name for name in outcomes.conditions if name != CLEAN]
+    names = [ConditionName.parse(condition) for condition in conditions]
+    values = np.array([sign * outcomes.of(condition) for condition in conditions])
+    away = clean - values
+    untouched = [at for at, name in enumerate(names) if name.coefficient]
+    tests = test_against_controls(away, names, outcomes, suite, untouched, ())
+    goes_there = paired_greater_p(clean, outcomes.items, outcomes.groups) < SIGNIFICANCE
+    kept = values.sum(axis=1) / clean.sum() if goes_there else None
+    net = (clean > 0).astype(float) - (values > 0)
+    rows = []
+    for at, (condition, name, test) in enumerate(zip(conditions, names, tests, strict=True)):
+        columns: dict[str, Any] = common_columns(outcomes, outcomes.conditions.index(condition), name)
+        before = str(ConditionName(name.place, name.role, UNTOUCHED, ZERO))
+        rows.append(
+            ErasureEffect(
+                category=category,
+                **columns,
+                right_before=float((clean > 0).mean()),
+                right=float((values[at] > 0).mean()),
+                kept=None if kept is None else float(kept[at]),
+                net=float(net[at].mean()),
+                net_ci=net_interval(net[at], outcomes, suite),
+                mean_displacement=float(away[at].mean()),
+                control_kept=_mean(kept, test.controls),
+                control_net=_mean(net.mean(axis=1), test.controls),
+                control_displacement=_mean(away.mean(axis=1), test.controls),
+                p=None if test.beyond is None else paired_greater_p(test.beyond, outcomes.items, outcomes.groups),
+                p_fwe=test.p_fwe,
+                probe_accuracy_before=probe_accuracy.get(before, {}).get(category),
+                probe_accuracy=probe_accuracy.get(condition, {}).get(category),
+                key=key,
+            )
+        )
+    return rows
+
+
+def _mean(values: NDArray[np.float64] | None, rows: Sequence[int]) -> float | None:
+    return None if values is None or not rows else float(values[list(rows)].mean())
+
+
+# -- table -------------------------------------------------------------------------------------------------
+
+
+def erasure_table(rows: Sequence[ErasureEffect], context: TableContext) -> "ResponsiveTable":
+    """One line per category and place; controls are columns of what is compared with them."""
+    from probe_kit._terminal.responsive_table import Part, ResponsiveTable
+
+    shown = [row for row in rows if row.finding not in ("control", "identity patch")]
+    return ResponsiveTable(
+        title=f"What is lost without it? {context.subject}, erase",
+        caption=_LEGEND,
+        name="category · erased",
+        names=tuple(f"{row.category} · {row.name}" for row in shown),
+        styles=tuple("bold" if row.finding == "effect" else "" for row in shown),
+        parts=(
+            Part(
+                "What the action does",
+                ("goes there %", "controls %", "kept", "controls", "displacement cm", "p", "relative change"),
+                tuple(_action_cells(row) for row in shown),
+            ),
+            Part(
+                "What a probe reads",
+                ("probe accuracy %", "finding"),
+                tuple(_probe_cells(row) for row in shown),
+            ),
+        ),
+    )
+
+
+def erasure_sentences(rows: Sequence[ErasureEffect], _: TableContext) -> list[str]:
+    """One per category: which erasures take the answer from the action."""
+    return [f"{category_of(name).title}: {_finding(own)}." for name, own in by_category(rows).items()]
+
+
+def _finding(rows: Sequence[ErasureEffect]) -> str:
+    tried = [row for row in rows if row.finding != "identity patch"]
+    if tried and all(row.finding == "no baseline effect" for row in tried):
+        return "the unedited action does not go to the correct picture, so that nothing can be lost"
+    found = [f"{row.name} keeps {row.kept:.2f}" for row in tried if row.finding == "effect"]
+    return f"erasures that take the answer from the action beyond their controls: {count_edits(found, len(tried))}"
+
+
+def _action_cells(row: ErasureEffect) -> "tuple[Cell, ...]":
+    from probe_kit._terminal.responsive_table import Cell
+
+    beside = None if row.control_net is None else row.right_before - row.control_net
+    texts = (
+        f"{100 * row.right_before:.1f} → {100 * row.right:.1f}", "–" if beside is None else f"{100 * beside:.1f}",
+        "n/a" if row.kept is None else f"{row.kept:.2f}",
+        "–" if row.control_kept is None else f"{row.control_kept:.2f}",
+        f"{-100 * row.mean_displacement:+.2f}", "–" if row.p is None else f"{row.p:.2g}",
+        f"{row.relative_change:.2f}",
+    )  # fmt: skip
+    return tuple(map(Cell, texts))
+
+
+def _probe_cells(row: ErasureEffect) -> "tuple[Cell, ...]":
+    from probe_kit._terminal.responsive_table import Cell
+
+    unknown = row.probe_accuracy_before is None or row.probe_accuracy is None
+    read = (
+        "–" if unknown else f"{100 * (row.probe_accuracy_before or 0):.1f} → {100 * (row.probe_accuracy or 0):.1f}"
+    )
+    return Cell(read), Cell(row.finding)

@@ -1,1 +1,0 @@
-"""Concept erasure: remove what can be read linearly."""
