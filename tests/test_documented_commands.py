@@ -257,7 +257,6 @@ STAND_INS = {
     },
     "docs/storage.md": {
         r"backbone\.07": "backbone.02",
-        r"--format hf": "--format parquet",
         r"tokens:image": "mean:image",
     },
     "docs/suite.md": {r"(--model pi0-tiny)": r"\1 --max-steps 4"},

@@ -87,8 +87,7 @@ def export(
         ExportFormat,
         typer.Option(
             "--format",
-            help="Format. mp4, lerobot, rerun, hf and sae write a folder; the first three need a run with "
-            "--frames all.",
+            help="Format. lerobot and sae write a folder; lerobot needs a run with --frames all.",
         ),
     ],
     out_file: Annotated[
@@ -100,15 +99,15 @@ def export(
         typer.Option(
             "--sites",
             **LISTED,
-            help="Of parquet, npz, hf and sae: sites, such as backbone.07, expert or expert.*@9. Default: all.",
+            help="Of parquet and sae: sites, such as backbone.07, expert or expert.*@9. Default: all.",
         ),
     ] = None,
     view: Annotated[
         str | None,
         typer.Option(
             "--view",
-            help="Of the same formats: a pooled view, tokens or tokens:ROLE. Default: all pooled views, or "
-            "mean in npz and sae.",
+            help="Of parquet and sae: a pooled view, tokens or tokens:ROLE. Default: all pooled views, or "
+            "mean in sae.",
         ),
     ] = None,
     dtype: Annotated[SaeDtype, typer.Option("--dtype", help="Of sae: type of the memory maps.")] = "bfloat16",
