@@ -42,7 +42,6 @@ from probe_kit.retention.choices import AnswerScore, Family, Section, TableForma
 from probe_kit.scene_names import ArmName, Rendering, RuleName, SceneName
 from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
-from probe_kit.suite.generators.couples import SUITE_VERSIONS, SuiteVersion
 from probe_kit.suite.ladder import WORDINGS, Wording
 from probe_kit.train.choices import (
     BASELINES,
@@ -94,7 +93,6 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("retention", "--rule"): RULES,
     ("retention", "--score"): SCORES,
     ("stages", "--score"): SCORES,
-    ("suite build", "--suite-version"): SUITE_VERSIONS,
     ("suite convert", "SOURCE"): EVERY_SOURCE,
 }
 """Command and option, and what the library accepts for it."""
@@ -149,7 +147,7 @@ def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> No
         (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Target, TARGETS),
         (Task, TASKS), (LabelControl, LABEL_CONTROLS),
         (Incomplete, INCOMPLETE), (Baseline, BASELINES), (FoldUnit, FOLD_UNITS), (Wording, WORDINGS),
-        (SuiteVersion, SUITE_VERSIONS), (ExportFormat, FORMATS),
+        (ExportFormat, FORMATS),
         (RuleName, RULES), (AnswerScore, SCORES),
     ],
 )  # fmt: skip

@@ -10,7 +10,6 @@ from probe_kit._terminal.console import counter, err, out, print_json, progress
 from probe_kit._terminal.options import AsJson, Categories, Seed, choices, one_of
 from probe_kit.errors import UsageError
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
-from probe_kit.suite.generators.couples import SuiteVersion
 
 app = typer.Typer(help="Build, convert, check and show suites of questions.", no_args_is_help=True)
 
@@ -29,17 +28,13 @@ def build(
         int, typer.Option("--n", help="Number of items per category, an even number.", max=100_000)
     ] = 150,
     seed: Seed = 0,
-    suite_version: Annotated[
-        SuiteVersion,
-        typer.Option(help="Version of the generators. 1: the first, which leaks more through pixels and words."),
-    ] = 2,
 ) -> None:
     """Draw the embedded suite and save it in FOLDER."""
     from probe_kit.suite import build_suite
 
     with progress() as bar:
         drawing = counter(bar, "drawing items")
-        suite = build_suite(folder, categories, n, seed, progress=drawing, version=suite_version)
+        suite = build_suite(folder, categories, n, seed, progress=drawing)
     out.print(f"{suite.identity}: {len(suite.items)} items, {2 * len(suite.items)} episodes in {folder}")
 
 
