@@ -30,8 +30,7 @@ probe-kit study table embedded success
 """
 app = typer.Typer(help=HELP, no_args_is_help=True)
 UNFINISHED = 1
-Tracker = Literal["mlflow", "wandb"]
-Style = Literal["table", "markdown", "latex", "json"]
+Style = Literal["table", "csv", "markdown", "latex", "json"]
 File = Annotated[
     str,
     typer.Argument(metavar="FILE", help="Study file, or the name of a study of the package: embedded or paper."),
@@ -207,9 +206,13 @@ def table(
     from probe_kit.retention.formats.latex import latex_table
     from probe_kit.retention.formats.terminal import responsive_table
     from probe_kit.study import load_study, make_table
-    from probe_kit.study.tables.formats import markdown_text, table_json
+    from probe_kit.study.tables.formats import markdown_text, table_csv, table_json
 
     study = load_study(file)
+    if style == "csv" and name is None and len(study.study.tables) > 1:
+        raise UsageError(
+            f"--format csv prints one table, and {file} has {', '.join(study.study.tables)}; give the name of one"
+        )
     made: dict[str, NamedTable] = {}
     for one in [name] if name else study.study.tables:
         try:
@@ -221,13 +224,16 @@ def table(
     if style == "json":
         found = {one: table_json(own) for one, own in made.items()}
         print_json(found[name] if name else found)
+    elif style == "csv":
+        for own in made.values():
+            print_text(table_csv(own).rstrip("\n"))
     elif style == "table":
         for own in made.values():
             out.print(responsive_table(own.text))
     else:
         texts = (latex_table(own.text) if style == "latex" else markdown_text(own) for own in made.values())
         print_text("\n\n".join(text.rstrip("\n") for text in texts))
-    if not name and style != "json":
+    if not name and style not in ("json", "csv"):
         tests = sum(own.n_tests for own in made.values())
         say(f"{len(made)} tables with {tests} tests; each is corrected within its own comparison.")
     if len(made) < (1 if name else len(study.study.tables)) or any(own.is_partial for own in made.values()):
@@ -302,22 +308,6 @@ def pack(
     out.print(f"{out_file}: {len(made.keys)} runs, without {', '.join(made.left_out)}", soft_wrap=True)
     for name, reason in made.missing.items():
         out.print(f"not packed: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
-
-
-@app.command("track")
-def track(
-    file: File,
-    tracker: Annotated[Tracker, typer.Option("--to", help="Tracker; its own settings say where it logs to.")],
-    project: Annotated[
-        str, typer.Option("--project", metavar="NAME", help="Project, or MLflow's experiment.")
-    ] = "probe-kit",
-    partial: Partial = False,
-) -> None:
-    """Log all tables of a study to MLflow or Weights & Biases, once. Loads no model."""
-    from probe_kit.study import load_study, track_study
-
-    logged, is_new = track_study(load_study(file), tracker, project, partial)
-    out.print(f"{logged}{'' if is_new else ' (was logged before)'}", highlight=False, markup=False)
 
 
 @app.command("publish")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from probe_kit._system.csv_text import rows_of_csv
 from probe_kit.cli import app
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
@@ -17,7 +18,7 @@ from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.retention.formats.latex import latex_table
 from probe_kit.statistics.paired_tests import holm
-from probe_kit.study import LoadedStudy, load_study, write_study_report
+from probe_kit.study import LoadedStudy, load_study, make_table, write_study_report
 from probe_kit.study.tables.compared import difference_table, stages_table
 from probe_kit.study.tables.rates import score_table, success_table, vlm_table
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
@@ -171,6 +172,23 @@ def test_without_a_name_all_tables_are_printed_and_their_tests_are_counted(
     assert "no table drift: " in partly.stderr
     assert "4 tables" in partly.stderr
     assert run.invoke(app, ["study", "table", str(file)]).exit_code != 0
+
+
+def test_a_table_is_also_rows_of_csv_with_both_ends_of_intervals(played: LoadedStudy) -> None:
+    run = CliRunner()
+    numbers = make_table(played, "score").numbers
+    printed = run.invoke(app, ["study", "table", str(played.file), "score", "--format", "csv"])
+    rows = rows_of_csv(printed.stdout)
+    assert [row["system"] for row in rows] == [number["system"] for number in numbers]
+    assert [float(row["score"]) for row in rows] == [number["score"] for number in numbers]
+    assert [(row["score_ci_low"], row["score_ci_high"]) for row in rows] == [
+        ("", "") if number["score_ci"] is None else tuple(map(str, number["score_ci"])) for number in numbers
+    ]
+    assert "score_ci" not in rows[0]
+    every = run.invoke(app, ["study", "table", str(played.file), "--format", "csv"])
+    assert every.exit_code == 2
+    assert "one table" in every.stderr
+    assert "main, sides, score, light" in every.stderr
 
 
 def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: LoadedStudy, tmp_path: Path) -> None:
