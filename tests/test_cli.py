@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from probe_kit._terminal import console
 from probe_kit.cli import app
-from probe_kit.suite import Suite
+from probe_kit.suite import Suite, load_suite
 
 # The keys of `retention --format json` are part of the contract (architecture, command line).
 KEYS = {
@@ -241,9 +241,17 @@ def test_suite_build_list_and_show_go_together(tmp_path: Path) -> None:
     assert built.returncode == 0, built.stderr
     listed = in_process("suite", "list", tmp_path / "suite", "--json")
     assert json.loads(listed.stdout)["items"] == {"color": 4}
-    shown = in_process("suite", "show", tmp_path / "suite", "--out", tmp_path / "sheets")
-    assert shown.returncode == 0
-    assert [Path(line).is_file() for line in shown.stdout.split()] == [True]
+    shown = in_process("suite", "show", tmp_path / "suite", "--n", 2, "--json")
+    items = json.loads(shown.stdout)["items"]
+    suite = load_suite(tmp_path / "suite")
+    assert [item["item"] for item in items] == [item.item_id for item in suite.items[:2]]
+    for shown_item, item in zip(items, suite.items, strict=False):
+        assert shown_item["instruction"] == item.instruction
+        assert Path(shown_item["correct"]) == item.picture(item.correct_side)
+        assert Path(shown_item["wrong"]) != Path(shown_item["correct"])
+        assert Path(shown_item["wrong"]).is_file()
+    as_text = in_process("suite", "show", tmp_path / "suite")
+    assert " ".join(as_text.stdout.split()).count("Put the") == 4
 
 
 @pytest.mark.slow
