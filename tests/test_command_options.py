@@ -85,14 +85,13 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("intervene", "--kind"): KINDS,
     ("intervene", "--readout"): get_args(Readout),
     ("intervene", "--format"): get_args(get_args(Format)[0]),
-    ("export", "--dtype"): get_args(SaeDtype),
-    ("export", "--format"): FORMATS,
+    ("run export", "--dtype"): get_args(SaeDtype),
+    ("run export", "--format"): FORMATS,
     ("retention", "--format"): get_args(TableFormat),
     ("retention", "--details"): (*get_args(Section), "all"),
     ("retention", "--family"): get_args(Family),
     ("retention", "--rule"): RULES,
     ("retention", "--score"): SCORES,
-    ("stages", "--score"): SCORES,
     ("suite convert", "SOURCE"): EVERY_SOURCE,
 }
 """Command and option, and what the library accepts for it."""
@@ -101,9 +100,8 @@ REQUIRED = {
     "ask": ["--model", "vlm-tiny"],
     "train": ["RUN"],
     "intervene": ["RUN"],
-    "export": ["RUN", "--format", "sae"],
+    "run export": ["RUN", "--format", "sae"],
     "retention": ["RUN"],
-    "stages": ["VLM_RUN", "RUN"],
     "suite build": ["FOLDER"],
     "suite convert": ["--root", "ROOT", "--out", "OUT"],
 }

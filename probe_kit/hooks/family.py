@@ -132,8 +132,8 @@ class Family:
             text, words = next(iter(bad.items()))
             more = f", and {len(bad) - 1} further texts have such words" if len(bad) > 1 else ""
             raise InstructionError(
-                f"{self.name} does not know {', '.join(map(repr, words))} in {text!r}{more}. `probe-kit suite "
-                "words` lists the words it knows; other models read any text"
+                f"{self.name} does not know {', '.join(map(repr, words))} in {text!r}{more}. `probe-kit models "
+                "--words` lists the words it knows; other models read any text"
             )
 
     def load(

@@ -1,6 +1,7 @@
 """`probe-kit retention`."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -11,7 +12,7 @@ from probe_kit.retention import command_options as own
 from probe_kit.retention.label_commands import save_all, say_report
 
 if TYPE_CHECKING:
-    from probe_kit.retention.choices import Section
+    from probe_kit.retention.choices import Family, Section, TableFormat
 
 
 def retention(
@@ -31,6 +32,7 @@ def retention(
     epsilons: own.Epsilons = None,
     score: own.Score = "text",
     vlm_vla: own.VlmVla = False,
+    stages: own.Stages = False,
     with_side_words: own.SideWords = False,
     details: own.Details = own.NO_DETAILS,
     style: own.Style = "table",
@@ -40,32 +42,34 @@ def retention(
     """Print success rates and how much of the backbone's signal reaches the action stream.
 
     With `--target COLUMN` the signal is that of a label of your own, see `probe-kit train --target COLUMN`.
+
+    With `--stages` it compares a VLM and a policy question by question: answered, encoded, acted on. Answered: the
+    VLM answers right. Encoded: a probe of the policy reads the answer, above chance and controls. Acted on: the
+    cube ends on the correct picture. Both runs need the same first frames.
     """
+    given = locals()
     from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
     from probe_kit.extract import open_run
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
-    from probe_kit.retention.label_commands import show_label_retention
-    from probe_kit.retention.labels.table import label_retention_table
     from probe_kit.retention.rows.outcome_rules import check_epsilons
+    from probe_kit.retention.stages_command import show_stages
 
+    if stages:
+        _check_only(given, ("runs", "probes", "views", "wording", "score", "with_side_words", "style", "figures"))
+        common.check_no_others({f"--format {style}": style not in ("table", "json")}, "--stages")
+        paths = list(runs or ())
+        _check_doubles(paths)
+        check_file(figures)
+        key = _keys(paths, probes or [])[-1] if paths else None
+        show_stages(paths, views, key, wording, score, with_side_words, style == "json", figures)
+        return
     if target:
-        refused = {
-            "--group": group, "--against": against, "--rule": rule != "disc", "--last-steps": last_steps != 1,
-            "--epsilons": epsilons, "--score": score != "text", "--vlm-vla": vlm_vla,
-            "--with-side-words": with_side_words, "--details": details, "--absent-below": absent_below != 0.65,
-        }  # fmt: skip
-        common.check_no_others(refused)
-        if not runs:
-            raise UsageError("give run folders whose probes of a label are stored")
-        _check_doubles(runs)
-        _check_places(html, figures)
-        opened_runs = [open_run(p, allow_partial=partial).in_wording(wording) for p in runs]
-        labels = label_retention_table(
-            opened_runs, target, views, iterations=own.read_iterations(iterations),
-            keys=_keys(runs, probes or []), family=family,
-        )  # fmt: skip
-        show_label_retention(opened_runs, labels, style, html, figures)
+        _check_only(
+            given,
+            ("runs", "family", "probes", "views", "iterations", "wording", "partial", "style", "html", "figures"),
+        )
+        _show_labels(runs or (), target, family, probes, views, iterations, wording, partial, style, html, figures)
         return
     if family != "label":
         raise UsageError("--family is for labels of your own; give --target COLUMN too, or leave it out")
@@ -105,6 +109,48 @@ def retention(
         show(getattr(table, f"to_{style}")())
         for note in table.notes:
             say(marked("[yellow]note:[/] {}", note))
+
+
+def _show_labels(
+    runs: Sequence[str],
+    columns: Sequence[str],
+    family: "Family",
+    probes: list[str] | None,
+    views: Sequence[str] | None,
+    iterations: str,
+    wording: str | None,
+    partial: bool,
+    style: "TableFormat",
+    html: Path | None,
+    figures: Path | None,
+) -> None:
+    """The retention of labels of one's own, whose columns are given."""
+    from probe_kit.extract import open_run
+    from probe_kit.retention.label_commands import show_label_retention
+    from probe_kit.retention.labels.table import label_retention_table
+
+    if not runs:
+        raise UsageError("give run folders whose probes of a label are stored")
+    _check_doubles(runs)
+    _check_places(html, figures)
+    opened = [open_run(path, allow_partial=partial).in_wording(wording) for path in runs]
+    steps, keys = own.read_iterations(iterations), _keys(list(runs), probes or [])
+    table = label_retention_table(opened, columns, views, iterations=steps, keys=keys, family=family)
+    show_label_retention(opened, table, style, html, figures)
+
+
+def _check_only(given: Mapping[str, object], allowed: Collection[str]) -> None:
+    """Raise UsageError for an option of `retention` that differs from its default and does not go with the table.
+
+    given: the value of every parameter. allowed: those that go with `--stages` or `--target`, whichever is given.
+    """
+    what = "stages" if given["stages"] else "target"
+    others = {
+        f"--{'format' if name == 'style' else name.replace('_', '-')}": given[name] != parameter.default
+        for name, parameter in signature(retention).parameters.items()
+        if name not in (*allowed, what)
+    }
+    common.check_no_others(others, "--stages" if what == "stages" else "labels of your own")
 
 
 def _check_places(html: Path | None, figures: Path | None) -> None:

@@ -202,9 +202,7 @@ def convert(
     ] = None,
     emit_curation: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Write a file to review, with previews.", rich_help_panel=REVIEW
-        ),
+        typer.Option(metavar="FILE", help="Write a file to review, with previews.", rich_help_panel=REVIEW),
     ] = None,
     option: Annotated[
         list[str] | None,

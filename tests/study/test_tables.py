@@ -197,7 +197,7 @@ def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: Loa
     text = text.replace('label = "Idle"', 'label = "<b>Idle & 5 %</b>"')
     file.write_text(text, encoding="utf-8")
     before = file_times(Path(played.study.folder))
-    made = run.invoke(app, ["study", "report", str(file), "--html", str(page)])
+    made = run.invoke(app, ["study", "table", str(file), "--html", str(page)])
     assert made.exit_code == 0, made.output
     html = page.read_text(encoding="utf-8")
     made_of = (
@@ -218,28 +218,31 @@ def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: Loa
     assert write_study_report(load_study(file), page).html == html
     assert file_times(Path(played.study.folder)) == before
     file.write_text(text.replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8")
-    refused = run.invoke(app, ["study", "report", str(file), "--html", str(tmp_path / "other.html")])
+    both = run.invoke(app, ["study", "table", str(file), "main", "--html", str(page)])
+    assert both.exit_code == 2
+    assert "leave NAME and --format out" in both.stderr
+    refused = run.invoke(app, ["study", "table", str(file), "--html", str(tmp_path / "other.html")])
     assert refused.exit_code == 1
     assert not (tmp_path / "other.html").exists()
-    partly = run.invoke(app, ["study", "report", str(file), "--html", str(page), "--partial"])
+    partly = run.invoke(app, ["study", "table", str(file), "--html", str(page), "--partial"])
     assert partly.exit_code == 1
     assert "· dark is missing: not played yet" in page.read_text(encoding="utf-8")
 
 
-def test_status_finds_changed_bytes_and_runs_that_the_file_does_not_use(
+def test_a_dry_run_finds_changed_bytes_and_runs_that_the_file_does_not_use(
     played: LoadedStudy, tmp_path: Path
 ) -> None:
     out, file, run = copytree(played.study.folder, tmp_path / "out"), tmp_path / "study.toml", CliRunner()
     text = played.file.read_text(encoding="utf-8").replace(played.study.folder, str(out))
     file.write_text(text, encoding="utf-8")
-    words = ["study", "status", str(file), "--verify", "--orphans", "--json"]
+    words = ["study", "run", str(file), "--dry-run", "--exit-code", "--json", "--verify", "--orphans"]
     whole = run.invoke(app, words)
     assert whole.exit_code == 0, whole.output
     found = json.loads(whole.stdout)
     assert (found["problems"], found["orphans"]) == ({}, [])
     (commit, *_) = sorted(out.glob("expert/*/data.zarr/trajectory/c/1/*/*"))
     commit.write_bytes(commit.read_bytes()[:-1] + b"?")
-    assert run.invoke(app, words[:3]).exit_code == 0, "what is not read is not compared"
+    assert run.invoke(app, words[:-2]).exit_code == 0, "what is not read is not compared"
     file.write_text(text.replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8")
     changed = run.invoke(app, words)
     assert changed.exit_code == 1

@@ -43,7 +43,7 @@ def read_label(root: Root) -> str:
     if root.schema < _WITH_LABEL_FILE:
         return str(root.settings.get("label", root.settings["model"]))
     name = f"{root.location}/{LABEL_FILE}"
-    advice = f"Write it anew: `probe-kit run label {root.location} LABEL`"
+    advice = f"Write it anew: `probe-kit run show {root.location} --label LABEL`"
     try:
         record = read_record(root.location.read(LABEL_FILE), name, advice)
     except FileNotFoundError:

@@ -39,7 +39,7 @@ def test_words_are_separated_as_the_tokenizer_of_the_checkpoint_does(name: str, 
 def test_an_unknown_word_is_refused_by_name(name: str) -> None:
     family = find_family(name, ())
     family.check_words(TEXTS[:1])
-    with pytest.raises(InstructionError, match=r"does not know 'xylophone' in .* 1 further .*suite words"):
+    with pytest.raises(InstructionError, match=r"does not know 'xylophone' in .* 1 further .*models --words"):
         family.check_words(["Put the cube on the xylophone", "Put the cube on the zither"])
     family.check_words(["Put the cube on the xylophone"], checkpoint="a folder with a tokenizer of its own")
 
@@ -48,8 +48,8 @@ def test_other_families_read_any_text() -> None:
     find_family("pi0", ()).check_words(["Put the cube on the xylophone"])
 
 
-def test_suite_words_lists_every_word_and_no_special_token() -> None:
-    answer = CliRunner().invoke(app, ["suite", "words"])
+def test_models_words_lists_every_word_and_no_special_token() -> None:
+    answer = CliRunner().invoke(app, ["models", "--words"])
     assert answer.exit_code == 0
     listed = answer.stdout.split("\n")
     assert {"red", "square", "cube"} <= set(listed)
