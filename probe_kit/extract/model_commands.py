@@ -67,13 +67,14 @@ def models(
 
 
 def _print_words(name: str | None, run: str | None, as_json: bool) -> None:
-    from probe_kit.hooks.registry import find_family
-    from probe_kit.models.embedded.words import known_words
+    from probe_kit.extract.rollout.controllers import SCRIPTED
+    from probe_kit.hooks.registry import find_family, own_families
 
     check_no_others({"--run": run is not None}, "--words")
-    if name is not None and not find_family(name, ()).vocabulary:
+    families = list(own_families().values()) if name is None else [find_family(name, tuple(SCRIPTED))]
+    if not any(family.vocabulary for family in families):
         raise UsageError(f"{name} reads any text; --words lists those of embedded models. Leave --words out")
-    listed = sorted(word for word in known_words() if word.strip())
+    listed = sorted({word for family in families for word in family.known_words()})
     if as_json:
         print_json(listed)
     else:

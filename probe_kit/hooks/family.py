@@ -136,6 +136,11 @@ class Family:
                 "--words` lists the words it knows; other models read any text"
             )
 
+    def known_words(self) -> list[str]:
+        """Every word that an instruction of an embedded model may hold, sorted; none of a family of any text."""
+        known = import_module(self.vocabulary).known_words() if self.vocabulary else ()
+        return sorted(word for word in known if word.strip())
+
     def load(
         self,
         checkpoint: str | None,

@@ -1,5 +1,6 @@
 """The words of the embedded models: listed, and checked before a model is loaded."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,6 +56,10 @@ def test_models_words_lists_every_word_and_no_special_token() -> None:
     assert {"red", "square", "cube"} <= set(listed)
     assert set(filter(None, listed)) == {word for word in known_words() if word.strip()}
     assert not set(SPECIAL) & set(listed)
+    named = CliRunner().invoke(app, ["models", "vlm-tiny", "--words", "--json"])
+    assert json.loads(named.stdout) == list(filter(None, listed))
+    other = CliRunner().invoke(app, ["models", "pi0", "--words"])
+    assert (other.exit_code, "pi0 reads any text" in other.stderr) == (2, True)
 
 
 @pytest.mark.parametrize("settings", [ExtractSettings("pi0-tiny"), AskSettings("vlm-tiny")])
