@@ -57,7 +57,7 @@ def main() -> None:
 def free_accuracy(suite: Suite, width: int) -> dict[str, tuple[float, float]]:
     """By category, the accuracy of the best random layer and the mean of all."""
     run = ArrayRun(suite.folder, "none", suite.identity, _episodes(suite), {})
-    inputs = RandomFeatureInputs.of(run, suite.folder)
+    inputs = RandomFeatureInputs.of(run, suite)
     settings = ProbeSettings(
         model="none", random_weights=True, weights=None, suite=suite.identity, run_settings=run.settings_sha256,
         episodes=episodes_sha256(run), categories=tuple(suite.categories), views=("mean",), target="correct",
