@@ -1,10 +1,10 @@
 """What an untrained conjunction of pictures and words gets for free on the embedded suite, by category.
 
-    python benchmarks/suite_random_features.py [--versions 1,2] [--items 150] [--seeds 0] [--width 96]
+    python benchmarks/suite_random_features.py [--items 150] [--seeds 0] [--width 96]
         [--categories …]
 
 Accuracy in % of the control `random-features`: of its five random layers the best one, and their mean, on the
-control's own nested folds. No model is asked. Several seeds: other drawings of the same version, averaged.
+control's own nested folds. No model is asked. Several seeds: other drawings, averaged.
 """
 
 import argparse
@@ -31,7 +31,6 @@ from probe_kit.train.results.probe_results import episodes_sha256
 def main() -> None:
     """Draw the suites, fit the control, print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--versions", default="1,2")
     parser.add_argument("--items", type=int, default=150)
     parser.add_argument("--seeds", default="0")
     parser.add_argument("--width", type=int, default=96, help="units of a random layer; 96 is pi0-tiny's backbone")
@@ -39,28 +38,26 @@ def main() -> None:
     asked = parser.parse_args()
     categories = asked.categories.split(",") if asked.categories else None
     seeds = [int(seed) for seed in asked.seeds.split(",")]
-    found: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    found: dict[str, list[tuple[float, float]]] = {}
     with threadpool_limits(1), TemporaryDirectory() as scratch:
-        for version in asked.versions.split(","):
-            for seed in seeds:
-                folder = Path(scratch) / f"{version}-{seed}"
-                suite = build_suite(folder, categories, asked.items, seed, version=int(version))
-                for category, scores in free_accuracy(suite, asked.width).items():
-                    found.setdefault(category, {}).setdefault(version, []).append(scores)
+        for seed in seeds:
+            suite = build_suite(Path(scratch) / str(seed), categories, asked.items, seed)
+            for category, scores in free_accuracy(suite, asked.width).items():
+                found.setdefault(category, []).append(scores)
     table = Table(
         title=f"random-features, {asked.items} items, width {asked.width}: best and mean of {LAYERS} layers, %"
     )
-    for heading in ("category", *(f"version {version}" for version in asked.versions.split(","))):
+    for heading in ("category", "accuracy"):
         table.add_column(heading)
-    for category, by_version in found.items():
-        table.add_row(category, *(_cell(scores) for scores in by_version.values()))
+    for category, scores in found.items():
+        table.add_row(category, _cell(scores))
     Console().print(table)
 
 
 def free_accuracy(suite: Suite, width: int) -> dict[str, tuple[float, float]]:
     """By category, the accuracy of the best random layer and the mean of all."""
     run = ArrayRun(suite.folder, "none", suite.identity, _episodes(suite), {})
-    inputs = RandomFeatureInputs.of(run, suite.folder)
+    inputs = RandomFeatureInputs.of(run, suite)
     settings = ProbeSettings(
         model="none", random_weights=True, weights=None, suite=suite.identity, run_settings=run.settings_sha256,
         episodes=episodes_sha256(run), categories=tuple(suite.categories), views=("mean",), target="correct",

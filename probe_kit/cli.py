@@ -25,14 +25,12 @@ from probe_kit.extract.ask_commands import ask
 from probe_kit.extract.commands import extract
 from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
-from probe_kit.extract.run_commands import export
 from probe_kit.extract.source_commands.dataset_commands import app as dataset_app
 from probe_kit.extract.source_commands.environment_commands import check_environment
-from probe_kit.hooks.commands import new_adapter, verify, words
+from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.intervene.commands import KindHelp, intervene
 from probe_kit.intervene.show_command import show
 from probe_kit.retention.commands import retention
-from probe_kit.retention.known_used_command import stages
 from probe_kit.study.commands import app as study_app
 from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import train
@@ -43,12 +41,17 @@ from probe_kit.view.commands import RUNS_BY_NAME, view
 if TYPE_CHECKING:
     from probe_kit.extract import Run
 
-ORDER = (
-    "demo", "doctor", "models", "suite", "extract", "ask", "dataset", "run", "labels", "train", "power",
-    "intervene", "retention", "stages", "view", "study", "export", "new-adapter", "check-adapter",
-    "check-environment", "verify",
-)  # fmt: skip
-"""The order in which a study needs the commands, and help lists them; others follow by name."""
+PANELS = {
+    "Start": ("demo", "doctor", "models"),
+    "Make runs": ("suite", "extract", "ask", "dataset", "run"),
+    "Probe": ("power", "train", "labels"),
+    "Is it used?": ("intervene",),
+    "Read results": ("retention", "view"),
+    "A whole study from one file": ("study",),
+    "Your own model or environment": ("new-adapter", "check-adapter", "check-environment", "verify"),
+}
+"""Commands and groups by what one wants to do, in the order in which help lists them."""
+_PANEL_OF = {name: panel for panel, names in PANELS.items() for name in names}
 
 PARSE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
 """click's UsageError, from the copy of click that typer uses, whichever that is."""
@@ -62,9 +65,9 @@ class Commands(typer.core.TyperGroup):
     """Turns errors and interruptions of any command into messages and exit codes."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """All commands in the order of `ORDER`."""
-        known = {name: place for place, name in enumerate(ORDER)}
-        return sorted(super().list_commands(ctx), key=lambda name: (known.get(name, len(known)), name))
+        """All commands in the order of `PANELS`."""
+        order = {name: number for number, name in enumerate(_PANEL_OF)}
+        return sorted(super().list_commands(ctx), key=lambda name: (order.get(name, len(order)), name))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the options in front of the command."""
@@ -157,32 +160,15 @@ def _stored_runs_of_study(name: str) -> "list[Run] | None":
     return stored_runs_by_name(name)
 
 
-app.add_typer(suite_app, name="suite")
-app.add_typer(run_app, name="run")
-app.add_typer(study_app, name="study")
-app.add_typer(dataset_app, name="dataset")
+for name, commands in (("suite", suite_app), ("run", run_app), ("study", study_app), ("dataset", dataset_app)):
+    app.add_typer(commands, name=name, rich_help_panel=_PANEL_OF[name])
 run_app.command()(show)
-suite_app.command()(words)
 for command in (
-    extract,
-    ask,
-    export,
-    demo,
-    models,
-    verify,
-    new_adapter,
-    check_adapter,
-    check_environment,
-    labels,
-    train,
-    power,
-    retention,
-    stages,
-    view,
-    doctor,
+    *(demo, doctor, models, extract, ask, power, train, labels, retention, view),
+    *(new_adapter, check_adapter, check_environment, verify),
 ):
-    app.command()(command)
-app.command(cls=KindHelp)(intervene)
+    app.command(rich_help_panel=_PANEL_OF[command.__name__.replace("_", "-")])(command)
+app.command(cls=KindHelp, rich_help_panel=_PANEL_OF["intervene"])(intervene)
 RUNS_BY_NAME.append(_stored_runs_of_study)
 for group in (app, *(named.typer_instance for named in app.registered_groups)):
     for registered in group.registered_commands if group else ():

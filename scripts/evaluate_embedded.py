@@ -36,7 +36,6 @@ def main(
     categories: Annotated[str, typer.Option(help="Comma-separated.")] = ",".join(CATEGORIES),
     scene: Annotated[str, typer.Option(help="Preset.")] = "act2answer",
     early_stop: Annotated[bool, typer.Option(help="End an episode when the cube was released and lies.")] = True,
-    suite_version: Annotated[int, typer.Option(help="Of the embedded suite: 1 or 2.")] = 2,
     suite_seed: Annotated[int, typer.Option(help="Of the embedded suite.")] = 0,
     checkpoint: Annotated[str | None, typer.Option(help="A policy instead of the embedded one.")] = None,
     policy: Annotated[bool, typer.Option(help="Have the policy act.")] = True,
@@ -45,11 +44,10 @@ def main(
     place = SceneSpec.preset(scene, early_stop=early_stop)
     with progress() as bar:
         suite = build_suite(
-            out / f"suite-{suite_version}-{suite_seed}",
+            out / f"suite-{suite_seed}",
             categories.split(","),
             items,
             seed=suite_seed,
-            version=suite_version,
             progress=counter(bar, "suite"),
         )
         runs = [_asked(out, suite, place, prompt, counter(bar, prompt)) for prompt in prompts.split(",") if prompt]

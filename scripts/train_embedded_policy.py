@@ -34,9 +34,8 @@ SHARES = {"color": 0.36, "shape": 0.42, LEFT_OPEN: 0.22}
 """Of each category in a batch."""
 TABLE = "table"
 PICTURE_SEED = 715_517
-COUPLES = {1: 1200, 2: 9000}
-COUPLES_LEFT_OPEN = {1: 1200, 2: 2400}
-"""By version of the suite's pictures; the actions of the second follow from few."""
+COUPLES, COUPLES_LEFT_OPEN = 10_200, 3_600
+"""Of pictures per category. The actions of State follow from few."""
 DEMONSTRATIONS = range(90)
 BATCH = 32
 COMMON = "common"

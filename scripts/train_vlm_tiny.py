@@ -26,8 +26,8 @@ SHARES = {"color": 0.22, "shape": 0.32, "state": 0.22, "traffic": 0.24}
 PRESETS = ("bridge", "act2answer")
 SHEETS = {"side by side": (480, 560)}
 PICTURE_SEED = 715_517
-COUPLES = {1: 800, 2: 1600}
-"""By version of the suite's pictures."""
+COUPLES = 2_400
+"""Of pictures per category."""
 
 
 def main(

@@ -15,8 +15,8 @@ import pytest
 from typer.testing import CliRunner
 
 from probe_kit._terminal import console
-from probe_kit.cli import app
-from probe_kit.suite import Suite
+from probe_kit.cli import PANELS, app, commands_of
+from probe_kit.suite import Suite, load_suite
 
 # The keys of `retention --format json` are part of the contract (architecture, command line).
 KEYS = {
@@ -181,16 +181,26 @@ def test_importing_the_command_line_loads_nothing_heavy() -> None:
     assert loaded.stdout.strip() == "[]"
 
 
-def test_help_lists_the_commands_in_the_order_of_a_study() -> None:
+def test_help_groups_all_commands_by_what_one_wants_to_do() -> None:
     import typer
 
-    from probe_kit.cli import ORDER, app
-
     group = typer.main.get_command(app)
-    assert group.list_commands(None)[: len(ORDER)] == list(ORDER)  # type: ignore[attr-defined,arg-type]
+    names = [name for panel in PANELS.values() for name in panel]
+    assert group.list_commands(None) == names  # type: ignore[attr-defined,arg-type]
     shown = probe_kit("--help").stdout
-    places = [shown.index(f"│ {name} ") for name in ORDER]
-    assert places == sorted(places)
+    headings = [*(f"─ {panel} ─" for panel in PANELS), *(f"│ {name} " for name in names)]
+    places = {heading: shown.index(heading) for heading in headings}
+    for panel, commands in PANELS.items():
+        further = [places[f"─ {other} ─"] for other in PANELS if places[f"─ {other} ─"] > places[f"─ {panel} ─"]]
+        end = min(further, default=len(shown))
+        assert all(places[f"─ {panel} ─"] < places[f"│ {name} "] < end for name in commands)
+
+
+def test_there_are_at_most_thirty_commands_with_those_of_groups() -> None:
+    import typer
+
+    paths = [path for path, _ in commands_of(typer.main.get_command(app), None)]
+    assert len(paths) == len(set(paths)) <= 30, "merge a command into an option of its elder"
 
 
 def test_the_version_is_that_of_the_package() -> None:
@@ -223,7 +233,7 @@ def test_a_folder_of_runs_lists_the_runs_inside_and_a_near_name_is_suggested(
     )  # fmt: skip
     assert made.returncode == 0, made.stderr
     shutil.copytree(tmp_path / "runs" / "mine", tmp_path / "runs" / "yours")
-    for command in ("train", "retention", "export --format h5", "run verify", "models --run"):
+    for command in ("train", "retention", "run export --format h5", "run verify", "models --run"):
         answer = in_process(*command.split(), "runs", cwd=tmp_path)
         assert answer.returncode == 2, answer.stderr
         assert "It holds 2 runs: runs/mine, runs/yours" in answer.stderr, command
@@ -241,9 +251,17 @@ def test_suite_build_list_and_show_go_together(tmp_path: Path) -> None:
     assert built.returncode == 0, built.stderr
     listed = in_process("suite", "list", tmp_path / "suite", "--json")
     assert json.loads(listed.stdout)["items"] == {"color": 4}
-    shown = in_process("suite", "show", tmp_path / "suite", "--out", tmp_path / "sheets")
-    assert shown.returncode == 0
-    assert [Path(line).is_file() for line in shown.stdout.split()] == [True]
+    shown = in_process("suite", "show", tmp_path / "suite", "--n", 2, "--json")
+    items = json.loads(shown.stdout)["items"]
+    suite = load_suite(tmp_path / "suite")
+    assert [item["item"] for item in items] == [item.item_id for item in suite.items[:2]]
+    for shown_item, item in zip(items, suite.items, strict=False):
+        assert shown_item["instruction"] == item.instruction
+        assert Path(shown_item["correct"]) == item.picture(item.correct_side)
+        assert Path(shown_item["wrong"]) != Path(shown_item["correct"])
+        assert Path(shown_item["wrong"]).is_file()
+    as_text = in_process("suite", "show", tmp_path / "suite")
+    assert " ".join(as_text.stdout.split()).count("Put the") == 4
 
 
 @pytest.mark.slow

@@ -42,7 +42,6 @@ from probe_kit.retention.choices import AnswerScore, Family, Section, TableForma
 from probe_kit.scene_names import ArmName, Rendering, RuleName, SceneName
 from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
-from probe_kit.suite.generators.couples import SUITE_VERSIONS, SuiteVersion
 from probe_kit.suite.ladder import WORDINGS, Wording
 from probe_kit.train.choices import (
     BASELINES,
@@ -86,15 +85,13 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("intervene", "--kind"): KINDS,
     ("intervene", "--readout"): get_args(Readout),
     ("intervene", "--format"): get_args(get_args(Format)[0]),
-    ("export", "--dtype"): get_args(SaeDtype),
-    ("export", "--format"): FORMATS,
+    ("run export", "--dtype"): get_args(SaeDtype),
+    ("run export", "--format"): FORMATS,
     ("retention", "--format"): get_args(TableFormat),
     ("retention", "--details"): (*get_args(Section), "all"),
     ("retention", "--family"): get_args(Family),
     ("retention", "--rule"): RULES,
     ("retention", "--score"): SCORES,
-    ("stages", "--score"): SCORES,
-    ("suite build", "--suite-version"): SUITE_VERSIONS,
     ("suite convert", "SOURCE"): EVERY_SOURCE,
 }
 """Command and option, and what the library accepts for it."""
@@ -103,9 +100,8 @@ REQUIRED = {
     "ask": ["--model", "vlm-tiny"],
     "train": ["RUN"],
     "intervene": ["RUN"],
-    "export": ["RUN", "--format", "sae"],
+    "run export": ["RUN", "--format", "sae"],
     "retention": ["RUN"],
-    "stages": ["VLM_RUN", "RUN"],
     "suite build": ["FOLDER"],
     "suite convert": ["--root", "ROOT", "--out", "OUT"],
 }
@@ -149,7 +145,7 @@ def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> No
         (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Target, TARGETS),
         (Task, TASKS), (LabelControl, LABEL_CONTROLS),
         (Incomplete, INCOMPLETE), (Baseline, BASELINES), (FoldUnit, FOLD_UNITS), (Wording, WORDINGS),
-        (SuiteVersion, SUITE_VERSIONS), (ExportFormat, FORMATS),
+        (ExportFormat, FORMATS),
         (RuleName, RULES), (AnswerScore, SCORES),
     ],
 )  # fmt: skip

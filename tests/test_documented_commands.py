@@ -142,8 +142,7 @@ def test_a_command_is_accepted_as_it_is_typed(
 
 LOOKED_FOR = {
     "extract": "accepted so far|kitchen is no LeRobotDataset",
-    "show": "kitchen is no LeRobotDataset",
-    "errors": "Make one with",
+    "show": "kitchen is no LeRobotDataset|Make one with",
     "check-environment": "there is no module kitchen",
     "ask": "accepted so far",
     "view": "Make one with",
@@ -152,7 +151,6 @@ LOOKED_FOR = {
     "intervene": "Make one with",
     "retention": "Make one with",
     "export": "Make one with",
-    "stages": "Make one with",
     "from-csv": "questions.csv",
     "convert": "no such|not a folder|does not exist|holds no|missing",
 }
@@ -257,7 +255,6 @@ STAND_INS = {
     },
     "docs/storage.md": {
         r"backbone\.07": "backbone.02",
-        r"--format hf": "--format parquet",
         r"tokens:image": "mean:image",
     },
     "docs/suite.md": {r"(--model pi0-tiny)": r"\1 --max-steps 4"},

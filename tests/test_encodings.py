@@ -105,7 +105,7 @@ def test_pages_and_tables_are_utf_8_under_a_locale_that_is_not(
         ["retention", *groups, "--format", "csv"],
         ["suite", "validate", str(small_suite.folder)],
         ["suite", "build", str(tmp_path / "built"), "--categories", "color", "--n", "2"],
-        ["export", other, "--format", "h5", "--out", str(tmp_path / "run.h5")],
+        ["run", "export", other, "--format", "h5", "--out", str(tmp_path / "run.h5")],
     ]
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", COMMANDS, json.dumps(asked)], env=locale, capture_output=True,

@@ -248,7 +248,7 @@ Frames = Annotated[
     _storage_option(
         "--frames",
         help="ends: store the first and last frame of every episode in small. all: store every frame, for the "
-        "viewer and for films.",
+        "viewer and for data sets.",
     ),
 ]
 Video = Annotated[VideoChoice, _storage_option("--video", help="Store a GIF of the first episode or of all.")]

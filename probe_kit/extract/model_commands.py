@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from probe_kit._terminal.console import marked, out, print_json
-from probe_kit._terminal.options import AsJson
+from probe_kit._terminal.console import marked, out, print_json, print_text
+from probe_kit._terminal.options import AsJson, check_no_others
+from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.card import EMBEDDED
 
 if TYPE_CHECKING:
@@ -16,12 +17,21 @@ if TYPE_CHECKING:
 def models(
     name: Annotated[str | None, typer.Argument(help="Model to show. Default: all.")] = None,
     run: Annotated[str | None, typer.Option(metavar="RUN", help="Show the certificate of this run.")] = None,
+    words: Annotated[
+        bool,
+        typer.Option(
+            "--words", help="List the words that the embedded models know, one per line. Others read any text."
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """List the models, one per line. With NAME: its checkpoint, streams, options and missing requirements.
 
     A third party's model is imported only when it is named.
     """
+    if words:
+        _print_words(name, run, as_json)
+        return
     if run is not None:
         from probe_kit.extract import open_run
 
@@ -54,6 +64,21 @@ def models(
             default = f" Default {option['default']}." if option["default"] else ""
             line = f"-M {option['name']}={option['kind'].upper()}  {option['help']}{default}"
             out.print(marked("  [dim]option    [/] {}", line), soft_wrap=True)
+
+
+def _print_words(name: str | None, run: str | None, as_json: bool) -> None:
+    from probe_kit.extract.rollout.controllers import SCRIPTED
+    from probe_kit.hooks.registry import find_family, own_families
+
+    check_no_others({"--run": run is not None}, "--words")
+    families = list(own_families().values()) if name is None else [find_family(name, tuple(SCRIPTED))]
+    if not any(family.vocabulary for family in families):
+        raise UsageError(f"{name} reads any text; --words lists those of embedded models. Leave --words out")
+    listed = sorted({word for family in families for word in family.known_words()})
+    if as_json:
+        print_json(listed)
+    else:
+        print_text("\n".join(listed))
 
 
 def _listed(rows: list[dict[str, Any]]) -> Text:

@@ -1,4 +1,4 @@
-"""`probe-kit run` and `probe-kit export`: inspect, verify, seal, label, copy and export runs."""
+"""`probe-kit run`: verify, seal, copy and export runs."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -6,11 +6,11 @@ from typing import Annotated
 
 import typer
 
-from probe_kit._terminal.console import err, out, print_json
+from probe_kit._terminal.console import err, out, print_json, say
 from probe_kit._terminal.options import LISTED, AsJson, Names, Partial, RunFolder
 from probe_kit.extract.run_layout import ExportFormat, SaeDtype
 
-app = typer.Typer(help="Inspect, verify and finalise runs.", no_args_is_help=True)
+app = typer.Typer(help="Inspect, verify, copy and export runs.", no_args_is_help=True)
 DAMAGED = 1
 
 
@@ -18,11 +18,17 @@ DAMAGED = 1
 def verify(
     run: RunFolder,
     deep: Annotated[bool, typer.Option("--deep", help="Read every byte.")] = False,
+    build: Annotated[
+        bool,
+        typer.Option("--seal", help="First build the columns that make probing fast."),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Check a run against its stored hashes; exit with 1 if anything is missing or changed."""
-    from probe_kit.extract import verify_run
+    from probe_kit.extract import seal, verify_run
 
+    if build:
+        say("sealed" if seal(run) else "nothing to seal")
     found = verify_run(run, deep)
     if as_json:
         print_json({**asdict(found), "ok": found.ok, "finished": found.finished})
@@ -47,26 +53,6 @@ def verify(
         raise typer.Exit(DAMAGED)
 
 
-@app.command("seal")
-def seal_run(run: RunFolder) -> None:
-    """Build the columns that make probing fast; `extract` builds them at its end."""
-    from probe_kit.extract import seal
-
-    out.print("sealed" if seal(run) else "nothing to do")
-
-
-@app.command("label")
-def label(
-    run: Annotated[str, typer.Argument(help="Run folder or URL.")],
-    text: Annotated[str, typer.Argument(help="What tables and figures call the run from now on.")],
-) -> None:
-    """Give a run another label; its numbers, hashes and probes stay as they are."""
-    from probe_kit.extract import label_run
-
-    label_run(run, text)
-    out.print(f"{run}: {text}", markup=False, highlight=False, soft_wrap=True)
-
-
 @app.command("copy")
 def copy(
     run: RunFolder,
@@ -81,14 +67,14 @@ def copy(
         out.print(str(copy_run(run, out_folder, pictures, partial).location), soft_wrap=True)
 
 
+@app.command("export")
 def export(
     run: RunFolder,
     style: Annotated[
         ExportFormat,
         typer.Option(
             "--format",
-            help="Format. mp4, lerobot, rerun, hf and sae write a folder; the first three need a run with "
-            "--frames all.",
+            help="Format. lerobot and sae write a folder; lerobot needs a run with --frames all.",
         ),
     ],
     out_file: Annotated[
@@ -100,15 +86,15 @@ def export(
         typer.Option(
             "--sites",
             **LISTED,
-            help="Of parquet, npz, hf and sae: sites, such as backbone.07, expert or expert.*@9. Default: all.",
+            help="Of parquet and sae: sites, such as backbone.07, expert or expert.*@9. Default: all.",
         ),
     ] = None,
     view: Annotated[
         str | None,
         typer.Option(
             "--view",
-            help="Of the same formats: a pooled view, tokens or tokens:ROLE. Default: all pooled views, or "
-            "mean in npz and sae.",
+            help="Of parquet and sae: a pooled view, tokens or tokens:ROLE. Default: all pooled views, or "
+            "mean in sae.",
         ),
     ] = None,
     dtype: Annotated[SaeDtype, typer.Option("--dtype", help="Of sae: type of the memory maps.")] = "bfloat16",

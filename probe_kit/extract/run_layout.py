@@ -65,7 +65,7 @@ FRAME_COLUMNS = 8
 """Frames to a row of the picture that holds them."""
 MOST_FRAMES = FRAME_COLUMNS * 68
 """In one picture: a WebP may not exceed 16,383 pixels a side, and a frame of a film is 240 high."""
-ExportFormat = Literal["h5", "safetensors", "mp4", "lerobot", "rerun", "parquet", "npz", "hf", "sae"]
+ExportFormat = Literal["h5", "safetensors", "lerobot", "parquet", "sae"]
 SaeDtype = Literal["bfloat16", "float16"]
 """What a memory map to train sparse autoencoders on holds."""
 CAPTURE_ONLY = "capture_only"

@@ -1,26 +1,16 @@
-"""`probe-kit verify`, `probe-kit new-adapter` and `probe-kit suite words`."""
+"""`probe-kit verify` and `probe-kit new-adapter`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from probe_kit._terminal.console import err, marked, out, print_json, print_text
+from probe_kit._terminal.console import err, marked, out, print_json
 from probe_kit._terminal.options import AsJson
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
     from probe_kit.hooks.verification.verify import Verification
-
-
-def words() -> None:
-    """List the words that the embedded models know, one per line.
-
-    Instructions of a suite for them use these words only. Other models read any text.
-    """
-    from probe_kit.models.embedded.words import known_words
-
-    print_text("\n".join(sorted(word for word in known_words() if word.strip())))
 
 
 def verify(

@@ -132,9 +132,14 @@ class Family:
             text, words = next(iter(bad.items()))
             more = f", and {len(bad) - 1} further texts have such words" if len(bad) > 1 else ""
             raise InstructionError(
-                f"{self.name} does not know {', '.join(map(repr, words))} in {text!r}{more}. `probe-kit suite "
-                "words` lists the words it knows; other models read any text"
+                f"{self.name} does not know {', '.join(map(repr, words))} in {text!r}{more}. `probe-kit models "
+                "--words` lists the words it knows; other models read any text"
             )
+
+    def known_words(self) -> list[str]:
+        """Every word that an instruction of an embedded model may hold, sorted; none of a family of any text."""
+        known = import_module(self.vocabulary).known_words() if self.vocabulary else ()
+        return sorted(word for word in known if word.strip())
 
     def load(
         self,

@@ -1,4 +1,4 @@
-"""Options of `probe-kit retention` and `probe-kit stages`, by help panel."""
+"""Options of `probe-kit retention`, by help panel."""
 
 from math import inf
 from pathlib import Path
@@ -166,6 +166,14 @@ Score = Annotated[
 VlmVla = Annotated[
     bool,
     typer.Option("--vlm-vla", help="Test VLM − VLA: VLM runs against policy runs.", rich_help_panel=VLM_RUNS),
+]
+Stages = Annotated[
+    bool,
+    typer.Option(
+        "--stages",
+        help="Compare VLM_RUN and RUN question by question: answered, encoded, acted on.",
+        rich_help_panel=VLM_RUNS,
+    ),
 ]
 SideWords = Annotated[
     bool,

@@ -1,6 +1,7 @@
 """`probe-kit retention`."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -11,9 +12,19 @@ from probe_kit.retention import command_options as own
 from probe_kit.retention.label_commands import save_all, say_report
 
 if TYPE_CHECKING:
-    from probe_kit.retention.choices import Section, TableFormat
+    from probe_kit.retention.choices import Family, Section, TableFormat
     from probe_kit.retention.formats.as_paper import PaperTable
     from probe_kit.retention.table import RetentionTable
+
+WITH_STAGES = ("runs", "probes", "views", "wording", "score", "with_side_words", "style", "figures")
+WITH_TARGET = (
+    "runs", "family", "probes", "views", "iterations", "wording", "partial", "style", "html", "figures",
+)  # fmt: skip
+WITH_AS_PAPER = (
+    "runs", "probes", "views", "iterations", "wording", "partial", "rule", "last_steps", "score", "with_side_words",
+    "style",
+)  # fmt: skip
+"""Options of `retention` that go with another table than its own."""
 
 
 def retention(
@@ -33,6 +44,7 @@ def retention(
     epsilons: own.Epsilons = None,
     score: own.Score = "text",
     vlm_vla: own.VlmVla = False,
+    stages: own.Stages = False,
     with_side_words: own.SideWords = False,
     details: own.Details = own.NO_DETAILS,
     as_paper: own.AsPaper = False,
@@ -43,43 +55,37 @@ def retention(
     """Print success rates and how much of the backbone's signal reaches the action stream.
 
     With `--target COLUMN` the signal is that of a label of your own, see `probe-kit train --target COLUMN`.
+
+    With `--stages` it compares a VLM and a policy question by question: answered, encoded, acted on. Answered: the
+    VLM answers right. Encoded: a probe of the policy reads the answer, above chance and controls. Acted on: the
+    cube ends on the correct picture. Both runs need the same first frames.
     """
+    given = locals()
     from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
     from probe_kit.extract import open_run
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
-    from probe_kit.retention.label_commands import show_label_retention
-    from probe_kit.retention.labels.table import label_retention_table
     from probe_kit.retention.rows.outcome_rules import check_epsilons
+    from probe_kit.retention.stages_command import show_stages
 
+    if stages:
+        _check_only(given, WITH_STAGES)
+        common.check_no_others({f"--format {style}": style not in ("table", "json")}, "--stages")
+        paths = list(runs or ())
+        _check_doubles(paths)
+        check_file(figures)
+        key = _keys(paths, probes or [])[-1] if paths else None
+        show_stages(paths, views, key, wording, score, with_side_words, style == "json", figures)
+        return
     if target:
-        refused = {
-            "--group": group, "--against": against, "--rule": rule != "disc", "--last-steps": last_steps != 1,
-            "--epsilons": epsilons, "--score": score != "text", "--vlm-vla": vlm_vla,
-            "--with-side-words": with_side_words, "--details": details, "--absent-below": absent_below != 0.65,
-            "--as-paper": as_paper,
-        }  # fmt: skip
-        common.check_no_others(refused)
-        if not runs:
-            raise UsageError("give run folders whose probes of a label are stored")
-        _check_doubles(runs)
-        _check_places(html, figures)
-        opened_runs = [open_run(p, allow_partial=partial).in_wording(wording) for p in runs]
-        labels = label_retention_table(
-            opened_runs, target, views, iterations=own.read_iterations(iterations),
-            keys=_keys(runs, probes or []), family=family,
-        )  # fmt: skip
-        show_label_retention(opened_runs, labels, style, html, figures)
+        _check_only(given, WITH_TARGET)
+        _show_labels(runs or (), target, family, probes, views, iterations, wording, partial, style, html, figures)
         return
     if family != "label":
         raise UsageError("--family is for labels of your own; give --target COLUMN too, or leave it out")
     if as_paper:
-        refused = {
-            "--group": group, "--against": against, "--epsilons": epsilons, "--absent-below": absent_below != 0.65,
-            "--score order-balanced": score == "order-balanced", "--vlm-vla": vlm_vla, "--details": details,
-            "--html": html is not None, "--figures": figures is not None,
-        }  # fmt: skip
-        common.check_no_others(refused, "the paper's own numbers (--as-paper)")
+        _check_only(given, WITH_AS_PAPER)
+        common.check_no_others({f"--score {score}": score == "order-balanced"}, "--as-paper")
     check_epsilons(rule, epsilons is not None)
     if bool(runs) == bool(group):
         raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
@@ -127,6 +133,53 @@ def _print(table: "RetentionTable | PaperTable", style: "TableFormat", notes: Se
         show(getattr(table, f"to_{style}")())
     for note in notes:
         say(marked("[yellow]note:[/] {}", note))
+
+
+def _show_labels(
+    runs: Sequence[str],
+    columns: Sequence[str],
+    family: "Family",
+    probes: list[str] | None,
+    views: Sequence[str] | None,
+    iterations: str,
+    wording: str | None,
+    partial: bool,
+    style: "TableFormat",
+    html: Path | None,
+    figures: Path | None,
+) -> None:
+    """The retention of labels of one's own, whose columns are given."""
+    from probe_kit.extract import open_run
+    from probe_kit.retention.label_commands import show_label_retention
+    from probe_kit.retention.labels.table import label_retention_table
+
+    if not runs:
+        raise UsageError("give run folders whose probes of a label are stored")
+    _check_doubles(runs)
+    _check_places(html, figures)
+    opened = [open_run(path, allow_partial=partial).in_wording(wording) for path in runs]
+    steps, keys = own.read_iterations(iterations), _keys(list(runs), probes or [])
+    table = label_retention_table(opened, columns, views, iterations=steps, keys=keys, family=family)
+    show_label_retention(opened, table, style, html, figures)
+
+
+def _check_only(given: Mapping[str, object], allowed: Collection[str]) -> None:
+    """Raise UsageError for an option of `retention` that differs from its default and does not go with the table.
+
+    given: the value of every parameter, `stages`, `target` or `as_paper` among them. allowed: those that go with it.
+    """
+    what = next(name for name in ("stages", "target", "as_paper") if given[name])
+    others = {
+        f"--{'format' if name == 'style' else name.replace('_', '-')}": given[name] != parameter.default
+        for name, parameter in signature(retention).parameters.items()
+        if name not in (*allowed, what)
+    }
+    words = {
+        "stages": "--stages",
+        "target": "labels of your own",
+        "as_paper": "the paper's own numbers (--as-paper)",
+    }
+    common.check_no_others(others, words[what])
 
 
 def _check_places(html: Path | None, figures: Path | None) -> None:

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from probe_kit.study.packing.pack import pack_study
     from probe_kit.study.packing.publishing import publish_data_set
     from probe_kit.study.packing.report import write_study_report
-    from probe_kit.study.packing.trackers import track_study
     from probe_kit.study.planning.plan import StudyPlan, plan_study
     from probe_kit.study.reading import LoadedStudy, load_study
     from probe_kit.study.running.calibrating import calibrate_study
@@ -44,7 +43,6 @@ __all__ = [
     "pack_study",
     "plan_study",
     "publish_data_set",
-    "track_study",
     "write_data_set",
     "write_study_report",
 ]
@@ -61,7 +59,6 @@ __getattr__, __dir__ = lazy_names(
         "make_figures": "figures",
         "pack_study": "packing.pack",
         "publish_data_set": "packing.publishing",
-        "track_study": "packing.trackers",
         "write_data_set": "packing.data_set",
         "write_study_report": "packing.report",
         "StudyPlan": "planning.plan",

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from probe_kit._terminal.console import counter, err, marked, out, print_json, print_text, progress, say
-from probe_kit._terminal.options import AsJson, EnvWorkers, Partial, RayAddress, speed_option
+from probe_kit._terminal.options import AsJson, EnvWorkers, Partial, RayAddress, check_no_others, speed_option
 from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.study.planning.plan_lines import print_plan
 from probe_kit.train.command_options import Jobs
 
 if TYPE_CHECKING:
-    from probe_kit.study import Failure, StudyPlan
+    from probe_kit.study import Failure, LoadedStudy, StudyPlan
     from probe_kit.study.running.model_task import Event
     from probe_kit.study.tables.named_table import NamedTable
 
@@ -25,13 +25,12 @@ Stored runs are never played again.
 \b
 probe-kit study run embedded --dry-run
 probe-kit study run embedded
-probe-kit study status embedded
 probe-kit study table embedded success
 """
 app = typer.Typer(help=HELP, no_args_is_help=True)
 UNFINISHED = 1
-Tracker = Literal["mlflow", "wandb"]
-Style = Literal["table", "markdown", "latex", "json"]
+DATA_SET = "Data set"
+Style = Literal["table", "csv", "markdown", "latex", "json"]
 File = Annotated[
     str,
     typer.Argument(metavar="FILE", help="Study file, or the name of a study of the package: embedded or paper."),
@@ -47,6 +46,20 @@ def run(
     only: Only = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the plan and stop. Loads no model and writes no run.")
+    ] = False,
+    exit_code: Annotated[
+        bool, typer.Option("--exit-code", help="With --dry-run: exit with 1 if anything is missing.")
+    ] = False,
+    verify: Annotated[
+        bool,
+        typer.Option(
+            "--verify",
+            help="With --dry-run: compare every stored byte with its hash; exit with 1 if one was changed. Takes "
+            "long.",
+        ),
+    ] = False,
+    orphans: Annotated[
+        bool, typer.Option("--orphans", help="With --dry-run: list stored runs that the file does not use.")
     ] = False,
     as_json: AsJson = False,
     no_probes: Annotated[bool, typer.Option("--no-probes", help="Fit no probes.")] = False,
@@ -73,10 +86,12 @@ def run(
     """Play and ask what a study needs and is not stored yet, then fit its probes.
 
     Each model is loaded once. A model that fails stops itself alone, and the ledger keeps the reason.
-    The same command resumes. What failed while it played is tried again with --retry-failed.
+    The same command resumes. What failed while it played is tried again with --retry-failed. --dry-run prints
+    what is stored, and why other runs are to be made.
 
     \b
     probe-kit study run mine.toml --dry-run
+    probe-kit study run mine.toml --dry-run --verify --orphans
     probe-kit study run mine.toml --slots 2
     probe-kit study run mine.toml --only base --retry-failed
     """
@@ -84,6 +99,10 @@ def run(
 
     if slots and ray is not None:
         raise UsageError("give either --slots, for processes of this machine, or --ray, for a cluster")
+    looks = {"--exit-code": exit_code, "--verify": verify, "--orphans": orphans}
+    if not dry_run and any(looks.values()):
+        named = next(name for name, is_on in looks.items() if is_on)
+        raise UsageError(f"{named} looks at what is stored and plays nothing; give it with --dry-run")
     study = load_study(file)
     if study.archive is not None and not dry_run:
         raise UsageError(f"{file} is an archive without activations; nothing can be added to its runs")
@@ -91,7 +110,9 @@ def run(
     if calibrate:
         plan = _calibrated(plan, env_workers)
     if dry_run:
-        _print(plan, as_json)
+        changed = _look(plan, verify, orphans, as_json)
+        if changed or (exit_code and not plan.whole):
+            raise typer.Exit(UNFINISHED)
         return
     failed = _played(plan, slots=slots, ray=ray, env_workers=env_workers, retry_failed=retry_failed)
     if plan.totals()["missing"]:
@@ -108,6 +129,23 @@ def run(
 
 def _print(plan: "StudyPlan", as_json: bool) -> None:
     print_json(plan.to_json()) if as_json else print_plan(plan)
+
+
+def _look(plan: "StudyPlan", verify: bool, orphans: bool, as_json: bool) -> bool:
+    """Print the plan, changed bytes and unused runs; return whether a byte was changed."""
+    from probe_kit.study.planning.stored_checks import changed_runs, orphaned_runs
+
+    problems = changed_runs(plan) if verify else {}
+    unused = orphaned_runs(plan) if orphans else []
+    if as_json:
+        further = {"problems": problems} if verify else {}
+        print_json({**plan.to_json(), **further, **({"orphans": unused} if orphans else {})})
+    else:
+        print_plan(plan)
+        lines = [f"damaged: {name}: {problem}" for name, texts in problems.items() for problem in texts]
+        for line in (*lines, *(f"used by no run of the file: {location}" for location in unused)):
+            out.print(line, highlight=False, markup=False, soft_wrap=True)
+    return bool(problems)
 
 
 def _calibrated(plan: "StudyPlan", env_workers: int | None) -> "StudyPlan":
@@ -157,40 +195,6 @@ def _probed(plan: "StudyPlan", jobs: int | None) -> "list[Failure]":
         return [one for one in fit_probes(plan, count, jobs) if one.stage != "waiting"]
 
 
-@app.command("status")
-def status(
-    file: File,
-    only: Only = None,
-    as_json: AsJson = False,
-    verify: Annotated[
-        bool, typer.Option("--verify", help="Compare every stored byte with its hash; takes long.")
-    ] = False,
-    orphans: Annotated[
-        bool, typer.Option("--orphans", help="List stored runs that the file does not use.")
-    ] = False,
-) -> None:
-    """Print what is stored of a study, and why other runs are to be made; exit with 1 if anything is missing.
-
-    With --verify it also exits with 1 if a stored byte was changed. Nothing is deleted.
-    """
-    from probe_kit.study import load_study, plan_study
-    from probe_kit.study.planning.stored_checks import changed_runs, orphaned_runs
-
-    plan = plan_study(load_study(file), only)
-    problems = changed_runs(plan) if verify else {}
-    others = orphaned_runs(plan) if orphans else []
-    if as_json:
-        further = {"problems": problems} if verify else {}
-        print_json({**plan.to_json(), **further, **({"orphans": others} if orphans else {})})
-    else:
-        print_plan(plan)
-        lines = [f"damaged: {name}: {one}" for name, found in problems.items() for one in found]
-        for line in (*lines, *(f"used by no run of the file: {place}" for place in others)):
-            out.print(line, highlight=False, markup=False, soft_wrap=True)
-    if problems or not plan.whole:
-        raise typer.Exit(UNFINISHED)
-
-
 @app.command("table")
 def table(
     file: File,
@@ -198,6 +202,10 @@ def table(
         str | None, typer.Argument(metavar="[NAME]", help="Table of the file; all of them by default.")
     ] = None,
     style: Annotated[Style, typer.Option("--format", help="Output format.")] = "table",
+    html: Annotated[
+        Path | None,
+        typer.Option("--html", metavar="FILE", help="Write state, all tables and all figures as one HTML file."),
+    ] = None,
     partial: Partial = False,
 ) -> None:
     """Print a table of a study, or all, from its stored runs. Loads no model.
@@ -207,9 +215,18 @@ def table(
     from probe_kit.retention.formats.latex import latex_table
     from probe_kit.retention.formats.terminal import responsive_table
     from probe_kit.study import load_study, make_table
-    from probe_kit.study.tables.formats import markdown_text, table_json
+    from probe_kit.study.tables.formats import markdown_text, table_csv, table_json
 
     study = load_study(file)
+    if html is not None:
+        if name is not None or style != "table":
+            raise UsageError("--html holds all tables and figures; leave NAME and --format out")
+        _write_report(study, html, partial)
+        return
+    if style == "csv" and name is None and len(study.study.tables) > 1:
+        raise UsageError(
+            f"--format csv prints one table, and {file} has {', '.join(study.study.tables)}; give the name of one"
+        )
     made: dict[str, NamedTable] = {}
     for one in [name] if name else study.study.tables:
         try:
@@ -221,16 +238,34 @@ def table(
     if style == "json":
         found = {one: table_json(own) for one, own in made.items()}
         print_json(found[name] if name else found)
+    elif style == "csv":
+        for own in made.values():
+            print_text(table_csv(own).rstrip("\n"))
     elif style == "table":
         for own in made.values():
             out.print(responsive_table(own.text))
     else:
         texts = (latex_table(own.text) if style == "latex" else markdown_text(own) for own in made.values())
         print_text("\n\n".join(text.rstrip("\n") for text in texts))
-    if not name and style != "json":
+    if not name and style not in ("json", "csv"):
         tests = sum(own.n_tests for own in made.values())
         say(f"{len(made)} tables with {tests} tests; each is corrected within its own comparison.")
     if len(made) < (1 if name else len(study.study.tables)) or any(own.is_partial for own in made.values()):
+        raise typer.Exit(UNFINISHED)
+
+
+def _write_report(study: "LoadedStudy", html: Path, partial: bool) -> None:
+    from probe_kit.retention.label_commands import say_report
+    from probe_kit.study import write_study_report
+
+    if html.is_dir():
+        raise UsageError(f"--html {html} is a folder; give a file, such as {html / 'report.html'}")
+    with err.status("drawing the report"):
+        made = write_study_report(study, html, partial)
+    say_report(html)
+    for name, reason in made.missing.items():
+        say(marked("[red]no {}: {}[/]", name, reason))
+    if made.is_partial:
         raise typer.Exit(UNFINISHED)
 
 
@@ -257,45 +292,78 @@ def figure(
             out.print(str(path), highlight=False, markup=False, soft_wrap=True)
 
 
-@app.command("report")
-def report(
-    file: File,
-    html: Annotated[Path, typer.Option("--html", metavar="PATH", help="HTML file to write.")],
-    partial: Partial = False,
-) -> None:
-    """Write state, all tables and all figures of a study as one HTML file, from its stored runs. Loads no model.
-
-    With --partial the command exits with 1 if anything is missing that the study would play.
-    """
-    from probe_kit.retention.label_commands import say_report
-    from probe_kit.study import load_study, write_study_report
-
-    if html.is_dir():
-        raise UsageError(f"--html {html} is a folder; give a file, such as {html / 'report.html'}")
-    with err.status("drawing the report"):
-        made = write_study_report(load_study(file), html, partial)
-    say_report(html)
-    for name, reason in made.missing.items():
-        say(marked("[red]no {}: {}[/]", name, reason))
-    if made.is_partial:
-        raise typer.Exit(UNFINISHED)
-
-
 @app.command("pack")
 def pack(
     file: File,
-    out_file: Annotated[Path, typer.Option("--out", metavar="PATH", help="Zip file (*.zip), or a folder.")],
+    out_file: Annotated[
+        Path, typer.Option("--out", metavar="PATH", help="Zip file (*.zip), or a folder. A folder for a data set.")
+    ],
     directions: Annotated[bool, typer.Option("--directions", help="With the weights of probes.")] = False,
     pictures: Annotated[bool, typer.Option("--pictures", help="With frames and videos.")] = False,
     trajectories: Annotated[
         bool, typer.Option("--trajectories", help="With what happened step by step, for other outcome rules.")
     ] = False,
+    data_set: Annotated[
+        bool,
+        typer.Option(
+            "--data-set",
+            help="Write a data set: card, episodes, tables, archive and hashes.",
+            rich_help_panel=DATA_SET,
+        ),
+    ] = False,
+    publish: Annotated[
+        str | None,
+        typer.Option(
+            "--publish",
+            metavar="OWNER/NAME",
+            help="Upload the data set to this repository of the hub.",
+            rich_help_panel=DATA_SET,
+        ),
+    ] = None,
+    pull_request: Annotated[
+        bool,
+        typer.Option(
+            "--pr", help="With --publish: open a pull request in a data set that exists.", rich_help_panel=DATA_SET
+        ),
+    ] = False,
+    private: Annotated[
+        bool,
+        typer.Option("--private", help="With --publish: make a new data set private.", rich_help_panel=DATA_SET),
+    ] = False,
+    licence: Annotated[
+        str | None,
+        typer.Option(
+            "--license",
+            metavar="NAME",
+            help="Licence of the data set, such as cc-by-4.0.",
+            rich_help_panel=DATA_SET,
+        ),
+    ] = None,
     partial: Partial = False,
 ) -> None:
-    """Pack runs without activations, and all tables; `study table PATH` prints them from the archive alone."""
+    """Pack runs without activations, and all tables; `study table PATH` prints them from the archive alone.
+
+    With --publish the pack is a data set of the Hugging Face hub.
+    """
     from probe_kit.study import load_study, pack_study
     from probe_kit.study.packing.pack import EXTRAS
 
+    if publish is None and (pull_request or private):
+        raise UsageError(
+            f"{'--pr' if pull_request else '--private'} is of an upload; give --publish OWNER/NAME too"
+        )
+    if data_set or publish is not None:
+        check_no_others(
+            {"--directions": directions, "--pictures": pictures, "--trajectories": trajectories}, "a data set"
+        )
+        _write_data_set(load_study(file), out_file, partial, licence)
+        if publish is None:
+            out.print(str(out_file), highlight=False, markup=False, soft_wrap=True)
+            return
+        _upload(out_file, publish, pull_request, private)
+        return
+    if licence is not None:
+        raise UsageError("--license is of a data set; give --data-set or --publish OWNER/NAME too")
     asked = dict(zip(EXTRAS, (pictures, trajectories, directions), strict=True))
     with err.status("packing"):
         made = pack_study(load_study(file), out_file, partial, [name for name in EXTRAS if asked[name]])
@@ -304,47 +372,18 @@ def pack(
         out.print(f"not packed: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
 
 
-@app.command("track")
-def track(
-    file: File,
-    tracker: Annotated[Tracker, typer.Option("--to", help="Tracker; its own settings say where it logs to.")],
-    project: Annotated[
-        str, typer.Option("--project", metavar="NAME", help="Project, or MLflow's experiment.")
-    ] = "probe-kit",
-    partial: Partial = False,
-) -> None:
-    """Log all tables of a study to MLflow or Weights & Biases, once. Loads no model."""
-    from probe_kit.study import load_study, track_study
-
-    logged, is_new = track_study(load_study(file), tracker, project, partial)
-    out.print(f"{logged}{'' if is_new else ' (was logged before)'}", highlight=False, markup=False)
-
-
-@app.command("publish")
-def publish(
-    file: File,
-    repository: Annotated[str, typer.Argument(metavar="REPO", help="Data set on the hub, as owner/name.")],
-    out_folder: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Folder for the data set.")],
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Write the folder, and upload nothing.")] = False,
-    pull_request: Annotated[
-        bool, typer.Option("--pr", help="Open a pull request in a data set that exists.")
-    ] = False,
-    private: Annotated[bool, typer.Option("--private", help="Make a new data set private.")] = False,
-    licence: Annotated[
-        str | None, typer.Option("--license", metavar="NAME", help="Of the data set, such as cc-by-4.0.")
-    ] = None,
-    partial: Partial = False,
-) -> None:
-    """Publish a study as a data set: card, episodes, tables, archive and hashes. Activations stay here."""
-    from probe_kit.study import load_study, publish_data_set, write_data_set
+def _write_data_set(study: "LoadedStudy", folder: Path, partial: bool, licence: str | None) -> None:
+    from probe_kit.study import write_data_set
 
     with err.status("packing"):
-        made = write_data_set(load_study(file), out_folder, partial, licence)
+        made = write_data_set(study, folder, partial, licence)
     for name, reason in made.missing.items():
         out.print(f"not in it: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
-    if dry_run:
-        out.print(str(out_folder), highlight=False, markup=False, soft_wrap=True)
-        return
+
+
+def _upload(folder: Path, repository: str, pull_request: bool, private: bool) -> None:
+    from probe_kit.study import publish_data_set
+
     with err.status("uploading"):
-        address = publish_data_set(out_folder, repository, pull_request, private)
+        address = publish_data_set(folder, repository, pull_request, private)
     out.print(address, highlight=False, markup=False, soft_wrap=True)

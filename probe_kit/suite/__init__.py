@@ -3,7 +3,6 @@
 from probe_kit.suite.build import build_suite, default_suite
 from probe_kit.suite.categories import CATEGORIES, Category
 from probe_kit.suite.checks.validate import Report, validate_suite
-from probe_kit.suite.contact_sheet import contact_sheets
 from probe_kit.suite.custom.from_csv import suite_from_csv
 from probe_kit.suite.custom.own_items import Terms
 from probe_kit.suite.custom.own_pictures import PicturePair, suite_from_pictures
@@ -27,7 +26,6 @@ __all__ = [
     "Suite",
     "Terms",
     "build_suite",
-    "contact_sheets",
     "default_suite",
     "load_picture",
     "load_suite",

@@ -13,8 +13,8 @@ from probe_kit.errors import UsageError
 from probe_kit.hashing import sha256_json, sha256_text
 from probe_kit.suite.card import drawing_libraries, new_suite
 from probe_kit.suite.categories import CATEGORIES, check_categories
-from probe_kit.suite.generators import GENERATORS, generators_of
-from probe_kit.suite.generators.couples import DEFAULT_VERSION, SUITE_NAME, SUITE_VERSIONS
+from probe_kit.suite.generators import GENERATORS
+from probe_kit.suite.generators.couples import SUITE_NAME, SUITE_VERSION
 from probe_kit.suite.generators.twins import draw_twins
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item
@@ -32,32 +32,27 @@ def build_suite(
     items_per_category: int = ITEMS,
     seed: int = 0,
     progress: Progress | None = None,
-    version: int = DEFAULT_VERSION,
 ) -> Suite:
     """The embedded suite, drawn and written to `folder`.
 
     categories: slugs, all embedded ones by default. Which others are built changes no item of a category, and
     fewer items per category are the beginning of more. progress: called with items done and items in all.
-    version: 2, or 1, whose pictures give more away to an untrained conjunction of pixels and words; the suite's
-    identity names it. Raises UnknownCategoryError, UsageError for a number of items that is not a positive even
-    one or a version that there is not, and SuiteError if `folder` holds anything but this very suite.
+    Raises UnknownCategoryError, UsageError for a number of items that is not a positive even one, and SuiteError
+    if `folder` holds anything but this very suite.
     """
     folder = Path(folder)
-    if version not in SUITE_VERSIONS:
-        known = " or ".join(map(str, SUITE_VERSIONS))
-        raise UsageError(f"suite version {version}; expected {known}")
     options = _options(categories, items_per_category, seed)
     check_foreign_folder(folder)
     items: list[Item] = []
     pictures: dict[str, bytes] = {}
     for category in options["categories"]:
-        for twins in draw_twins(category, items_per_category // 2, seed, version):
+        for twins in draw_twins(category, items_per_category // 2, seed):
             items += twins.items
             pictures |= {picture.file_name: picture.png for picture in twins.pictures}
             if progress:
                 progress(len(items), items_per_category * len(options["categories"]))
-    suite = new_suite(SUITE_NAME, SUITE_VERSIONS[version], with_groups(items), options)
-    return save_suite(suite, pictures, _stats(suite, version), folder)
+    suite = new_suite(SUITE_NAME, SUITE_VERSION, with_groups(items), options)
+    return save_suite(suite, pictures, _stats(suite), folder)
 
 
 def default_suite(
@@ -86,7 +81,7 @@ def default_folder(
 
 def default_identity() -> str:
     """`name@version` of what `default_suite` draws."""
-    return f"{SUITE_NAME}@{SUITE_VERSIONS[DEFAULT_VERSION]}"
+    return f"{SUITE_NAME}@{SUITE_VERSION}"
 
 
 def _options(categories: Sequence[str] | None, items_per_category: int, seed: int) -> dict[str, Any]:
@@ -107,10 +102,10 @@ def _options(categories: Sequence[str] | None, items_per_category: int, seed: in
     }
 
 
-def _stats(suite: Suite, version: int) -> dict[str, dict[str, int]]:
+def _stats(suite: Suite) -> dict[str, dict[str, int]]:
     """How many different pairs of concepts each category has, and how many items were made."""
     return {
-        category: {"pool": len(generators_of(version)[category].pairs), "emitted": emitted}
+        category: {"pool": len(GENERATORS[category].pairs), "emitted": emitted}
         for category, emitted in suite.card["counts"].items()
     }
 

@@ -8,9 +8,9 @@ import typer
 from probe_kit._system.bounded_json import parse_json
 from probe_kit._terminal.console import counter, err, out, print_json, progress
 from probe_kit._terminal.options import AsJson, Categories, Seed, choices, one_of
+from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
-from probe_kit.suite.generators.couples import SuiteVersion
 
 app = typer.Typer(help="Build, convert, check and show suites of questions.", no_args_is_help=True)
 
@@ -29,17 +29,13 @@ def build(
         int, typer.Option("--n", help="Number of items per category, an even number.", max=100_000)
     ] = 150,
     seed: Seed = 0,
-    suite_version: Annotated[
-        SuiteVersion,
-        typer.Option(help="Version of the generators. 1: the first, which leaks more through pixels and words."),
-    ] = 2,
 ) -> None:
     """Draw the embedded suite and save it in FOLDER."""
     from probe_kit.suite import build_suite
 
     with progress() as bar:
         drawing = counter(bar, "drawing items")
-        suite = build_suite(folder, categories, n, seed, progress=drawing, version=suite_version)
+        suite = build_suite(folder, categories, n, seed, progress=drawing)
     out.print(f"{suite.identity}: {len(suite.items)} items, {2 * len(suite.items)} episodes in {folder}")
 
 
@@ -91,16 +87,37 @@ def from_csv(
 @app.command("show")
 def show(
     folder: ShownSuite = None,
-    out_folder: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="Folder for the sheets.")] = Path(
-        "suite-sheets"
-    ),
+    categories: Categories = None,
+    n: Annotated[int, typer.Option("--n", min=1, help="Number of items per category, the first ones.")] = 4,
+    as_json: AsJson = False,
 ) -> None:
-    """Write a contact sheet per category with picture pairs and instructions; correct pictures are framed."""
-    from probe_kit.suite import contact_sheets, default_suite, load_suite
+    """List items of a suite: the instruction, the picture that answers it, and the other picture."""
+    from rich.table import Table
+
+    from probe_kit.suite import default_suite, load_suite
 
     suite = default_suite() if folder is None else load_suite(folder)
-    for path in contact_sheets(suite, out_folder):
-        out.print(str(path), soft_wrap=True)
+    suite = suite.select(categories)
+    rows = [
+        {
+            "category": item.category,
+            "item": item.item_id,
+            "instruction": item.instruction,
+            "correct": str(item.picture(item.correct_side)),
+            "wrong": str(item.picture("right" if item.correct_side == "left" else "left")),
+        }
+        for category in suite.categories
+        for item in [item for item in suite.items if item.category == category][:n]
+    ]
+    if as_json:
+        print_json({"suite": suite.identity, "items": rows})
+        return
+    table = Table(*rows[0], title=suite.identity)
+    for column in table.columns:
+        column.overflow = "fold"
+    for row in rows:
+        table.add_row(*map(terminal_safe, row.values()))
+    out.print(table)
 
 
 @app.command("list")
@@ -185,7 +202,7 @@ def convert(
     ] = None,
     emit_curation: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write a file to review, with an HTML page.", rich_help_panel=REVIEW),
+        typer.Option(metavar="FILE", help="Write a file to review, with previews.", rich_help_panel=REVIEW),
     ] = None,
     option: Annotated[
         list[str] | None,

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.suite.generators import generators_of
+from probe_kit.suite.generators import GENERATORS
 from probe_kit.suite.generators.couples import draw_couples
 from probe_kit.suite.pictures import pixels_sha256
 from vlm_tiny_training.painting import Surface
@@ -40,30 +40,29 @@ class PictureBank:
         cls,
         category: str,
         seed: int,
-        counts: Mapping[int, int],
+        count: int,
         surfaces: Mapping[str, Surface],
         report: Callable[[str], None],
     ) -> Self:
-        """The first couples of the suite's generators at `seed`, by version of the suite so many.
+        """The first `count` couples of the suite's generators at `seed`.
 
         Raises ValueError if a picture is one of an embedded suite's, on which the models will be evaluated.
         """
         painted: dict[str, tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8]]]]
         painted = {name: ([], []) for name in surfaces}
         phrases: list[list[str]] = []
-        for version, count in counts.items():
-            evaluation = _evaluation_pictures(category, version)
-            for number, couple in enumerate(islice(draw_couples(generators_of(version)[category], seed), count)):
-                pictures = couple.left_tile.draw(), couple.right_tile.draw()
-                if not evaluation.isdisjoint(map(pixels_sha256, pictures)):
-                    raise ValueError(f"couple {number} of {category} is in the evaluation split; change the seed")
-                for name, surface in surfaces.items():
-                    for side, place in enumerate(surface.places):
-                        values = np.stack([place.paint(picture) for picture in pictures])
-                        painted[name][side].append(np.rint(values).clip(0, 255).astype(np.uint8))
-                phrases.append([couple.left.phrase, couple.right.phrase])
-                if number % 500 == 0:
-                    report(f"pictures of {category}, suite {version}: {number}/{count}")
+        evaluation = _evaluation_pictures(category)
+        for number, couple in enumerate(islice(draw_couples(GENERATORS[category], seed), count)):
+            pictures = couple.left_tile.draw(), couple.right_tile.draw()
+            if not evaluation.isdisjoint(map(pixels_sha256, pictures)):
+                raise ValueError(f"couple {number} of {category} is in the evaluation split; change the seed")
+            for name, surface in surfaces.items():
+                for side, place in enumerate(surface.places):
+                    values = np.stack([place.paint(picture) for picture in pictures])
+                    painted[name][side].append(np.rint(values).clip(0, 255).astype(np.uint8))
+            phrases.append([couple.left.phrase, couple.right.phrase])
+            if number % 500 == 0:
+                report(f"pictures of {category}: {number}/{count}")
         arrays = {name: (np.stack(left), np.stack(right)) for name, (left, right) in painted.items()}
         return cls(category, arrays, np.array(phrases))
 
@@ -88,11 +87,11 @@ class PictureBank:
         return [np.array(members) for _, members in sorted(pairs.items(), key=lambda entry: sorted(entry[0]))]
 
 
-def _evaluation_pictures(category: str, version: int) -> set[str]:
+def _evaluation_pictures(category: str) -> set[str]:
     return {
         pixels_sha256(tile.draw())
         for seed in EVALUATION_SEEDS
-        for couple in islice(draw_couples(generators_of(version)[category], seed), EVALUATION_COUPLES)
+        for couple in islice(draw_couples(GENERATORS[category], seed), EVALUATION_COUPLES)
         for tile in (couple.left_tile, couple.right_tile)
     }
 
@@ -101,7 +100,7 @@ def read_banks(
     folder: Path,
     categories: Sequence[str],
     seed: int,
-    counts: Mapping[int, int],
+    count: int,
     surfaces: Mapping[str, Surface],
     processes: int,
     report: Callable[[str], None],
@@ -111,7 +110,7 @@ def read_banks(
     missing = [category for category, path in paths.items() if not path.is_file()]
     if missing:
         with get_context("fork").Pool(min(processes, len(missing))) as pool:
-            jobs = [(category, seed, counts, surfaces, report) for category in missing]
+            jobs = [(category, seed, count, surfaces, report) for category in missing]
             for category, bank in zip(missing, pool.starmap(PictureBank.drawn, jobs, 1), strict=True):
                 bank.save(paths[category])
     return [PictureBank.read(path) for path in paths.values()]

@@ -54,7 +54,7 @@ CASES = {
     "train a-run --device nonsense": (2, "This machine has cpu"),
     "retention nowhere": (2, "is not a run"),
     "run verify nowhere": (2, "is not a run"),
-    "export nowhere --format h5": (2, "is not a run"),
+    "run export nowhere --format h5": (2, "is not a run"),
     "models --run nowhere": (2, "is not a run"),
 }
 

@@ -36,10 +36,10 @@ def test_it_opens_as_a_table_of_no_episodes(run: Path) -> None:
     [
         "run show",
         "run verify",
-        "run seal",
+        "run verify --seal",
         "train --partial",
         "retention --partial",
-        "export --format safetensors",
+        "run export --format safetensors",
     ],
 )
 def test_no_command_ends_in_a_traceback(run: Path, command: str, tmp_path: Path, monkeypatch: Any) -> None:

@@ -38,10 +38,10 @@ def said(*words: object) -> str:
     "words",
     [
         ("run", "verify"), ("run", "verify", "--deep"), ("run", "verify", "--json"), ("run", "show"),
-        ("run", "show", "--json"), ("run", "seal"), ("retention",), ("retention", "--format", "json"),
+        ("run", "show", "--json"), ("run", "verify", "--seal"), ("retention",), ("retention", "--format", "json"),
         ("retention", "--format", "csv"), ("retention", "--format", "latex"),
         ("retention", "--format", "markdown"),
-        ("models", "--run"), ("train", "--views", "nothing"), ("export", "--format", "nothing"),
+        ("models", "--run"), ("train", "--views", "nothing"), ("run", "export", "--format", "nothing"),
     ],
     ids=" ".join,
 )  # fmt: skip
@@ -52,7 +52,7 @@ def test_a_run_of_a_hostile_name_is_shown_as_text(run: Path, words: tuple[str, .
 @pytest.mark.parametrize(
     "words",
     [
-        ("run", "show", NAME), ("retention", NAME), ("train", NAME), ("export", NAME, "--format", "h5"),
+        ("run", "show", NAME), ("retention", NAME), ("train", NAME), ("run", "export", NAME, "--format", "h5"),
         ("models", "--run", NAME), ("suite", "list", NAME), ("suite", "validate", NAME), ("suite", "show", NAME),
         ("extract", "--model", "expert", "--suite", NAME),
     ],

@@ -146,8 +146,10 @@ def _command(name: str, request: pytest.FixtureRequest) -> KilledCommand:
             suite: Suite = request.getfixturevalue("six")
             given = ("--model", "pi0-tiny", "--suite", str(suite.folder), "--no-act", "--tokens", "all")
             return _of_extract(name, "extract", *given, "--workers", "2")
-        case "run seal":
-            return _of_run(name, partial(_unsealed, request.getfixturevalue("little_runs") / "run"), "run", "seal")
+        case "run verify --seal":
+            return _of_run(
+                name, partial(_unsealed, request.getfixturevalue("little_runs") / "run"), "run", "verify", "--seal"
+            )
     acted, folder = request.getfixturevalue("acted"), str(request.getfixturevalue("small_suite").folder)
     match name:
         case "train":
@@ -158,11 +160,11 @@ def _command(name: str, request: pytest.FixtureRequest) -> KilledCommand:
     raise LookupError(name)
 
 
-ALL = ("suite build", "suite convert", "run seal", "train", "intervene", "ask", "extract")
+ALL = ("suite build", "suite convert", "run verify --seal", "train", "intervene", "ask", "extract")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["suite build", "run seal"])
+@pytest.mark.parametrize("name", ["suite build", "run verify --seal"])
 def test_a_kill_loses_nothing_and_changes_no_byte(
     name: str, request: pytest.FixtureRequest, tmp_path: Path
 ) -> None:
@@ -198,7 +200,7 @@ def test_sealing_while_another_process_extracts_changes_no_byte(
     command = _command("extract", request)
     alone, together = tmp_path / "alone", tmp_path / "together"
     run_together([command.arguments(alone)], alone, lambda: True)
-    seal = ["run", "seal", str(together / "run")]
+    seal = ["run", "verify", "--seal", str(together / "run")]
     commands = [command.arguments(together), seal, seal]
     assert run_together(commands, together, lambda: any(together.glob("run/commits/*.json"))) == []
     assert command.made(together) == command.made(alone)

@@ -48,7 +48,7 @@ def test_a_run_on_a_read_only_disk_is_read_and_verified(disk: Path, little_runs:
     "command",
     [
         "extract --model expert --items 2 --suite {suite} --out {}/new",
-        "run seal {}/bare",
+        "run verify {}/bare --seal",
         "train {}/run --permutations 7",
     ],
     ids=lambda command: command.split(" -")[0].split(" {")[0],

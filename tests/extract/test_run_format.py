@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.extract import (
@@ -219,11 +221,15 @@ def test_a_lost_label_and_one_of_another_run_are_damage_that_a_new_label_repairs
 ) -> None:
     place = Path(shutil.copytree(acted.path, tmp_path / "run"))
     (place / "label.json").unlink()
-    with pytest.raises(RunDamagedError, match=r"label\.json is missing.*probe-kit run label"):
+    with pytest.raises(RunDamagedError, match=r"label\.json is missing.*probe-kit run show .* --label"):
         open_run(place)
     assert any("label.json is missing" in problem for problem in verify_run(place).problems)
-    label_run(place, "again")
+    shown = CliRunner().invoke(app, ["run", "show", str(place), "--label", "again"])
+    assert shown.exit_code == 0, shown.output
     assert open_run(place).label == "again"
+    refused = CliRunner().invoke(app, ["run", "show", str(place), "--partial"])
+    assert refused.exit_code == 2
+    assert "--partial is for --action-errors" in refused.stderr
     content = json.loads((place / "label.json").read_text(encoding="utf-8"))
     (place / "label.json").write_text(json.dumps({**content, "label": "forged"}), encoding="utf-8")
     with pytest.raises(RunDamagedError, match=r"label\.json was changed"):

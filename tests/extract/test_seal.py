@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract import Run, open_run, seal
 from probe_kit.extract.store.run import NotSealedWarning
@@ -47,6 +49,10 @@ def test_sealing_again_gives_the_same_bytes_and_a_second_time_does_nothing(copy:
     shutil.rmtree(copy / "columns.zarr")
     assert seal(copy)
     assert tree(copy) == before
+    shutil.rmtree(copy / "columns.zarr")
+    answer = CliRunner().invoke(app, ["run", "verify", str(copy), "--seal"])
+    assert (answer.exit_code, "48 of 48 episodes, sealed" in answer.stdout) == (0, True), answer.output
+    assert tree(copy) == before
 
 
 @pytest.mark.slow
@@ -78,7 +84,7 @@ def test_columns_of_other_commits_are_not_used_until_sealed_again(copy: Path) ->
         seal(copy)
     shutil.rmtree(copy / "sealed")
     run = open_run(copy, allow_partial=True)
-    with pytest.warns(NotSealedWarning, match="probe-kit run seal"):
+    with pytest.warns(NotSealedWarning, match=r"probe-kit run verify .* --seal"):
         assert run.column(SITES[0]).shape == (47, 96)
     assert seal(copy)
     again = open_run(copy, allow_partial=True)
@@ -91,7 +97,7 @@ def test_a_flipped_bit_in_a_column_is_an_error_that_says_how_to_rebuild(copy: Pa
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 1
     chunk.write_bytes(content)
-    with pytest.raises(RunDamagedError, match="run seal"):
+    with pytest.raises(RunDamagedError, match=r"run verify .* --seal"):
         open_run(copy).column(SITES[0])
 
 

@@ -36,7 +36,7 @@ def banks(surface: Surface) -> list[PictureBank]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pictures, "EVALUATION_COUPLES", 1)
         drawn = {SURFACE: surface}
-        return [PictureBank.drawn(name, 77, {1: 3}, drawn, lambda _: None) for name in ("color", LEFT_OPEN)]
+        return [PictureBank.drawn(name, 77, 3, drawn, lambda _: None) for name in ("color", LEFT_OPEN)]
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ def surfaces() -> dict[str, Surface]:
 def banks(surfaces: dict[str, Surface]) -> list[PictureBank]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pictures, "EVALUATION_COUPLES", 1)
-        return [PictureBank.drawn(name, 77, {1: 3, 2: 3}, surfaces, lambda _: None) for name in ("color", "state")]
+        return [PictureBank.drawn(name, 77, 6, surfaces, lambda _: None) for name in ("color", "state")]
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_pictures_of_the_evaluation_split_are_refused(
 ) -> None:
     monkeypatch.setattr(pictures, "EVALUATION_COUPLES", 1)
     with pytest.raises(ValueError, match="evaluation split"):
-        PictureBank.drawn("color", 0, {1: 1}, surfaces, lambda _: None)
+        PictureBank.drawn("color", 0, 1, surfaces, lambda _: None)
 
 
 def test_the_asked_picture_lies_on_the_asked_side(pairs: Pairs, surfaces: dict[str, Surface]) -> None:

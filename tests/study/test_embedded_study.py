@@ -44,7 +44,7 @@ def test_the_embedded_study_runs_to_all_tables_and_again_without_a_model(
     assert "missing: 0 episodes" in again.stdout
     assert not [line for line in again.stderr.splitlines() if line.split("|")[-1].strip() == "torch"]
     assert stored(tmp_path) == files
-    assert command(tmp_path, "status", "embedded").returncode == 0
+    assert command(tmp_path, "run", "embedded", "--dry-run", "--exit-code").returncode == 0
     monkeypatch.chdir(tmp_path)
     study = load_study("embedded")
     for name in study.study.tables:

@@ -94,9 +94,28 @@ def test_a_pull_request_is_opened_once_and_creates_and_tags_nothing(folder: Path
     assert server.commits == 1
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--private"], "--private is of an upload; give --publish OWNER/NAME too"),
+        (["--pr", "--data-set"], "--pr is of an upload; give --publish OWNER/NAME too"),
+        (["--license", "cc-by-4.0"], "--license is of a data set; give --data-set or --publish OWNER/NAME too"),
+        (["--data-set", "--pictures"], "--pictures is not for a data set; leave it out"),
+        (["--publish", "lab/study", "--directions"], "--directions is not for a data set; leave it out"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused_before_anything_is_written(
+    options: list[str], words: str, played: LoadedStudy, tmp_path: Path
+) -> None:
+    answer = CliRunner().invoke(app, ["study", "pack", str(played.file), "--out", str(tmp_path / "set"), *options])
+    assert answer.exit_code == 2
+    assert words in " ".join(answer.stderr.split())
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_command_writes_the_folder_first_and_never_over_another(played: LoadedStudy, tmp_path: Path) -> None:
     out = tmp_path / "set"
-    arguments = ["study", "publish", str(played.file), "lab/study", "--out", str(out), "--dry-run"]
+    arguments = ["study", "pack", str(played.file), "--out", str(out), "--data-set"]
     made = CliRunner().invoke(app, arguments)
     assert (made.exit_code, made.stdout.strip()) == (0, str(out))
     assert (out / "study.zip").is_file()

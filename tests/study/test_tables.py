@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from probe_kit._system.csv_text import rows_of_csv
 from probe_kit.cli import app
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
@@ -17,7 +18,7 @@ from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.retention.formats.latex import latex_table
 from probe_kit.statistics.paired_tests import holm
-from probe_kit.study import LoadedStudy, load_study, write_study_report
+from probe_kit.study import LoadedStudy, load_study, make_table, write_study_report
 from probe_kit.study.tables.compared import difference_table, stages_table
 from probe_kit.study.tables.rates import score_table, success_table, vlm_table
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
@@ -173,13 +174,30 @@ def test_without_a_name_all_tables_are_printed_and_their_tests_are_counted(
     assert run.invoke(app, ["study", "table", str(file)]).exit_code != 0
 
 
+def test_a_table_is_also_rows_of_csv_with_both_ends_of_intervals(played: LoadedStudy) -> None:
+    run = CliRunner()
+    numbers = make_table(played, "score").numbers
+    printed = run.invoke(app, ["study", "table", str(played.file), "score", "--format", "csv"])
+    rows = rows_of_csv(printed.stdout)
+    assert [row["system"] for row in rows] == [number["system"] for number in numbers]
+    assert [float(row["score"]) for row in rows] == [number["score"] for number in numbers]
+    assert [(row["score_ci_low"], row["score_ci_high"]) for row in rows] == [
+        ("", "") if number["score_ci"] is None else tuple(map(str, number["score_ci"])) for number in numbers
+    ]
+    assert "score_ci" not in rows[0]
+    every = run.invoke(app, ["study", "table", str(played.file), "--format", "csv"])
+    assert every.exit_code == 2
+    assert "one table" in every.stderr
+    assert "main, sides, score, light" in every.stderr
+
+
 def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: LoadedStudy, tmp_path: Path) -> None:
     file, page, run = tmp_path / "named.toml", tmp_path / "report.html", CliRunner()
     text = played.file.read_text(encoding="utf-8").partition("[figures.curves]")[0]
     text = text.replace('label = "Idle"', 'label = "<b>Idle & 5 %</b>"')
     file.write_text(text, encoding="utf-8")
     before = file_times(Path(played.study.folder))
-    made = run.invoke(app, ["study", "report", str(file), "--html", str(page)])
+    made = run.invoke(app, ["study", "table", str(file), "--html", str(page)])
     assert made.exit_code == 0, made.output
     html = page.read_text(encoding="utf-8")
     made_of = (
@@ -200,28 +218,31 @@ def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: Loa
     assert write_study_report(load_study(file), page).html == html
     assert file_times(Path(played.study.folder)) == before
     file.write_text(text.replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8")
-    refused = run.invoke(app, ["study", "report", str(file), "--html", str(tmp_path / "other.html")])
+    both = run.invoke(app, ["study", "table", str(file), "main", "--html", str(page)])
+    assert both.exit_code == 2
+    assert "leave NAME and --format out" in both.stderr
+    refused = run.invoke(app, ["study", "table", str(file), "--html", str(tmp_path / "other.html")])
     assert refused.exit_code == 1
     assert not (tmp_path / "other.html").exists()
-    partly = run.invoke(app, ["study", "report", str(file), "--html", str(page), "--partial"])
+    partly = run.invoke(app, ["study", "table", str(file), "--html", str(page), "--partial"])
     assert partly.exit_code == 1
     assert "· dark is missing: not played yet" in page.read_text(encoding="utf-8")
 
 
-def test_status_finds_changed_bytes_and_runs_that_the_file_does_not_use(
+def test_a_dry_run_finds_changed_bytes_and_runs_that_the_file_does_not_use(
     played: LoadedStudy, tmp_path: Path
 ) -> None:
     out, file, run = copytree(played.study.folder, tmp_path / "out"), tmp_path / "study.toml", CliRunner()
     text = played.file.read_text(encoding="utf-8").replace(played.study.folder, str(out))
     file.write_text(text, encoding="utf-8")
-    words = ["study", "status", str(file), "--verify", "--orphans", "--json"]
+    words = ["study", "run", str(file), "--dry-run", "--exit-code", "--json", "--verify", "--orphans"]
     whole = run.invoke(app, words)
     assert whole.exit_code == 0, whole.output
     found = json.loads(whole.stdout)
     assert (found["problems"], found["orphans"]) == ({}, [])
     (commit, *_) = sorted(out.glob("expert/*/data.zarr/trajectory/c/1/*/*"))
     commit.write_bytes(commit.read_bytes()[:-1] + b"?")
-    assert run.invoke(app, words[:3]).exit_code == 0, "what is not read is not compared"
+    assert run.invoke(app, words[:-2]).exit_code == 0, "what is not read is not compared"
     file.write_text(text.replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8")
     changed = run.invoke(app, words)
     assert changed.exit_code == 1

@@ -1,18 +1,13 @@
-"""`probe-kit dataset`: data sets of recordings, and how a policy predicts their actions."""
+"""`probe-kit dataset`: data sets of recordings."""
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import err, marked, out, print_json, say
+from probe_kit._terminal.console import err, marked, out, say
 from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.extract.recordings import options as recorded
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from probe_kit.extract.store.recorded.action_errors import ActionErrors
 
 app = typer.Typer(help="Inspect data sets of recordings.", no_args_is_help=True)
 
@@ -67,49 +62,3 @@ def show_dataset(
     out.print(table)
     for warning in warnings:
         say(marked("[yellow]{}[/]", terminal_safe(warning)))
-
-
-@app.command("errors")
-def show_errors(run: common.RunFolder, partial: common.Partial = False, as_json: common.AsJson = False) -> None:
-    """Compare the actions that a model predicted with the recorded ones.
-
-    The errors are in standard deviations of the recorded actions at the shown frames: the mean recorded action has
-    an error of 1. `--json` prints every episode too; `probe-kit labels RUN` writes the error of every frame.
-
-    Example: `probe-kit dataset errors runs/own`
-    """
-    from probe_kit.extract import compare_actions, open_run
-
-    errors = compare_actions(open_run(run, allow_partial=partial))
-    if as_json:
-        print_json({"run": run, "numbers": _plain(errors.by_number), "episodes": _plain(errors.by_episode)})
-    else:
-        _print_errors(errors)
-
-
-def _plain(frame: "pd.DataFrame") -> list[dict[str, Any]]:
-    """The lines of a frame as JSON has them: NaN is null."""
-    rows = frame.to_dict("records")
-    return [{str(name): None if own != own else own for name, own in row.items()} for row in rows]
-
-
-def _print_errors(errors: "ActionErrors") -> None:
-    """A line per number of an action, and how the episodes differ."""
-    from rich.table import Table
-
-    episodes = errors.by_episode
-    table = Table(title=f"predicted against recorded actions, {int(episodes['frames'].sum())} frames")
-    for heading in ("number", "recorded deviation", "bias", "error, first action", "error, whole chunk"):
-        table.add_column(heading, justify="left" if heading == "number" else "right")
-    for row in _plain(errors.by_number):
-        own = [row["bias"], row["first"], row["chunk"]]
-        cells = ["constant" if one is None else f"{one:.2f}" for one in own]
-        table.add_row(terminal_safe(row["number"]), f"{row['deviation']:.3g}", *cells)
-    out.print(table)
-    ordered = _plain(episodes.sort_values("first").dropna())
-    span = [f"{row['first']:.2f} in episode {row['source_episode']}" for row in (ordered[:1] + ordered[-1:])]
-    out.print(
-        "bias and errors in recorded deviations; the mean recorded action has 1. First action: "
-        f"{' to '.join(span) or 'nothing recorded'}",
-        soft_wrap=True,
-    )

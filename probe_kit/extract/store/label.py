@@ -33,7 +33,7 @@ def label_record(identity: str, label: str) -> bytes:
 def read_label(root: Root) -> str:
     """The label of a run. Raises RunDamagedError if its record is missing, was changed, or is of another run."""
     name = f"{root.location}/{LABEL_FILE}"
-    advice = f"Write it anew: `probe-kit run label {root.location} LABEL`"
+    advice = f"Write it anew: `probe-kit run show {root.location} --label LABEL`"
     try:
         record = read_record(root.location.read(LABEL_FILE), name, advice)
     except FileNotFoundError:

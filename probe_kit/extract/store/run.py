@@ -606,7 +606,7 @@ class Run:
     def _note_slow_reading(self) -> None:
         warnings.warn(
             f"{self.location} is not sealed; columns are put together from rows, which is slow but gives the same "
-            f"numbers. `probe-kit run seal {self.location}` makes it fast",
+            f"numbers. `probe-kit run verify {self.location} --seal` makes it fast",
             NotSealedWarning,
             stacklevel=3,
         )

@@ -1,4 +1,4 @@
-"""What `study status` can also look for: bytes that were changed, and runs that a study no longer uses."""
+"""Checks of what is stored of a study: bytes that were changed, and runs that a study no longer uses."""
 
 from pathlib import Path
 

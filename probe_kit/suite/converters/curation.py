@@ -1,7 +1,6 @@
-"""The curation file: a person's decisions (accept, reject, reword) as JSON lines or CSV, with a preview page."""
+"""The curation file: a person's decisions (accept, reject, reword) as JSON lines or CSV, with previews."""
 
 import csv
-import html
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -30,8 +29,8 @@ Row = Mapping[str, Any]
 Render = Callable[[SourcePicture], Image.Image]
 
 
-def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) -> Path:
-    """The file at `path`, previews in a folder beside it, and an HTML page, whose path is returned.
+def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) -> None:
+    """The file at `path`, and previews in a folder beside it.
 
     In the previews the picture asked for lies left. `.csv` gives CSV, anything else JSON lines. Raises SuiteError
     if the file is there and a person has reviewed any row of it.
@@ -46,9 +45,6 @@ def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) ->
         else "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
     )
     write_whole(path, text)
-    page = path.with_suffix(".html")
-    write_whole(page, _page(rows))
-    return page
 
 
 def _check_reviewed(path: Path) -> None:
@@ -189,21 +185,3 @@ def _from_lines(text: str, path: Path) -> list[dict[str, Any]]:
             )
         rows.append(row)
     return rows
-
-
-def _page(rows: Sequence[Row]) -> str:
-    cells = "\n".join(
-        f"<tr><td>{html.escape(row['candidate_id'])}</td>"
-        f'<td><img src="{html.escape(row["left_preview"])}" alt="asked for"></td>'
-        f'<td><img src="{html.escape(row["right_preview"])}" alt="other"></td>'
-        f"<td>{html.escape(row['question'])}</td>"
-        f"<td>{html.escape(row['proposed_instruction'] or 'needs a wording')}</td></tr>"
-        for row in rows
-    )
-    return (
-        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Curation</title>'
-        "<style>body{font-family:sans-serif}td{padding:4px 12px;border-bottom:1px solid #ccc}</style>"
-        "<h1>Curation</h1><p>The picture asked for lies left. Edit status and instruction in the file itself.</p>"
-        f"<table><tr><th>id<th>asked for<th>other<th>question<th>instruction</tr>\n{cells}\n"
-        "</table></html>\n"
-    )

@@ -14,24 +14,16 @@ from probe_kit.suite.generators.categories.symmetry import SYMMETRY
 from probe_kit.suite.generators.categories.time import TIME
 from probe_kit.suite.generators.categories.traffic import TRAFFIC
 from probe_kit.suite.generators.generator import Concept, Generator, Tile
-from probe_kit.suite.generators.second import SECOND
 from probe_kit.suite.wording import instruction_for
 
-__all__ = ["GENERATORS", "Concept", "Generator", "Tile", "generators_of", "vocabulary"]
+__all__ = ["GENERATORS", "Concept", "Generator", "Tile", "vocabulary"]
 
 _ALL = (
     *(EMOTION, ATTRIBUTE, STATE, COLOR, SHAPE, SYMMETRY),
     *(COUNTING, TIME, PUBLIC_INFO, TRAFFIC, LIVING_WORLD),
 )
 GENERATORS: dict[str, Generator[Any]] = {generator.category: generator for generator in _ALL}
-"""By category, of version 1 of the suite."""
-
-_OF_SECOND = GENERATORS | {generator.category: generator for generator in SECOND}
-
-
-def generators_of(version: int) -> dict[str, Generator[Any]]:
-    """By category, of a version of the suite: 1 or 2."""
-    return {1: GENERATORS, 2: _OF_SECOND}[version]
+"""By category."""
 
 
 def vocabulary() -> list[str]:

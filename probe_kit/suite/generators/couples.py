@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -12,10 +12,7 @@ from probe_kit.suite.generators.generator import Concept, Generator, Tile
 
 SUITE_NAME = "a2a-embedded"
 # The next major version if the picture, text or side of any item changes; the next minor if items are added.
-SuiteVersion = Literal[1, 2]
-SUITE_VERSIONS: dict[int, str] = {1: "1.0.0", 2: "2.0.0"}
-DEFAULT_VERSION = 2
-"""2 as soon as the embedded policy was trained on it; one without the other would not know its pictures."""
+SUITE_VERSION = "2.0.0"
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from typing import Any
 
 from probe_kit.hashing import sha256_json
 from probe_kit.suite.categories import CATEGORIES
-from probe_kit.suite.generators import generators_of
-from probe_kit.suite.generators.couples import DEFAULT_VERSION, SUITE_NAME, SUITE_VERSIONS, Couple, draw_couples
+from probe_kit.suite.generators import GENERATORS
+from probe_kit.suite.generators.couples import SUITE_NAME, SUITE_VERSION, Couple, draw_couples
 from probe_kit.suite.generators.generator import Generator, Tile
 from probe_kit.suite.items import Item, Side
 from probe_kit.suite.making import Picture, make_item
@@ -38,14 +38,14 @@ class Twins:
     pictures: tuple[DrawnPicture, DrawnPicture]
 
 
-def draw_twins(category: str, count: int, seed: int, version: int = DEFAULT_VERSION) -> Iterator[Twins]:
+def draw_twins(category: str, count: int, seed: int) -> Iterator[Twins]:
     """The first `count` twins of one category; a smaller count gives the beginning of a larger one."""
-    generator = generators_of(version)[category]
+    generator = GENERATORS[category]
     for number, couple in enumerate(islice(draw_couples(generator, seed), count)):
         pictures = _draw(category, couple.left_tile), _draw(category, couple.right_tile)
         gen = {
             "generator": category,
-            "version": SUITE_VERSIONS[version],
+            "version": SUITE_VERSION,
             "seed": seed,
             "couple": number,
             "left": pictures[0].tile,

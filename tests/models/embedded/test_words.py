@@ -1,5 +1,6 @@
 """The words of the embedded models: listed, and checked before a model is loaded."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,7 +40,7 @@ def test_words_are_separated_as_the_tokenizer_of_the_checkpoint_does(name: str, 
 def test_an_unknown_word_is_refused_by_name(name: str) -> None:
     family = find_family(name, ())
     family.check_words(TEXTS[:1])
-    with pytest.raises(InstructionError, match=r"does not know 'xylophone' in .* 1 further .*suite words"):
+    with pytest.raises(InstructionError, match=r"does not know 'xylophone' in .* 1 further .*models --words"):
         family.check_words(["Put the cube on the xylophone", "Put the cube on the zither"])
     family.check_words(["Put the cube on the xylophone"], checkpoint="a folder with a tokenizer of its own")
 
@@ -48,13 +49,17 @@ def test_other_families_read_any_text() -> None:
     find_family("pi0", ()).check_words(["Put the cube on the xylophone"])
 
 
-def test_suite_words_lists_every_word_and_no_special_token() -> None:
-    answer = CliRunner().invoke(app, ["suite", "words"])
+def test_models_words_lists_every_word_and_no_special_token() -> None:
+    answer = CliRunner().invoke(app, ["models", "--words"])
     assert answer.exit_code == 0
     listed = answer.stdout.split("\n")
     assert {"red", "square", "cube"} <= set(listed)
     assert set(filter(None, listed)) == {word for word in known_words() if word.strip()}
     assert not set(SPECIAL) & set(listed)
+    named = CliRunner().invoke(app, ["models", "vlm-tiny", "--words", "--json"])
+    assert json.loads(named.stdout) == list(filter(None, listed))
+    other = CliRunner().invoke(app, ["models", "pi0", "--words"])
+    assert (other.exit_code, "pi0 reads any text" in other.stderr) == (2, True)
 
 
 @pytest.mark.parametrize("settings", [ExtractSettings("pi0-tiny"), AskSettings("vlm-tiny")])

@@ -113,8 +113,14 @@ def test_the_commands_print_the_plan_and_say_by_their_exit_code_whether_it_is_wh
     assert "4 runs, 16 episodes (16 acted, 0 captured without acting, 0 asked)" in plain.stdout
     found = json.loads(run.invoke(app, ["study", "run", str(file), "--dry-run", "--json"]).stdout)
     assert [one["model"] for one in found["runs"]] == ["expert", "broken", "idle", "idle"]
-    assert run.invoke(app, ["study", "status", str(file)]).exit_code == 1
-    assert run.invoke(app, ["study", "status", str(file), "--only", "absent-block"]).exit_code == 2
+    assert run.invoke(app, ["study", "run", str(file), "--dry-run", "--exit-code"]).exit_code == 1
+    assert run.invoke(app, ["study", "run", str(file), "--dry-run", "--only", "absent-block"]).exit_code == 2
+    for option in ("--exit-code", "--verify", "--orphans"):
+        alone = run.invoke(app, ["study", "run", str(file), option])
+        assert alone.exit_code == 2
+        assert f"{option} looks at what is stored and plays nothing; give it with --dry-run" in " ".join(
+            alone.stderr.split()
+        )
 
 
 @pytest.mark.slow
@@ -249,7 +255,7 @@ def test_what_fails_while_it_plays_is_kept_with_its_traceback_and_tried_again_on
     assert states(changed)["broken/short"] == ("failed", 0)
     assert states(changed)["idle/dark"] == ("whole", 4)
     monkeypatch.setattr(out, "_width", 200)
-    result = CliRunner().invoke(app, ["study", "status", str(changed)])
+    result = CliRunner().invoke(app, ["study", "run", str(changed), "--dry-run", "--exit-code"])
     assert result.exit_code == 1
     assert "the loader of a family is wrong" in result.stdout
 

@@ -47,7 +47,7 @@ def describe_fit(fitted: Fitted) -> tuple[dict[str, str], list[str]]:
         + (f" of {recorded} numbers" if recorded and recorded != width else ""),
         "actions": "not compared: " + fitted.other_actions
         if fitted.other_actions
-        else "compared with the recorded ones, see `probe-kit dataset errors`",
+        else "compared with the recorded ones, see `probe-kit run show RUN --action-errors`",
         "state": _shares(fitted),
     }
     names = recording.folder.names(STATE) if fitted.unusual.size else []

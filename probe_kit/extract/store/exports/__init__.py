@@ -1,1 +1,1 @@
-"""Runs written for other tools: whole arrays, tables, matrices; see `export`."""
+"""Runs written for other tools: whole arrays, tables, matrices, a LeRobotDataset; see `export`."""

@@ -8,26 +8,22 @@ on the way. The sha256 of a file is written beside it, and those of a folder int
 import hashlib
 import json
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 from probe_kit._system.drafts import draft_of, write_whole
 from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import MEAN_VIEW, ExportFormat, SaeDtype
-from probe_kit.extract.store.exports.matrices import write_npz, write_sae
-from probe_kit.extract.store.exports.tables import write_hf, write_parquet
+from probe_kit.extract.store.exports.lerobot_dataset import write_lerobot
+from probe_kit.extract.store.exports.matrices import write_sae
+from probe_kit.extract.store.exports.tables import write_parquet
 from probe_kit.extract.store.exports.vectors import StreamChoice, choose
 from probe_kit.extract.store.exports.whole_arrays import write_h5, write_safetensors
-from probe_kit.extract.store.films.lerobot_dataset import write_lerobot
-from probe_kit.extract.store.films.rerun_recordings import write_rerun
-from probe_kit.extract.store.films.videos import write_films
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run, open_run
 from probe_kit.version import __version__
 
 SUMS = "SHA256SUMS"
 """The hashes of all other files of a folder."""
-Choices = Sequence[StreamChoice]
 
 
 def export_run(
@@ -46,14 +42,12 @@ def export_run(
     h5: `<stream>/pooled`, `<stream>/later`, `<stream>/tokens`, and a dataset per column under `episodes`.
     safetensors: the same with a dot, the last two true bfloat16; episodes in the metadata.
     Axes of both are (episode, call, [iteration,] layer, view or token, feature).
-    mp4: a folder with a film per episode. rerun: one with a recording per episode. lerobot: a LeRobotDataset.
-    These three need a run with `--frames all`.
+    lerobot: a LeRobotDataset, of a run with `--frames all`.
 
-    Four formats hold the vectors that `sites` and `view` choose, see `choose`.
-    parquet, hf: a row per vector with episode, group, inference, frame, site, view, role and token; hf is a folder
-    for `datasets.load_from_disk`. npz: (N, D) float32 per site, and where its rows are from.
+    Two formats hold the vectors that `sites` and `view` choose, see `choose`.
+    parquet: a row per vector with episode, group, inference, frame, site, view, role and token.
     sae: a folder with a memory map (N, D) per site in a drawn order, an index, and the scale of every site.
-    Default are all sites, and all pooled views in tables, `mean` in matrices. dtype, seed: of `sae` alone.
+    Default are all sites, and all pooled views in Parquet, `mean` in matrices. dtype, seed: of `sae` alone.
 
     Raises UsageError for another format, an option that a format does not have, or a file that exists;
     UnknownSiteError, MissingExtraError, RunDamagedError.
@@ -69,13 +63,15 @@ def export_run(
     if out.exists():
         raise UsageError(f"{out} exists; choose another --out or remove it")
     run = open_run(path, allow_partial)
-    if not run.streams and style not in OF_FRAMES:
+    if not run.streams and style != LEROBOT:
         raise UsageError(f"{path} has no activations to export; its episodes are in `open_run(...).episodes`")
     with draft_of(out) as draft:
         if style in OF_VECTORS:
-            choices = choose(run, sites, view or (None if style in ("parquet", "hf") else MEAN_VIEW))
-            write = CHOSEN.get(style) or partial(write_sae, dtype=dtype, seed=seed)
-            write(run, choices, draft, _about(run, choices))
+            choices = choose(run, sites, view or (MEAN_VIEW if style == SAE else None))
+            if style == SAE:
+                write_sae(run, choices, draft, _about(run, choices), dtype, seed)
+            else:
+                write_parquet(run, choices, draft, _about(run, choices))
         else:
             WHOLE[style](run, draft)
         if draft.is_dir():
@@ -91,7 +87,7 @@ def check_format(style: str) -> None:
         raise UsageError(f"unknown format {style!r}; expected one of {', '.join(FORMATS)}")
 
 
-def _about(run: Run, choices: Choices) -> str:
+def _about(run: Run, choices: Sequence[StreamChoice]) -> str:
     """JSON of what vectors were made of: sites and views, the run's settings, and what it was made with."""
     return json.dumps(
         {
@@ -118,22 +114,15 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+LEROBOT: ExportFormat = "lerobot"
+"""The format that holds frames and actions, and no activations."""
 WHOLE: dict[ExportFormat, Callable[[Run, Path], None]] = {
     "h5": write_h5,
     "safetensors": write_safetensors,
-    "mp4": write_films,
-    "lerobot": write_lerobot,
-    "rerun": write_rerun,
+    LEROBOT: write_lerobot,
 }
 """Formats that hold all that was stored."""
-CHOSEN: dict[ExportFormat, Callable[[Run, Choices, Path, str], None]] = {
-    "parquet": write_parquet,
-    "npz": write_npz,
-    "hf": write_hf,
-}
-OF_FRAMES: tuple[ExportFormat, ...] = ("mp4", "lerobot", "rerun")
-"""Formats that hold what was seen and done, and no activations."""
 SAE: ExportFormat = "sae"
-OF_VECTORS: tuple[ExportFormat, ...] = (*CHOSEN, SAE)
+OF_VECTORS: tuple[ExportFormat, ...] = ("parquet", SAE)
 """Formats that hold chosen vectors."""
 FORMATS: tuple[ExportFormat, ...] = (*WHOLE, *OF_VECTORS)

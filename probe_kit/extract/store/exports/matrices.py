@@ -1,11 +1,10 @@
-"""A matrix per site with a vector per row: npz, and shuffled memory maps to train sparse autoencoders on."""
+"""A shuffled memory map per site with a vector per row, to train sparse autoencoders on."""
 
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import ZIP_STORED, ZipFile
 
 import numpy as np
 from numpy.lib.format import open_memmap
@@ -54,29 +53,6 @@ class RowOrigins:
         self.roles[places] = [self.role_names.index(role) for role in block.roles]
 
 
-def write_npz(run: Run, choices: Sequence[StreamChoice], out: Path, about: str) -> None:
-    """`<site>` (N, D) float32 of every site, where its rows are from, the episodes, and `about`.
-
-    The matrices of a stream are written beside `out` first, because an npz holds one array after the other.
-    """
-    beside = out.with_name(f"{out.name}.arrays")
-    beside.mkdir()
-    with ZipFile(out, "w", ZIP_STORED) as packed:
-        _put(packed, beside, "about", np.array(about))
-        for name in (origins := Origins(run)).keys:
-            cells: NDArray[Any] = run.episodes[name].to_numpy(origins.dtype(name)).astype(origins.dtype(name))
-            _put(packed, beside, f"episodes/{name}", cells)
-        for choice in choices:
-            rows, files = _write_matrices(run, choice, beside, np.dtype(np.float32), None)
-            for site, file in files.items():
-                packed.write(file, f"{site}.npy")
-                file.unlink()
-            _put(packed, beside, f"{choice.name}/episode", rows.positions)
-            _put(packed, beside, f"{choice.name}/inference", rows.inferences)
-            _put(packed, beside, f"{choice.name}/token", rows.tokens)
-            _put(packed, beside, f"{choice.name}/role", np.array(rows.role_names)[rows.roles])
-
-
 def write_sae(
     run: Run, choices: Sequence[StreamChoice], folder: Path, about: str, dtype: SaeDtype, seed: int
 ) -> None:
@@ -103,9 +79,9 @@ def write_sae(
 
 
 def _write_matrices(
-    run: Run, choice: StreamChoice, folder: Path, dtype: np.dtype[Any], order: NDArray[np.intp] | None
+    run: Run, choice: StreamChoice, folder: Path, dtype: np.dtype[Any], order: NDArray[np.intp]
 ) -> tuple[RowOrigins, dict[Site, Path]]:
-    """A file per site, filled in one pass over the run. order: (N,) row of every vector; None: as read."""
+    """A file per site, filled in one pass over the run. order: (N,) row of every vector."""
     count = count_vectors(run, choice)
     files = {site: folder / f"{site}.npy" for site in choice.sites}
     shape = count, choice.stored.width
@@ -116,7 +92,7 @@ def _write_matrices(
     rows, done = RowOrigins.of(count), 0
     for block in blocks(run, [choice]):
         end = done + block.tokens.size
-        places = slice(done, end) if order is None else order[done:end]
+        places = order[done:end]
         rows.put(places, block)
         for site, values in zip(choice.sites, block.values, strict=True):
             maps[site][places] = _as_stored(values, dtype, site, run)
@@ -161,9 +137,3 @@ def _write_index(run: Run, rows: RowOrigins, out: Path) -> None:
                 rows.positions[part], rows.inferences[part], rows.tokens[part], names[rows.roles[part]]
             )
             writer.write_table(pa.table([columns[name] for name in schema.names], schema=schema))
-
-
-def _put(packed: ZipFile, beside: Path, name: str, array: NDArray[Any]) -> None:
-    file = beside / "small.npy"
-    np.save(file, array, allow_pickle=False)
-    packed.write(file, f"{name}.npy")

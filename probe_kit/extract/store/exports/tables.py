@@ -1,4 +1,4 @@
-"""A row per vector: Parquet, and a folder that Hugging Face `datasets` loads."""
+"""A row per vector in a Parquet file, and where vectors are from."""
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -30,7 +30,7 @@ class Origins:
 
     @cached_property
     def pa(self) -> Any:
-        """The module pyarrow, which an npz does not need."""
+        """The module pyarrow."""
         return require("pyarrow", "export")
 
     @property
@@ -51,15 +51,13 @@ class Origins:
         found["token"] = pa.array(tokens, pa.int32(), mask=np.asarray(tokens) == POOLED)
         return found
 
-    def dtype(self, name: str) -> type:
-        """What numpy holds a column of the episodes in."""
-        return np.int64 if name in NUMBERS else np.str_
-
     @cached_property
     def _cells(self) -> dict[str, Any]:
-        types = dict(self.fields)
+        episodes, types = self.run.episodes, dict(self.fields)
         return {
-            name: self.pa.array(self.run.episodes[name].to_numpy(self.dtype(name)).tolist(), types[name])
+            name: self.pa.array(
+                episodes[name].to_numpy(np.int64 if name in NUMBERS else np.str_).tolist(), types[name]
+            )
             for name in self.keys
         }
 
@@ -72,25 +70,6 @@ def write_parquet(run: Run, choices: Sequence[StreamChoice], out: Path, about: s
     with pq.ParquetWriter(out, schema) as writer:
         for table in _tables(run, choices, origins, schema):
             writer.write_table(table)
-
-
-def write_hf(run: Run, choices: Sequence[StreamChoice], folder: Path, about: str) -> None:
-    """A folder for `datasets.load_from_disk`. about: the description of the data set."""
-    datasets = require("datasets", "datasets")
-    origins = Origins(run)
-    pa, schema, folded = origins.pa, _schema(origins), folder.with_name(f"{folder.name}.arrow")
-    with pa.OSFile(str(folded), "wb") as file, pa.ipc.new_stream(file, schema) as stream:
-        for table in _tables(run, choices, origins, schema):
-            stream.write_table(table)
-    bars = datasets.is_progress_bar_enabled()
-    datasets.disable_progress_bars()
-    try:
-        info = datasets.DatasetInfo(description=about)
-        datasets.Dataset.from_file(str(folded), info=info).save_to_disk(str(folder))
-    finally:
-        if bars:
-            datasets.enable_progress_bars()
-    folded.unlink()
 
 
 def _schema(origins: Origins) -> Any:

@@ -51,7 +51,8 @@ class Columns:
         self.folder, self.sums = folder, sums
         self._location = location
         self.advice = (
-            f"Delete {folder}; the rows are not concerned, and `probe-kit run seal {location}` builds it again"
+            f"Delete {folder}; the rows are not concerned, and `probe-kit run verify {location} --seal` builds "
+            "it again"
         )
 
     @property
@@ -139,7 +140,7 @@ def _read_seals(root: Root, commits: Mapping[int, Commit]) -> Iterator[dict[str,
         if not _NAMED.fullmatch(file):
             continue  # a copy under another name
         name = f"{root.location}/{SEALED}/{file}"
-        advice = f"Delete it; `probe-kit run seal {root.location}` builds the columns again"
+        advice = f"Delete it; `probe-kit run verify {root.location} --seal` builds the columns again"
         seal = read_record(raw, name, advice)
         expect(seal, {"run": str, "stamp": str, "objects": dict}, name, advice)
         check_sums(seal["objects"], name, advice)

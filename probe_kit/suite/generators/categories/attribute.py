@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
+from probe_kit.suite.generators.backgrounds import on_hues
 from probe_kit.suite.generators.drawing.canvas import Canvas, Placement, random_placement
 from probe_kit.suite.generators.drawing.gradable import GRADABLES, Gradable
 from probe_kit.suite.generators.drawing.palette import COLORS, RGB, background_for, jittered
@@ -55,7 +56,7 @@ def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Sam
     low = rng.uniform(0, 1 - gap)
     levels = {"neg": low, "pos": low + gap}
     one, other = (_sample(_THINGS[c.name], float(levels[c.polarity]), rng) for c in (left, right))
-    return one, other
+    return on_hues(one, other, rng)
 
 
 ATTRIBUTE = Generator(

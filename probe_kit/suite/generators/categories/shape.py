@@ -4,6 +4,7 @@ from itertools import combinations
 
 import numpy as np
 
+from probe_kit.suite.generators.backgrounds import on_hues
 from probe_kit.suite.generators.drawing.figure import Figure, colored_outline, random_figure
 from probe_kit.suite.generators.drawing.outlines import OUTLINES
 from probe_kit.suite.generators.drawing.palette import COLORS
@@ -31,7 +32,7 @@ def _figure(concept: Concept, rng: np.random.Generator) -> Figure:
 
 
 def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Figure, Figure]:
-    return _figure(left, rng), _figure(right, rng)
+    return on_hues(_figure(left, rng), _figure(right, rng), rng)
 
 
 SHAPE = Generator(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image
 
+from probe_kit.suite.generators.backgrounds import on_hues
 from probe_kit.suite.generators.drawing.canvas import FULL_DISK, Canvas, Placement, random_placement
 from probe_kit.suite.generators.drawing.palette import RGB, background_for
 from probe_kit.suite.generators.drawing.road_signs import LOOK_ALIKES, ROAD_SIGNS
@@ -38,7 +39,7 @@ def _sign_post(concept: Concept, rng: np.random.Generator) -> SignPost:
 
 
 def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[SignPost, SignPost]:
-    return _sign_post(left, rng), _sign_post(right, rng)
+    return on_hues(_sign_post(left, rng), _sign_post(right, rng), rng)
 
 
 TRAFFIC = Generator(

@@ -30,13 +30,12 @@ def bits_of(run: Run, site: Site) -> NDArray[np.uint16]:
     return np.stack([rows.read(row, (0, *run.stored(site.stream).at(site))) for row in range(len(rows))])
 
 
-def test_hugging_face_loads_a_row_per_pooled_vector(labelled_run: Path, tmp_path: Path) -> None:
-    datasets = pytest.importorskip("datasets", reason="datasets is not installed")
+def test_parquet_holds_a_row_per_pooled_vector(labelled_run: Path, tmp_path: Path) -> None:
+    pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
     run = open_run(labelled_run)
-    out = export_run(labelled_run, "hf", tmp_path / "run", sites=["backbone.01"])
-    found = datasets.load_from_disk(str(out))
-    assert json.loads(found.info.description)["settings_sha256"] == run.settings_sha256
-    table = found.to_pandas()
+    out = export_run(labelled_run, "parquet", tmp_path / "run.parquet", sites=["backbone.01"])
+    assert json.loads(pq.read_schema(out).metadata[b"probe_kit"])["settings_sha256"] == run.settings_sha256
+    table = pd.read_parquet(out)
     assert set(table["site"]) == {str(BACKBONE)}
     assert (
         len(table)
@@ -47,22 +46,21 @@ def test_hugging_face_loads_a_row_per_pooled_vector(labelled_run: Path, tmp_path
     assert table["group_id"].tolist() == run.episodes["group_id"].iloc[rows].tolist()
     assert table["control_step"].tolist() == run.control_steps[rows, table["inference"]].tolist()
     assert table["token"].isna().all()
-    for call, own in table.groupby("inference"):
-        expected = run.column(BACKBONE, "mean", int(call))[own["episode_id"].map(rows_of(run))]
-        np.testing.assert_array_equal(np.stack(own["vector"]), expected)
+    for call, vectors in table.groupby("inference"):
+        expected = run.column(BACKBONE, "mean", int(call))[vectors["episode_id"].map(rows_of(run))]
+        np.testing.assert_array_equal(np.stack(vectors["vector"]), expected)
 
 
-def test_hugging_face_loads_a_row_per_token_of_a_role(recorded_run: Run, tmp_path: Path) -> None:
-    datasets = pytest.importorskip("datasets", reason="datasets is not installed")
+def test_parquet_holds_a_row_per_token_of_a_role(recorded_run: Run, tmp_path: Path) -> None:
     out = export_run(
-        recorded_run.path, "hf", tmp_path / "run", sites=["backbone.01.residual"], view="tokens:image"
+        recorded_run.path, "parquet", tmp_path / "run", sites=["backbone.01.residual"], view="tokens:image"
     )
-    found = datasets.load_from_disk(str(out)).with_format("numpy")
+    table = pd.read_parquet(out)
     values, mask = recorded_run.tokens(BACKBONE, "image")
-    assert len(found) == mask.sum()
-    assert {role.partition(".")[0] for role in found["role"]} == {"image"}
-    rows = np.array([rows_of(recorded_run)[name] for name in found["episode_id"]])
-    np.testing.assert_array_equal(np.stack(found["vector"]), values[rows, np.asarray(found["token"])])
+    assert len(table) == mask.sum()
+    assert {role.partition(".")[0] for role in table["role"]} == {"image"}
+    rows = table["episode_id"].map(rows_of(recorded_run)).to_numpy()
+    np.testing.assert_array_equal(np.stack(table["vector"]), values[rows, table["token"].to_numpy(int)])
 
 
 def test_recordings_keep_episode_and_frame_of_their_data_set(shown_run: Run, tmp_path: Path) -> None:
@@ -71,20 +69,6 @@ def test_recordings_keep_episode_and_frame_of_their_data_set(shown_run: Run, tmp
     assert table["source_episode"].tolist() == shown_run.episodes["source_episode"].iloc[rows].tolist()
     assert table["frame"].tolist() == shown_run.control_steps[rows, table["inference"]].tolist()
     assert set(table["frame"]) == {0, 5, 10, 15}
-
-
-def test_an_npz_has_a_matrix_per_site_and_where_its_rows_are_from(labelled_run: Path, tmp_path: Path) -> None:
-    run = open_run(labelled_run)
-    with np.load(export_run(labelled_run, "npz", tmp_path / "run.npz"), allow_pickle=False) as found:
-        episodes, inferences = found["expert/episode"], found["expert/inference"]
-        assert found["episodes/episode_id"].tolist() == run.episodes["episode_id"].tolist()
-        for site in (BACKBONE, Site("expert", 0, iteration=1)):
-            every = np.stack([run.column(site, "mean", call) for call in range(run.captured_calls)])
-            assert found[str(site)].dtype == np.float32
-            np.testing.assert_array_equal(found[str(site)], every[inferences, episodes])
-            assert np.isfinite(found[str(site)]).all()
-        assert json.loads(str(found["about"]))["views"] == {"backbone": ["mean"], "expert": ["mean"]}
-        assert sum(name.endswith("residual") or "@" in name for name in found) == 4
 
 
 def test_a_memory_map_holds_the_stored_bits_and_its_index_leads_back(recorded_run: Run, tmp_path: Path) -> None:
@@ -125,21 +109,16 @@ def test_pooled_memory_maps_are_rounded_as_torch_does_and_share_one_order(
 
 
 def test_every_file_of_a_folder_is_in_its_sums_and_none_is_a_picture(labelled_run: Path, tmp_path: Path) -> None:
-    for style in ("sae", "hf"):
-        if style == "hf":
-            pytest.importorskip("datasets", reason="datasets is not installed")
-        out = export_run(labelled_run, style, tmp_path / style)
-        lines = [line.split("  ") for line in (out / "SHA256SUMS").read_text(encoding="utf-8").splitlines()]
-        assert all(hashlib.sha256((out / name).read_bytes()).hexdigest() == digest for digest, name in lines)
-        files = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
-        assert files == {name for _, name in lines} | {"SHA256SUMS"}
-        assert {Path(name).suffix for name in files} <= {".npy", ".parquet", ".json", ".arrow", ""}
+    out = export_run(labelled_run, "sae", tmp_path / "sae")
+    lines = [line.split("  ") for line in (out / "SHA256SUMS").read_text(encoding="utf-8").splitlines()]
+    assert all(hashlib.sha256((out / name).read_bytes()).hexdigest() == digest for digest, name in lines)
+    files = {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()}
+    assert files == {name for _, name in lines} | {"SHA256SUMS"}
+    assert {Path(name).suffix for name in files} <= {".npy", ".parquet", ".json", ""}
 
 
-@pytest.mark.parametrize("style", ["parquet", "npz", "hf", "sae"])
+@pytest.mark.parametrize("style", ["parquet", "sae"])
 def test_damage_stops_the_export_and_leaves_nothing(labelled_run: Path, tmp_path: Path, style: str) -> None:
-    if style == "hf":
-        pytest.importorskip("datasets", reason="datasets is not installed")
     copy = Path(shutil.copytree(labelled_run, tmp_path / "run"))
     chunk = next(p for p in (copy / "data.zarr/expert/pooled/c/9").rglob("*") if p.is_file())
     content = bytearray(chunk.read_bytes())
@@ -161,15 +140,15 @@ def test_what_is_not_stored_is_refused_with_what_is(labelled_run: Path, tmp_path
         export_run(labelled_run, style, tmp_path / "out", **options)
 
     with pytest.raises(UnknownSiteError, match=r"no site 'decoder'; it has backbone\.00\.residual to"):
-        export("npz", sites=["decoder"])
+        export("parquet", sites=["decoder"])
     with pytest.raises(UnknownSiteError, match=r"view 'last'.*backbone: mean; expert: mean"):
         export("parquet", view="last")
     with pytest.raises(UnknownSiteError, match=r"tokens.*--tokens all"):
-        export("hf", sites=["backbone"], view="tokens")
-    with pytest.raises(UsageError, match=r"--sites or --view with --format h5.*parquet, npz, hf, sae"):
+        export("sae", sites=["backbone"], view="tokens")
+    with pytest.raises(UsageError, match=r"--sites or --view with --format h5.*parquet, sae"):
         export("h5", sites=["backbone"])
-    with pytest.raises(UsageError, match="--dtype or --seed with --format npz"):
-        export("npz", seed=3)
+    with pytest.raises(UsageError, match="--dtype or --seed with --format parquet"):
+        export("parquet", seed=3)
     with pytest.raises(UsageError, match="no sites are named"):
-        export("npz", sites=[])
+        export("sae", sites=[])
     assert not list(tmp_path.iterdir())

@@ -68,7 +68,7 @@ def test_changed_settings_are_found(damaged: Path) -> None:
 
 def test_a_flipped_bit_in_the_columns_is_found(damaged: Path) -> None:
     flip_a_bit(next(p for p in sorted((damaged / "columns.zarr/expert/pooled/c").rglob("*")) if p.is_file()))
-    assert "run seal" in verify_run(damaged, deep=True).problems[0]
+    assert "--seal" in verify_run(damaged, deep=True).problems[0]
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sklearn.metrics import r2_score
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.extract import ActionErrors, Run, compare_actions, open_run
 from probe_kit.extract.store.locations.locate import locate
@@ -97,16 +99,13 @@ def test_a_run_of_scenes_has_no_recorded_actions(labelled_run: Path) -> None:
 
 
 def test_the_command_prints_a_line_per_number_and_json_every_episode(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
 ) -> None:
-    from probe_kit.extract.source_commands.dataset_commands import show_errors
-
     run = write_recorded_run(tmp_path / "run", 3)
-    show_errors(str(run.path))
-    shown = capsys.readouterr().out
+    command = ["run", "show", str(run.path), "--action-errors"]
+    shown = CliRunner().invoke(app, command).stdout
     assert "dx" in shown
     assert "12 frames" in shown
-    show_errors(str(run.path), as_json=True)
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
     assert [row["number"] for row in found["numbers"]] == ["dx", "grip"]
     assert [row["source_episode"] for row in found["episodes"]] == [0, 1, 2]

@@ -1,1 +1,0 @@
-"""Exports of the frames of a run: films, recordings of rerun, and a data set that lerobot loads."""

@@ -1,0 +1,67 @@
+"""`probe-kit retention VLM_RUN RUN --stages`: answers of a VLM, probes of a policy, actions of the policy."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probe_kit._terminal.console import out, print_json, say
+from probe_kit.errors import NoProbesError, UsageError
+
+if TYPE_CHECKING:
+    from probe_kit.retention.choices import AnswerScore
+    from probe_kit.retention.compare.known_used import KnownUsedTable
+
+
+def show_stages(
+    runs: Sequence[str],
+    views: Sequence[str] | None,
+    key: str | None,
+    wording: str | None,
+    score: "AnswerScore",
+    with_side_words: bool,
+    as_json: bool,
+    figures: Path | None,
+) -> None:
+    """Compare what a VLM answers, a policy encodes and a policy does, question by question.
+
+    Answered: the VLM answers right. Encoded: a probe of the policy reads the answer, above chance and controls.
+    Acted: the cube ends on the correct picture. runs: the VLM's, then the policy's; both need the same first
+    frames. views: at most one, of the policy run's probes; None for the first. key: of its probe results.
+    Raises UsageError for other runs or views, and what `match_runs` raises.
+    """
+    from probe_kit.extract import open_run
+    from probe_kit.retention.behaviour.vlm_answers import scored
+    from probe_kit.retention.columns.known_used_table import rich_known_used
+    from probe_kit.retention.compare.known_used import match_runs
+    from probe_kit.train import load_results
+
+    if len(runs) != 2:
+        raise UsageError(f"--stages compares two runs, and {len(runs)} are given; expected VLM_RUN RUN --stages")
+    if views is not None and len(views) != 1:
+        raise UsageError(
+            f"--stages reads probes of one view; --views {','.join(views)} has {len(views)}. Give one"
+        )
+    view = views[0] if views else None
+    vlm = scored(open_run(runs[0]), score, with_side_words)
+    policy = open_run(runs[1]).in_wording(wording)
+    try:
+        results = load_results(policy, key)
+    except NoProbesError:
+        if view is not None:
+            raise UsageError(f"--views {view}: {runs[1]} has no probes. Run `probe-kit train {runs[1]}`") from None
+        results = None
+    joined = match_runs(vlm, policy, results, view)
+    if as_json:
+        print_json(joined.to_json())
+    else:
+        out.print(rich_known_used(joined))
+    if figures is not None:
+        _save(joined, figures)
+
+
+def _save(joined: "KnownUsedTable", folder: Path) -> None:
+    from probe_kit.retention.displays.known_used import known_used_figures
+    from probe_kit.retention.displays.report_figures import save_figures
+
+    for path in save_figures(list(known_used_figures([joined])), folder):
+        say(f"figure: {path}")
