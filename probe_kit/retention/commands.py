@@ -21,8 +21,8 @@ WITH_TARGET = (
     "runs", "family", "probes", "views", "iterations", "wording", "partial", "style", "html", "figures",
 )  # fmt: skip
 WITH_AS_PAPER = (
-    "runs", "probes", "views", "iterations", "wording", "partial", "rule", "last_steps", "score", "with_side_words",
-    "style",
+    "runs", "probes", "views", "iterations", "wording", "partial", "rule", "last_steps", "score",
+    "with_side_words", "style",
 )  # fmt: skip
 """Options of `retention` that go with another table than its own."""
 
@@ -166,7 +166,7 @@ def _show_labels(
 def _check_only(given: Mapping[str, object], allowed: Collection[str]) -> None:
     """Raise UsageError for an option of `retention` that differs from its default and does not go with the table.
 
-    given: the value of every parameter, `stages`, `target` or `as_paper` among them. allowed: those that go with it.
+    given: the value of every parameter, `stages`, `target` or `as_paper` among them. allowed: what goes with it.
     """
     what = next(name for name in ("stages", "target", "as_paper") if given[name])
     others = {
