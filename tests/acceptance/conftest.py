@@ -24,7 +24,7 @@ def _played(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def played(_played: Path) -> Path:
-    """Folder of a complete run of `pi0-tiny` with the settings `PLAYED`; a process of tests has a copy of its own."""
+    """Folder of a complete run with the settings `PLAYED`; a process of tests has a copy of its own."""
     return _played / "played"
 
 
