@@ -196,9 +196,7 @@ def test_a_recorded_number_is_decoded_with_the_recorded_action_as_a_control(show
     assert "dataset.state.s1" in text
 
 
-def test_an_environment_passes_its_check_and_a_broken_one_fails_it(
-    environment_module: str, tmp_path: Path
-) -> None:
+def test_an_environment_passes_its_check_and_a_broken_one_fails_it(environment_module: str) -> None:
     assert "passed" in probe_kit("check-environment", environment_module).text.casefold()
     assert "nowhere" in probe_kit("check-environment", "nowhere:Table", code=2).text
 

@@ -97,7 +97,7 @@ def test_one_accuracy_is_that_of_scikit_learn_in_the_same_folds(sides: pd.DataFr
 
 
 def test_every_control_of_the_side_is_stored_and_the_untrained_network_is_compared(
-    sides: pd.DataFrame, trained: Path, untrained: Path
+    trained: Path, untrained: Path
 ) -> None:
     run = pk.open_run(trained)
     controls = pk.load_results(run).controls
