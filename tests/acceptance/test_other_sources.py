@@ -13,6 +13,8 @@ import probe_kit as pk
 from tests.acceptance.product import probe_kit
 
 CAMERA, FRAMES, EPISODES = "observation.images.top", 4, 6
+FURTHER = 2
+"""Recorded episodes that the first run does not show."""
 PLAYED = 10
 """Episodes of the environment: five groups per side."""
 STATE = np.array([0.29, 0.0, 0.16, 0.0, 0.0, 0.0, 0.0, 1.0], np.float32)
@@ -77,7 +79,7 @@ def _datasets_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def recording(_datasets_cache: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Six episodes of four frames and one more in odd episodes, written by lerobot's own API."""
+    """Eight episodes of four frames and one more in odd episodes, written by lerobot's own API."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     folder, draw = tmp_path_factory.mktemp("recorded") / "kitchen", np.random.default_rng(0)
@@ -87,7 +89,7 @@ def recording(_datasets_cache: None, tmp_path_factory: pytest.TempPathFactory) -
         "action": {"dtype": "float32", "shape": (7,), "names": None},
     }
     data = LeRobotDataset.create("local/kitchen", 5, features, root=folder, use_videos=False)
-    for episode in range(EPISODES):
+    for episode in range(EPISODES + FURTHER):
         for frame in range(FRAMES + episode % 2):
             data.add_frame(
                 {
@@ -117,9 +119,12 @@ def recorded_action(episode: int, frame: int) -> np.ndarray:
 @pytest.fixture(scope="module")
 def shown(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("shown") / "run"
-    camera = ("--camera", f"base={CAMERA}")
-    probe_kit("extract", "--model", "pi0-tiny", "--dataset", recording, *camera, "--out", folder)
+    probe_kit("extract", *recording_words(recording), "--episodes", f"0:{EPISODES}", "--out", folder)
     return folder
+
+
+def recording_words(folder: Path) -> tuple[object, ...]:
+    return ("--model", "pi0-tiny", "--dataset", folder, "--camera", f"base={CAMERA}")
 
 
 @pytest.fixture(scope="module")
@@ -194,6 +199,21 @@ def test_a_recorded_number_is_decoded_with_the_recorded_action_as_a_control(show
     )
     text = probe_kit("retention", shown, "--target", "dataset.state.s1").text
     assert "dataset.state.s1" in text
+
+
+def test_probes_of_one_run_are_scored_on_another_with_other_episodes(
+    recording: Path, shown: Path, tmp_path: Path
+) -> None:
+    further = ("--episodes", f"{EPISODES}:{EPISODES + FURTHER}")
+    probe_kit("extract", *recording_words(recording), *further, "--out", tmp_path / "others")
+    typed = ("--target", "dataset.state.s1", "--task", "continuous", "--permutations", "3", "--controls", "step")
+    before = sorted(shown.rglob("settings.json"))
+    text = probe_kit("train", shown, *typed, "--test-on", tmp_path / "others").text
+    for word in ("chance", "recentred", "own", "backbone"):
+        assert word in text
+    assert sorted(shown.rglob("settings.json")) == before, "nothing is stored"
+    with_itself = probe_kit("train", shown, *typed, "--test-on", shown, code=None)
+    assert with_itself.code != 0, "the groups of a run do not test its own probes"
 
 
 def test_an_environment_passes_its_check_and_a_broken_one_fails_it(environment_module: str) -> None:
