@@ -12,7 +12,7 @@ import pytest
 import probe_kit as pk
 from tests.acceptance.product import probe_kit
 
-CAMERA, FRAMES, EPISODES = "observation.images.top", 4, 6
+CAMERA, FRAMES, EPISODES = "observation.images.top", 3, 6
 FURTHER = 5
 """Recorded episodes that the first run does not show."""
 PLAYED = 10
@@ -79,7 +79,7 @@ def _datasets_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def recording(_datasets_cache: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Eleven episodes of four frames and one more in odd episodes, written by lerobot's own API."""
+    """Eleven episodes of three frames and one more in odd episodes, written by lerobot's own API."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     folder, draw = tmp_path_factory.mktemp("recorded") / "kitchen", np.random.default_rng(0)
@@ -201,6 +201,7 @@ def test_a_recorded_number_is_decoded_with_the_recorded_action_as_a_control(show
     assert "dataset.state.s1" in text
 
 
+@pytest.mark.slow
 def test_probes_of_one_run_are_scored_on_another_with_other_episodes(
     recording: Path, shown: Path, tmp_path: Path
 ) -> None:
