@@ -19,7 +19,8 @@ QUANTITIES = {
 def rows_with(text: str, cell: str) -> Iterator[list[str]]:
     """Rows of printed tables that have a cell of this content, in any case of letters."""
     for line in text.replace("−", "-").splitlines():
-        cells = [part.strip() for part in re.split(r"\s{2,}|\||&|\\\\", line)]
+        border = next((mark for mark in (r"\|", "&") if re.search(mark, line)), r"\s{2,}")
+        cells = [part.strip() for part in re.split(border, line.replace(r"\\", ""))]
         if cell.casefold() in (part.casefold() for part in cells):
             yield cells
 
