@@ -204,7 +204,9 @@ def test_mistakes_of_a_file_are_reported_together_before_anything_is_played(tmp_
 
 def test_a_table_of_runs_that_are_missing_is_refused_and_partial_names_them(tmp_path: Path, study: Path) -> None:
     file = Path(shutil.copy(study, tmp_path / "more.toml"))
-    file.write_text(study.read_text(encoding="utf-8").replace("light_level = 0.7", "light_level = 0.6"))
+    file.write_text(
+        study.read_text(encoding="utf-8").replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8"
+    )
     refused = probe_kit("study", "table", file, "light", code=None)
     assert refused.code in (1, 2)
     assert "dark" in refused.text

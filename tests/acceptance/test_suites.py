@@ -1,4 +1,4 @@
-"""Suites as users make them: from a table, drawn, converted; and what `suite validate` says of good and bad ones."""
+"""Suites from a table, drawn and converted; `suite validate` on good and bad ones."""
 
 import csv
 import json

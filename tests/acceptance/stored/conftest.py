@@ -8,12 +8,13 @@ import pytest
 from tests.acceptance.product import probe_kit
 from tests.support.made_once import made_once
 
+
 @dataclass(frozen=True)
 class StoredRuns:
     """Folders of runs on the same items, of seed 0.
 
-    trained: the embedded policy on Color and State, with probes and a swap of pictures. untrained: its network with
-    random weights on Color, in two wordings, with probes. asked: the embedded VLM on both. expert, mirrored, idle:
+    trained: the embedded policy on Color and State, with probes and a swap of pictures. untrained: its network
+    with random weights on Color, in two wordings, with probes. asked: the embedded VLM on both. expert, mirrored, idle:
     scripted policies on four items of Color.
     """
 

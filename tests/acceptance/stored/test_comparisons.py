@@ -48,7 +48,9 @@ def test_two_runs_are_compared_on_their_common_items_with_a_corrected_p(runs: St
         assert color[part] == pytest.approx(expected, abs=1e-9)
     assert color["n_items"] == 12
     assert color["p"] <= color["p_holm"] <= 1
-    assert not [one for one in differences(answer) if one["category"] == "state"], "State was played by one run only"
+    assert not [one for one in differences(answer) if one["category"] == "state"], (
+        "State was played by one run only"
+    )
 
 
 def test_against_names_the_run_that_is_subtracted_and_the_table_prints_the_difference(runs: StoredRuns) -> None:
@@ -106,9 +108,7 @@ def test_stages_count_items_by_answered_encoded_and_acted(runs: StoredRuns) -> N
     rows = {row["category"]: row for row in probe_kit("stages", runs.asked, runs.trained, "--json").json()["rows"]}
     for category in ("color", "state"):
         row = rows[category]
-        answered, acted = (
-            correct(run, category).groupby("item_id").all() for run in (runs.asked, runs.trained)
-        )
+        answered, acted = (correct(run, category).groupby("item_id").all() for run in (runs.asked, runs.trained))
         assert row["n_items"] == sum(row["counts"].values()) == 12
         assert row["answered_correctly"] == answered.sum()
         assert row["acted_correctly"] == acted.sum()
@@ -135,7 +135,9 @@ def test_wordings_of_one_run_are_compared_on_the_same_seeds_and_chosen_by_name(r
     assert {pair["wording"], pair["other"]} == {"knowledge", "named"}
     assert pair["sr"] == pytest.approx(rates[pair["wording"]])
     assert pair["other_sr"] == pytest.approx(rates[pair["other"]])
-    right = (episodes["outcome"] == "correct").groupby([episodes["wording"], episodes["item_id"], episodes["layout"]])
+    right = (episodes["outcome"] == "correct").groupby(
+        [episodes["wording"], episodes["item_id"], episodes["layout"]]
+    )
     first, second = (right.first()[pair[name]] for name in ("wording", "other"))
     assert (pair["only"], pair["only_other"]) == ((first & ~second).sum(), (second & ~first).sum())
     assert "knowledge" in probe_kit("retention", runs.untrained, "--details", "success").text

@@ -33,7 +33,18 @@ class Room:
 
 def played(room: Room, *more: object, model: str = "idle") -> tuple[object, ...]:
     """A short extract of a scripted policy into the folder."""
-    settings = ("--model", model, "--categories", "color", "--items", "2", "--max-steps", "1", "--env-workers", "0")
+    settings = (
+        "--model",
+        model,
+        "--categories",
+        "color",
+        "--items",
+        "2",
+        "--max-steps",
+        "1",
+        "--env-workers",
+        "0",
+    )
     return ("extract", *settings, *more, "--out", room.folder / "run")
 
 
@@ -114,7 +125,9 @@ def unknown_word(room: Room) -> tuple[object, ...]:
         Image.linear_gradient("L").resize((128, 128)).rotate(90 * number).save(room.folder / f"{colour}.png")
     lines = "instruction,correct,wrong\nPut the cube on the zeppelin,red.png,blue.png\n"
     (room.folder / "mine.csv").write_text(lines, encoding="utf-8")
-    probe_kit("suite", "from-csv", room.folder / "mine.csv", "--out", room.folder / "suite", "--license", "CC0-1.0")
+    probe_kit(
+        "suite", "from-csv", room.folder / "mine.csv", "--out", room.folder / "suite", "--license", "CC0-1.0"
+    )
     settings = ("--model", "pi0-tiny", "--suite", room.folder / "suite", "--max-steps", "1", "--env-workers", "0")
     return ("extract", *settings, "--out", room.folder / "run")
 
@@ -170,7 +183,7 @@ def test_a_documented_error_has_its_class_its_exit_code_and_a_remedy(
     assert not answer.out.strip() or "extract" in str(typed[0]), "an error prints no table"
 
 
-def test_python_raises_what_the_command_line_prints(runs: StoredRuns, tmp_path: Path) -> None:
+def test_python_raises_what_the_command_line_prints(tmp_path: Path) -> None:
     with pytest.raises(pk.ProbeKitError) as raised:
         pk.open_run(tmp_path)
     answer = probe_kit("run", "show", tmp_path, code=2)
@@ -180,7 +193,7 @@ def test_python_raises_what_the_command_line_prints(runs: StoredRuns, tmp_path: 
         pk.SceneSpec.preset("act2answer", epsilon=0.5)
 
 
-def test_a_path_of_the_wrong_kind_is_wrong_usage_and_a_full_disk_is_not(runs: StoredRuns, tmp_path: Path) -> None:
+def test_a_path_of_the_wrong_kind_is_wrong_usage(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("text", encoding="utf-8")
     for typed in (("retention", file), ("suite", "list", file), ("demo", "--out", file / "below")):
@@ -190,7 +203,7 @@ def test_a_path_of_the_wrong_kind_is_wrong_usage_and_a_full_disk_is_not(runs: St
         assert "InternalError" not in answer.text
 
 
-def test_the_installed_program_exits_with_the_documented_codes(runs: StoredRuns, tmp_path: Path) -> None:
+def test_the_installed_program_exits_with_the_documented_codes(tmp_path: Path) -> None:
     """The console script itself: a refused option, and an error of the product."""
     answer = probe_kit_process("retention", "nowhere", code=2, folder=tmp_path)
     assert "RunNotFoundError" in answer.err

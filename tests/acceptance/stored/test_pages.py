@@ -1,4 +1,4 @@
-"""The report and the viewer: one file or folder that fetches nothing, shows the table's values, and escapes names."""
+"""The report and the viewer fetch nothing, show the values of the table, and escape names."""
 
 import re
 import shutil
@@ -20,7 +20,9 @@ from tests.support.browser import CHROMIUM, WHY_SKIPPED, Browser
 
 HOSTILE = """<script>alert("x")</script><img src=x onerror='alert(1)'>&amp;"""
 FETCHING = ("src", "srcset", "poster", "data", "action", "formaction", "background", "href", "xlink:href")
-OUTSIDE = re.compile(r"""(?:\bsrc|\bhref|\burl|\bimport|\bfetch)\s*[=(]?\s*["'(]\s*(?:https?:)?//""", re.IGNORECASE)
+OUTSIDE = re.compile(
+    r"""(?:\bsrc|\bhref|\burl|\bimport|\bfetch)\s*[=(]?\s*["'(]\s*(?:https?:)?//""", re.IGNORECASE
+)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,10 @@ def test_the_report_is_one_file_that_names_no_outside_address(report: Path) -> N
     assert [path.name for path in report.parent.iterdir()] == ["report.html"]
     page = Page(report.read_text(encoding="utf-8"))
     addresses = [
-        value for _, attributes in page.elements for name, value in attributes.items() if name in FETCHING and value
+        value
+        for _, attributes in page.elements
+        for name, value in attributes.items()
+        if name in FETCHING and value
     ]
     assert any(address.startswith("data:image/") for address in addresses), "no picture of an episode"
     assert all(address.startswith(("#", "data:")) for address in addresses)
@@ -101,7 +106,9 @@ def test_the_viewers_folder_needs_no_server_and_no_address(hostile: Path, tmp_pa
     assert all((folder / address).is_file() for address in linked)
     texts = [path for path in folder.rglob("*") if path.suffix in (".html", ".js", ".css")]
     assert not [path.name for path in texts if OUTSIDE.search(path.read_text(encoding="utf-8"))]
-    assert not [path.name for path in texts if HOSTILE in path.read_text(encoding="utf-8") and path.suffix == ".html"]
+    assert not [
+        path.name for path in texts if HOSTILE in path.read_text(encoding="utf-8") and path.suffix == ".html"
+    ]
     assert list(folder.rglob("*.webp")), "no frame of an episode"
 
 

@@ -21,7 +21,7 @@ Damage = Callable[[Path, list[Path]], list[Path]]
 
 
 def kind_of(file: Path) -> str:
-    """The sort of thing that a file of a run holds, such as `data.zarr/backbone`, `commits` or `probes/scores.npz`."""
+    """The sort of thing that a file of a run holds, such as `data.zarr/backbone` or `commits`."""
     top, *below = file.parts
     if not below:
         return top
