@@ -32,9 +32,8 @@ label = "Idle"
 [conditions.usual]
 max_steps = 30
 
-[conditions.dark]
-max_steps = 30
-light_level = 0.7
+[conditions.short]
+max_steps = 1
 
 [[runs]]
 name = "main"
@@ -42,20 +41,20 @@ models = ["expert", "idle"]
 conditions = ["usual"]
 
 [[runs]]
-name = "light"
-models = ["idle"]
-conditions = ["dark"]
+name = "cut"
+models = ["expert"]
+conditions = ["short"]
 
-[comparisons.light]
-pairs = {{ conditions = ["usual", "dark"], models = ["idle"] }}
+[comparisons.time]
+pairs = {{ conditions = ["usual", "short"], models = ["expert"] }}
 
 [tables.main]
 kind = "success"
 runs = ["main"]
 
-[tables.light]
+[tables.time]
 kind = "ablation"
-comparison = "light"
+comparison = "time"
 
 [figures.overview]
 kind = "overview"
@@ -80,7 +79,7 @@ def play(folder: Path) -> Path:
     file = write_study(folder)
     probe_kit("study", "run", file, "--only", "idle", "--env-workers", "0")
     first = stored(folder)
-    assert len(first) == 8, "two conditions of four episodes"
+    assert len(first) == 4, "two items in both layouts"
     assert probe_kit("study", "status", file, code=1).text
     probe_kit("study", "run", file, "--env-workers", "0")
     assert first.items() <= stored(folder).items(), "what was stored is played again"
@@ -98,7 +97,7 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(tmp_path: Path) -> None:
     plan = probe_kit("study", "run", file, "--dry-run", "--json").json()
     text = probe_kit("study", "run", file, "--dry-run").text
     assert [path.name for path in file.parent.iterdir()] == ["study.toml"]
-    assert all(name in text for name in ("expert", "dark"))
+    assert all(name in text for name in ("expert", "short"))
     assert re.search(r"\b12\b", json.dumps(plan)), "three runs of four episodes"
     assert probe_kit("study", "status", file, code=1).text
 
@@ -123,27 +122,40 @@ def test_a_table_holds_the_success_of_the_runs_in_every_format(study: Path) -> N
     held = json.dumps(probe_kit("study", "table", study, "main", "--format", "json").json())
     for style in ("table", "markdown", "latex"):
         text = probe_kit("study", "table", study, "main", "--format", style).out
-        lines = {name: next(line for line in text.splitlines() if name in line) for name in ("expert", "Idle")}
-        assert re.search(r"\b100(?:\.0)?\b", lines["expert"]), text
-        assert not re.search(r"\b100(?:\.0)?\b", lines["Idle"]), text
+        for name, rate in (("expert", 100), ("Idle", 0)):
+            line = next(line for line in text.splitlines() if name in line)
+            first = re.search(r"-?\d+(?:\.\d+)?", line.replace("−", "-").partition(name)[2])
+            assert first is not None, text
+            assert float(first.group()) == rate, text
     assert all(name in held for name in ("expert", "Idle", "color"))
     both = probe_kit("study", "table", study).out
     assert "expert" in both
-    assert "dark" in both
+    assert "short" in both
     answer = probe_kit("study", "table", study, "nothing", code=2)
-    assert "light" in answer.text, "the names that exist"
+    assert "time" in answer.text, "the names that exist"
 
 
-def test_an_ablation_subtracts_conditions_on_the_same_items(study: Path) -> None:
-    numbers = probe_kit("study", "table", study, "light", "--format", "json").json()
+def test_an_ablation_subtracts_one_condition_from_another_on_the_same_items(study: Path) -> None:
+    """The expert needs more than one action: all of its success is lost."""
+    held = probe_kit("study", "table", study, "time", "--format", "json").json()
+    numbers = {abs(value) for value in numeric_leaves(held["numbers"])}
+    assert numbers & {1.0, 100.0}
+    text = probe_kit("study", "table", study, "time", "--format", "markdown").out.replace("−", "-")
+    row = next(line for line in text.splitlines() if line.startswith("|") and "expert" in line)
+    assert re.search(r"[-+]100(?:\.0)?\b", row), text
 
-    def objects(value: Any) -> list[dict[str, Any]]:
-        inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-        return [*([value] if isinstance(value, dict) else []), *(one for part in inner for one in objects(part))]
 
-    values = [one["value"] for one in objects(numbers) if isinstance(one.get("value"), int | float)]
-    assert values
-    assert all(value == 0 for value in values if -100 <= value <= 0), "idle does nothing in either light"
+def numeric_leaves(value: Any) -> list[float]:
+    """All numbers of a nested JSON value."""
+    if isinstance(value, bool) or value is None or isinstance(value, str):
+        return []
+    if isinstance(value, int | float):
+        return [float(value)]
+    return [
+        number
+        for part in (value.values() if isinstance(value, dict) else value)
+        for number in numeric_leaves(part)
+    ]
 
 
 def test_figures_are_drawn_as_png_and_pdf(study: Path, tmp_path: Path) -> None:
@@ -161,7 +173,7 @@ def test_the_report_of_a_study_is_one_file_with_its_tables(study: Path, tmp_path
     probe_kit("study", "report", study, "--html", tmp_path / "report.html")
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert all(name in text for name in ("expert", "Idle", "light_level"))
+    assert all(name in text for name in ("expert", "Idle", "max_steps"))
     assert not re.search(r"""(?:src|href)=["']https?:""", text)
 
 
@@ -169,7 +181,7 @@ def test_an_archive_gives_every_table_without_the_runs_and_refuses_a_changed_fil
     study: Path, tmp_path: Path
 ) -> None:
     archive = tmp_path / "study.zip"
-    before = {name: probe_kit("study", "table", study, name).out for name in ("main", "light")}
+    before = {name: probe_kit("study", "table", study, name).out for name in ("main", "time")}
     probe_kit("study", "pack", study, "--out", archive)
     away = study.parent.with_name("away")
     study.parent.rename(away)
@@ -205,14 +217,14 @@ def test_mistakes_of_a_file_are_reported_together_before_anything_is_played(tmp_
 def test_a_table_of_runs_that_are_missing_is_refused_and_partial_names_them(tmp_path: Path, study: Path) -> None:
     file = Path(shutil.copy(study, tmp_path / "more.toml"))
     file.write_text(
-        study.read_text(encoding="utf-8").replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8"
+        study.read_text(encoding="utf-8").replace("max_steps = 1\n", "max_steps = 2\n"), encoding="utf-8"
     )
-    refused = probe_kit("study", "table", file, "light", code=None)
+    refused = probe_kit("study", "table", file, "time", code=None)
     assert refused.code in (1, 2)
-    assert "dark" in refused.text
+    assert "short" in refused.text
     partial = probe_kit("study", "table", file, "--partial", code=1)
     assert "expert" in partial.out
-    assert "dark" in partial.text
+    assert "short" in partial.text
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ import probe_kit as pk
 from tests.acceptance.product import probe_kit
 
 COLOURS = ("red", "green")
-FOLDERS = {"left": "left_image", "right": "right_image"}
 
 
 def draw(path: Path, colour: str, seed: int) -> None:
@@ -90,7 +89,7 @@ def test_validate_accepts_questions_asked_both_ways_and_finds_the_leak_of_those_
     probe_kit("suite", "validate", leaking)  # its format is right
     answer = probe_kit("suite", "validate", leaking, "--baselines", code=1)
     assert "pixels" in answer.text
-    assert "tint" in answer.text
+    assert "tint" in answer.text.casefold()
 
 
 def break_picture(suite: Path) -> None:
@@ -190,8 +189,8 @@ def test_a_benchmark_is_converted_with_the_answered_picture_as_the_target(tmp_pa
         assert images[item.correct_side].endswith(answered) == ("more" in item.instruction)
     probe_kit("suite", "validate", tmp_path / "suite")
     broken = labels / "fer2013_0_720_rebalanced.json"
-    broken.write_text(json.dumps([{**records[0], "answer": "Middle"}, *records[1:]]), encoding="utf-8")
+    broken.write_text(json.dumps(records)[:-40], encoding="utf-8")
     answer = probe_kit("suite", "convert", *typed[:3], "--out", tmp_path / "no", "--categories", "emotion", code=1)
     assert "SuiteError" in answer.err
-    assert "Middle" in answer.text
+    assert broken.name in answer.text
     assert not (tmp_path / "no").exists()

@@ -14,8 +14,8 @@ class StoredRuns:
     """Folders of runs on the same items, of seed 0.
 
     trained: the embedded policy on Color and State, with probes and a swap of pictures. untrained: its network
-    with random weights on Color, in two wordings, with probes. asked: the embedded VLM on both. expert, mirrored, idle:
-    scripted policies on four items of Color.
+    with random weights on Color, in two wordings, with probes. asked: the embedded VLM on both. expert,
+    mirrored, idle: scripted policies on four items of Color.
     """
 
     folder: Path
