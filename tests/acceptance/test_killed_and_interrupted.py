@@ -71,7 +71,7 @@ def test_a_killed_extract_resumes_to_the_bytes_of_an_undisturbed_one(played: Pat
 
 def test_ctrl_c_is_exit_code_130_and_one_line_and_keeps_what_is_done(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    settings = ("--model", "expert", "--categories", "color", "--items", "6", "--max-steps", "30")
+    settings = ("--model", "expert", "--categories", "color", "--items", "6", "--max-steps", "8")
     typed = ("extract", *settings, "--env-workers", "0", "--out", run)
     answer = end(begin(*typed), signal.SIGINT, lambda: committed(run) >= 1)
     assert answer.code == 130, answer.text

@@ -81,14 +81,25 @@ def changed_suite(room: Room) -> tuple[object, ...]:
 
 def suite_that_moved(room: Room) -> tuple[object, ...]:
     probe_kit("suite", "build", room.folder / "suite", "--categories", "color", "--n", "2", "--seed", "4")
-    settings = ("--model", "pi0-tiny", "--no-act", "--env-workers", "0")
+    settings = ("--model", "pi0-tiny", "--max-steps", "1", "--env-workers", "0")
     probe_kit("extract", *settings, "--suite", room.folder / "suite", "--out", room.folder / "run")
     shutil.rmtree(room.folder / "suite")
     return ("intervene", room.folder / "run")
 
 
 def other_frames(room: Room) -> tuple[object, ...]:
-    settings = ("--model", "vlm-tiny", "--categories", "color", "--items", "2", "--prompt", "p1", "--seed", "3")
+    settings = (
+        "--model",
+        "vlm-tiny",
+        "--categories",
+        "color",
+        "--items",
+        "2",
+        "--prompt",
+        "p1",
+        "--scene",
+        "frontal",
+    )
     probe_kit("ask", *settings, "--out", room.folder / "asked")
     return ("stages", next((room.folder / "asked").glob("*/run.json")).parent, room.runs.trained)
 
@@ -97,12 +108,6 @@ def too_few_groups(room: Room) -> tuple[object, ...]:
     settings = ("--model", "pi0-tiny", "--no-act", "--categories", "color", "--items", "4", "--env-workers", "0")
     probe_kit("extract", *settings, "--out", room.folder / "run")
     return ("train", room.folder / "run", "--controls", "none")
-
-
-def never_probed(room: Room) -> tuple[object, ...]:
-    copy = room.copy(room.runs.untrained)
-    shutil.rmtree(copy / "probes")
-    return ("stages", room.runs.asked, copy)
 
 
 def no_data_set(room: Room) -> tuple[object, ...]:
@@ -147,11 +152,13 @@ SITUATIONS: dict[str, tuple[str, Callable[[Room], tuple[object, ...]], str]] = {
         "UnknownCategoryError", lambda room: ("train", room.runs.untrained, "--categories", "state"), "color"
     ),
     "a layer that does not exist": ("UnknownSiteError", lambda room: steered(room, "backbone.99"), "backbone"),
-    "an intervention that a family lacks": (
-        "UnsupportedInterventionError", lambda room: ("intervene", room.runs.asked, "--kind", "steer"), "answer"
+    "an intervention in a run that only answered": (
+        "UsageError", lambda room: ("intervene", room.runs.asked), "asked"
     ),
     "a folder without a run": ("RunNotFoundError", lambda room: ("retention", room.folder), "run"),
-    "stages before train": ("NoProbesError", never_probed, "train"),
+    "retention of a label before train": (
+        "NoProbesError", lambda room: ("retention", room.runs.untrained, "--target", "drawer"), "train"
+    ),
     "pictures of a suite that moved": ("SuiteNotFoundError", suite_that_moved, "--suite"),
     "a zone that overlaps its neighbour": (
         "SceneError", lambda room: played(room, "--epsilon", "0.5"), "epsilon"
@@ -163,8 +170,13 @@ SITUATIONS: dict[str, tuple[str, Callable[[Room], tuple[object, ...]], str]] = {
     "a word that the tokenizer does not know": ("InstructionError", unknown_word, "zeppelin"),
     "other settings in a folder": ("SettingsMismatchError", other_settings, "seed"),
     "a copy without activations": ("ActivationsLeftOutError", without_activations, "copy"),
-    "a VLM that saw other frames": ("OtherFramesError", other_frames, "seed"),
-    "a folder without weights": ("CheckpointError", half_a_checkpoint, "checkpoint"),
+    "a VLM that saw other frames": ("OtherFramesError", other_frames, "frames"),
+    "a checkpoint that does not exist": (
+        "CheckpointError",
+        lambda room: ("extract", "--model", "pi0", "--checkpoint", room.folder / "nowhere", "--items", "2"),
+        "exist",
+    ),
+    "a checkpoint folder without weights": ("WeightsError", half_a_checkpoint, "weights"),
     "a folder that is no data set": ("RecordingError", no_data_set, "data"),
 }  # fmt: skip
 
