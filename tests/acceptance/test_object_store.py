@@ -61,11 +61,11 @@ def test_a_study_in_a_bucket_equals_the_same_in_a_folder(bucket: str, tmp_path: 
         tables.append(json.loads(probe_kit("retention", run, "--format", "json").out.replace(run, "RUN")))
     assert tables[0] == tables[1]
     assert tables[0][0]["backbone"]["score"] is not None
-    there, here = pk.open_run(f"{bucket}/study/run"), pk.open_run(tmp_path / "run")
-    assert there.stamp == here.stamp
+    remote, local = pk.open_run(f"{bucket}/study/run"), pk.open_run(tmp_path / "run")
+    assert remote.stamp == local.stamp
     site = pk.Site("expert", 2, iteration=5)
-    assert there.column(site, "mean").tobytes() == here.column(site, "mean").tobytes()
-    assert there.episodes["episode_id"].tolist() == here.episodes["episode_id"].tolist()
+    assert remote.column(site, "mean").tobytes() == local.column(site, "mean").tobytes()
+    assert remote.episodes["episode_id"].tolist() == local.episodes["episode_id"].tolist()
 
 
 def test_a_bucket_without_the_run_is_wrong_usage_and_other_settings_are_refused(bucket: str) -> None:

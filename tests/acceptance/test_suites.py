@@ -31,8 +31,8 @@ def table(folder: Path, pairs: int, both_ways: bool) -> Path:
     for number in range(pairs):
         for offset, colour in enumerate(COLOURS):
             draw(folder / f"{colour}-{number}.png", colour, 2 * number + offset)
-        asked = (COLOURS, COLOURS[::-1]) if both_ways else (COLOURS,)
-        for right, wrong in asked:
+        orders = (COLOURS, COLOURS[::-1]) if both_ways else (COLOURS,)
+        for right, wrong in orders:
             words = f"Put the cube on the {right} shape"
             lines.append([words, f"{right}-{number}.png", f"{wrong}-{number}.png", f"pair-{number}", "tint"])
     with (folder / "questions.csv").open("w", encoding="utf-8", newline="") as file:
@@ -73,9 +73,9 @@ def test_a_suite_of_ones_own_is_played_in_both_layouts(balanced: Path, tmp_path:
     sides = run.episodes.groupby("item_id")["side_correct"].apply(sorted)
     assert len(sides) == 2
     assert all(pair == ["left", "right"] for pair in sides)
-    known = {item.item_id: item for item in pk.load_suite(balanced).items}
+    items = {item.item_id: item for item in pk.load_suite(balanced).items}
     original = run.episodes[run.episodes["layout"] == "original"].set_index("item_id")["side_correct"]
-    assert all(side == known[name].correct_side for name, side in original.items())
+    assert all(side == items[name].correct_side for name, side in original.items())
 
 
 def test_validate_accepts_questions_asked_both_ways_and_finds_the_leak_of_those_that_are_not(
@@ -147,8 +147,8 @@ def test_the_embedded_suite_is_drawn_alike_twice_and_is_valid(tmp_path: Path) ->
     assert Counter(item.correct_side for item in suites[0].items) == {"left": 6, "right": 6}
     probe_kit("suite", "validate", tmp_path / "first")
     words = set(probe_kit("suite", "words").out.split())
-    asked = {word for item in suites[0].items for word in item.instruction.lower().split()}
-    assert asked <= words
+    used = {word for item in suites[0].items for word in item.instruction.lower().split()}
+    assert used <= words
 
 
 def test_a_benchmark_is_converted_with_the_answered_picture_as_the_target(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def quantities_of(row: dict[str, Any]) -> dict[str, tuple[float, float, float]]:
 
 
 class Page(HTMLParser):
-    """An HTML page as a browser reads it. elements: tag and attributes. text: what is shown, without scripts."""
+    """An HTML page as a browser reads it. elements: tag and attributes. text: readable text without scripts."""
 
     def __init__(self, content: str) -> None:
         super().__init__()

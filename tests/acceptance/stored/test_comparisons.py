@@ -22,15 +22,15 @@ def correct(run: Any, category: str) -> pd.Series:
 
 def rows_of(answer: Any) -> list[dict[str, Any]]:
     """Rows of a JSON answer, alone or beside comparisons."""
-    found: list[dict[str, Any]] = answer["rows"] if isinstance(answer, dict) else answer
-    return found
+    rows: list[dict[str, Any]] = answer["rows"] if isinstance(answer, dict) else answer
+    return rows
 
 
 def differences(answer: Any) -> list[dict[str, Any]]:
     """Differences of a JSON answer, wherever rows or the table hold them."""
     if isinstance(answer, dict) and "differences" in answer:
-        found: list[dict[str, Any]] = answer["differences"]
-        return found
+        of_groups: list[dict[str, Any]] = answer["differences"]
+        return of_groups
     return [difference for row in rows_of(answer) for difference in row.get("differences", [])]
 
 
@@ -117,9 +117,9 @@ def test_stages_count_items_by_answered_encoded_and_acted(runs: StoredRuns) -> N
         assert row["encoded"] == sum(number for which, number in row["counts"].items() if which[1] == "1")
     text = probe_kit("stages", runs.asked, runs.trained).out
     for category, row in rows.items():
-        shown = " ".join(cell for cells in rows_with(text, category) for cell in cells)
-        assert f"{row['answered_correctly']} (" in shown
-        assert f"{row['acted_correctly']} (" in shown
+        printed = " ".join(cell for cells in rows_with(text, category) for cell in cells)
+        assert f"{row['answered_correctly']} (" in printed
+        assert f"{row['acted_correctly']} (" in printed
 
 
 def test_wordings_of_one_run_are_compared_on_the_same_seeds_and_chosen_by_name(runs: StoredRuns) -> None:

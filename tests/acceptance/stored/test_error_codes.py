@@ -224,10 +224,10 @@ def test_the_installed_program_exits_with_the_documented_codes(tmp_path: Path) -
 
 def test_escape_sequences_of_outside_text_never_reach_the_terminal(runs: StoredRuns, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(runs.expert, tmp_path / "copy"))
-    named = probe_kit("run", "label", copy, "red\x1b[31m", code=None)
+    labelled = probe_kit("run", "label", copy, "red\x1b[31m", code=None)
     table = probe_kit("retention", copy)
     missing = probe_kit("retention", f"{tmp_path}/\x1b[2Jnowhere", code=2)
-    for answer in (named, table, missing):
+    for answer in (labelled, table, missing):
         assert "\x1b" not in answer.out + answer.err
 
 

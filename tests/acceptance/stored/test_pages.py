@@ -184,9 +184,9 @@ def test_chromium_shows_the_viewer_and_the_report_without_a_complaint(
         page = browser.page()
         page.open(served[0])
         page.wait("document.body.innerText.includes('Color') || document.body.innerText.includes('color')")
-        shown: Any = page.read("document.body.innerText")
-        assert 'alert("x")' in shown
-        assert "untrained" in shown
+        body: Any = page.read("document.body.innerText")
+        assert 'alert("x")' in body
+        assert "untrained" in body
         assert page.read("document.querySelectorAll('img[src=x]').length") == 0
         page.open(report.as_uri())
         assert 'alert("x")' in page.read("document.body.innerText")

@@ -23,8 +23,8 @@ from tests.acceptance.stored.printed_tables import (
 @pytest.fixture(scope="module")
 def rows(runs: StoredRuns) -> list[dict[str, Any]]:
     """The rows of the trained policy as JSON: State, Color, and their mean."""
-    found: list[dict[str, Any]] = probe_kit("retention", runs.trained, "--format", "json").json()
-    return found
+    answer: list[dict[str, Any]] = probe_kit("retention", runs.trained, "--format", "json").json()
+    return answer
 
 
 def test_the_json_has_a_row_per_category_and_their_mean_within_bounds(rows: list[dict[str, Any]]) -> None:

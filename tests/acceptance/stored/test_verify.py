@@ -58,10 +58,10 @@ def swap(run: Path, files: list[Path]) -> list[Path]:
     """Exchange two files of one kind that differ, if there are two."""
     first = run / files[0]
     for file in files[1:]:
-        here, there = first.read_bytes(), (run / file).read_bytes()
-        if here != there:
-            first.write_bytes(there)
-            (run / file).write_bytes(here)
+        contents = first.read_bytes(), (run / file).read_bytes()
+        if contents[0] != contents[1]:
+            first.write_bytes(contents[1])
+            (run / file).write_bytes(contents[0])
             return [files[0], file]
     return []
 
@@ -80,15 +80,15 @@ def copied(runs: StoredRuns, tmp_path: Path) -> Path:
     return Path(shutil.copytree(runs.untrained, tmp_path / "run"))
 
 
-def undetected(whole: Path, run: Path, kind: str, damage: Damage) -> str | None:
-    """Damage `run`, verify, and repair it from `whole`. Return the damage if it went through, else None."""
-    files = files_by_kind(whole)[kind]
+def undetected(intact: Path, run: Path, kind: str, damage: Damage) -> str | None:
+    """Damage `run`, verify, and repair it from `intact`. Return the damage if it went through, else None."""
+    files = files_by_kind(intact)[kind]
     touched = damage(run, files)
     try:
         answer = probe_kit("run", "verify", run, "--deep", code=None)
     finally:
         for file in touched:
-            shutil.copyfile(whole / file, run / file)
+            shutil.copyfile(intact / file, run / file)
     assert "InternalError" not in answer.text, answer.text
     without_root = (kind, damage) == ("run.json", delete)  # no run any more: wrong usage
     if not touched or answer.code == (2 if without_root else 1):
@@ -119,15 +119,15 @@ def test_damage_of_every_kind_of_file_is_exit_code_1(runs: StoredRuns, copied: P
 @pytest.mark.slow
 def test_every_damage_of_every_kind_of_file_is_exit_code_1(runs: StoredRuns, tmp_path: Path) -> None:
     passed = []
-    for number, whole in enumerate((runs.trained, runs.asked)):
-        run = Path(shutil.copytree(whole, tmp_path / str(number)))
-        for kind in files_by_kind(whole):
+    for number, intact in enumerate((runs.trained, runs.asked)):
+        run = Path(shutil.copytree(intact, tmp_path / str(number)))
+        for kind in files_by_kind(intact):
             if kind in FREE:
                 continue
             for damage in DAMAGES:
                 if damage is delete and kind.partition("/")[0] in MAY_BE_LOST:
                     continue
-                passed.append(undetected(whole, run, kind, damage))
+                passed.append(undetected(intact, run, kind, damage))
     assert [problem for problem in passed if problem] == []
 
 
