@@ -42,6 +42,7 @@ def bucket() -> Iterator[str]:
         "AWS_SECRET_ACCESS_KEY": "nothing",
         "AWS_REGION": "us-east-1",
         "AWS_ALLOW_HTTP": "true",
+        "AWS_TIMEOUT": "5m",  # other tests may use the same cores
     }
     with pytest.MonkeyPatch.context() as patch:
         for name, value in variables.items():
