@@ -8,7 +8,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
+from urllib.error import HTTPError
+from urllib.request import HTTPCookieProcessor, build_opener, urlopen
 
 import pytest
 
@@ -162,15 +163,20 @@ def test_the_viewers_server_answers_on_this_machine_until_ctrl_c(
 ) -> None:
     address, process = served
     assert re.match(r"http://(127\.0\.0\.1|localhost|\[::1\])", address)
+    browser = build_opener(HTTPCookieProcessor())
     end, content = time.monotonic() + 60, ""
     while not content and time.monotonic() < end:
         try:
-            with urlopen(address, timeout=30) as answer:
+            with browser.open(address, timeout=30) as answer:
                 content = answer.read().decode()
+        except HTTPError:
+            raise
         except OSError:
             time.sleep(0.2)
     assert "<html" in content
     assert not OUTSIDE.search(content)
+    with pytest.raises(HTTPError, match="403"):
+        urlopen(address.partition("?")[0], timeout=30)  # another program of this machine, without the token
     process.send_signal(signal.SIGINT)
     assert process.wait(60) in (0, 130)
 
