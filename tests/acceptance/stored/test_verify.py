@@ -85,7 +85,7 @@ def undetected(intact: Path, run: Path, kind: str, damage: Damage) -> str | None
     files = files_by_kind(intact)[kind]
     touched = damage(run, files)
     try:
-        answer = probe_kit("run", "verify", run, "--deep", code=None)
+        answer = probe_kit("run", "verify", run, "--deep", "--json", code=None)
     finally:
         for file in touched:
             shutil.copyfile(intact / file, run / file)
@@ -93,6 +93,8 @@ def undetected(intact: Path, run: Path, kind: str, damage: Damage) -> str | None
     without_root = (kind, damage) == ("run.json", delete)  # no run any more: wrong usage
     if not touched or answer.code == (2 if without_root else 1):
         return None
+    if damage is delete and kind == "commits" and not answer.json()["finished"]:
+        return None  # a run without columns: a lost commit is an episode that is missing
     return f"{damage.__name__} of {files[0]}: exit code {answer.code}"
 
 
