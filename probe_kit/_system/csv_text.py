@@ -41,24 +41,12 @@ def csv_of_frame(frame: "pd.DataFrame") -> str:
 
 
 def csv_of_rows(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Rows as comma-separated values with a header; texts are `escaped`, and `rows_of_csv` gives them back."""
+    """Rows as comma-separated values with a header; texts are `escaped`."""
     lines = _Lines()
     table = csv.DictWriter(lines, columns, lineterminator=_Lines.END)
     table.writerow({name: escaped(name) for name in columns})
     table.writerows({name: escaped(cell) for name, cell in row.items()} for row in rows)
     return lines.getvalue()
-
-
-def rows_of_csv(text: str) -> list[dict[str, Any]]:
-    """The rows that `csv_of_rows` wrote, every cell as text.
-
-    As `csv.DictReader` has it, cells beyond the header are a list at the key None. Raises csv.Error.
-    """
-    reader = csv.DictReader(io.StringIO(text, newline=""))
-    reader.fieldnames = [unescaped(name) for name in reader.fieldnames or ()]
-    return [
-        {name: unescaped(cell) if isinstance(cell, str) else cell for name, cell in row.items()} for row in reader
-    ]
 
 
 class _Lines(io.StringIO):

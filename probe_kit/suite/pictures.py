@@ -1,15 +1,16 @@
-"""Pictures: hashes, encoding, and conversion of foreign files to square RGB tiles."""
+"""Pictures: the one decoder of foreign files, hashes, encoding, and conversion to square RGB tiles."""
 
 import hashlib
+import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageFile, ImageOps, UnidentifiedImageError
 
-from probe_kit.errors import SuiteError
+from probe_kit.errors import ProbeKitError, SuiteError
 
 RESTORE = "Restore the suite's files or build it again."
 """What to do about a picture of a suite."""
@@ -17,8 +18,26 @@ WHITE = (255, 255, 255)
 LARGEST_PICTURE = 8192
 """Pixels of the longer side: a few kilobytes can claim to be a picture that fills all memory once decoded."""
 
+FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
+"""Formats that are decoded, as Pillow names them."""
+
 # What Pillow raises for bytes that are no picture or only part of one; PNG reports bad chunks as SyntaxError.
-_DECODING_ERRORS = (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError)
+_DECODING_ERRORS = (
+    UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, struct.error, EOFError,
+    KeyError, IndexError, TypeError, OverflowError,
+)  # fmt: skip
+_PNG = b"\x89PNG\r\n\x1a\n"
+_PNG_DEPTH = 24
+"""Place of the byte that holds the bits per channel of a PNG."""
+_REFUSED = (
+    (b"II*\0", "TIFF"), (b"MM\0*", "TIFF"), (b"II+\0", "TIFF"), (b"MM\0+", "TIFF"), (b"%PDF", "PDF"),
+    (b"8BPS", "Photoshop"), (b"\0\0\1\0", "ICO"), (b"\0\0\2\0", "CUR"), (b"<svg", "SVG"), (b"<?xml", "SVG or XML"),
+    (b"\xff\x4f\xff\x51", "JPEG 2000"), (b"\0\0\0\x0cjP", "JPEG 2000"), (b"\xff\x0a", "JPEG XL"),
+    (b"\0\0\0\x0cJXL", "JPEG XL"), (b"v/1\1", "OpenEXR"), (b"#?RADIANCE", "Radiance HDR"), (b"DDS ", "DDS"),
+    (b"qoif", "QOI"), (b"icns", "ICNS"), (b"%!PS", "PostScript"), (b"\x0a\x05\1\x08", "PCX"), (b"BPG\xfb", "BPG"),
+    *((f"P{number}{end}".encode(), "PNM") for number in range(1, 8) for end in " \n\t\r"), (b"Pf\n", "PFM"), (b"PF\n", "PFM"),
+)  # fmt: skip
+"""Beginnings of files in other formats, so that they are refused by name."""
 
 
 def pixels_sha256(image: Image.Image) -> str:
@@ -44,9 +63,9 @@ def encode_png(image: Image.Image) -> bytes:
 
 
 def picture_size(encoded: bytes) -> tuple[int, int] | None:
-    """Width and height in pixels as the file's header states them, None if it is not a picture."""
+    """Width and height in pixels as the file's header states them, None if it is not a picture of `FORMATS`."""
     try:
-        with _headers_of_bombs(), Image.open(BytesIO(encoded)) as image:
+        with _opened(encoded) as image:
             return image.size
     except _DECODING_ERRORS:
         return None
@@ -66,43 +85,109 @@ def load_picture(path: Path, pixels: str | None = None) -> Image.Image:
 
 
 def decode_picture(path: Path) -> Image.Image:
-    """An RGB picture in its own size: EXIF rotation is applied and transparency becomes white.
+    """The RGB picture in a file, as `decode_bytes` has it.
 
-    Raises SuiteError naming the file if it is missing, is not a picture, is damaged, is larger than
-    `LARGEST_PICTURE`, or has more than 8 bits per channel.
+    Raises SuiteError naming the file if it is missing or cannot be decoded.
     """
-    if not path.is_file():
-        raise SuiteError(f"{path}: there is no such picture. {RESTORE}")
     try:
-        with _headers_of_bombs(), Image.open(path) as image:
-            _check_huge(image, path)
+        encoded = path.read_bytes()
+    except OSError as error:
+        reason = "there is no such picture" if not path.is_file() else f"cannot be read ({error.strerror})"
+        raise SuiteError(f"{path}: {reason}. {RESTORE}") from error
+    return decode_bytes(encoded, f"{path}:")
+
+
+def decode_bytes(
+    encoded: bytes,
+    name: str,
+    error: type[ProbeKitError] = SuiteError,
+    remedy: str = RESTORE,
+    upright: bool = True,
+    largest: int = LARGEST_PICTURE,
+) -> Image.Image:
+    """An RGB picture in its own size from the bytes of a file of `FORMATS`.
+
+    The orientation of EXIF is applied, and transparency becomes white. Palettes and grey become RGB. CMYK becomes
+    RGB by Pillow's formula, without a colour profile.
+    name: what the picture is, at the beginning of messages. upright: False for textures, whose orientation
+    belongs to their mesh. largest: pixels of the longer side.
+    Raises `error` for another format, damaged or incomplete bytes, a larger picture, several frames, and more than
+    8 bits per channel.
+    """
+    if refused := _refused_format(encoded):
+        raise error(f"{name} is {refused}; expected one of {', '.join(FORMATS)}. Convert it, or give another file.")
+    try:
+        with _opened(encoded) as image:
+            _check_still(image, name, error, largest)
+            _check_deep(image, encoded, name, error)
             image.verify()  # decoding alone does not compare the checksums
-        with Image.open(path) as image:
-            _check_deep(image, path)
-            return on_white(ImageOps.exif_transpose(image))
-    except _DECODING_ERRORS as error:
-        raise SuiteError(f"{path}: not a picture that Pillow can decode ({error}). {RESTORE}") from error
+        with _opened(encoded) as image:
+            return on_white(ImageOps.exif_transpose(image) if upright else image)
+    except _DECODING_ERRORS as problem:
+        raise error(f"{name} not a picture that Pillow can decode ({problem}). {remedy}") from problem
+
+
+def rgb_of(image: Image.Image, name: str, remedy: str) -> Image.Image:
+    """The RGB pixels of a picture that another library opened: transparency becomes white.
+
+    Raises SuiteError for a format outside `FORMATS`, more than 8 bits per channel, and damaged bytes.
+    """
+    if image.format not in (None, *FORMATS):
+        raise SuiteError(f"{name} is {image.format}; expected one of {', '.join(FORMATS)}. {remedy}")
+    _check_deep(image, b"", name, SuiteError)
+    try:
+        return on_white(image)
+    except _DECODING_ERRORS as problem:
+        raise SuiteError(f"{name} not a picture that Pillow can decode ({problem}). {remedy}") from problem
+
+
+def stored_picture(path: Path, mode: str) -> Image.Image:
+    """A picture of this package, whose transparency is part of it. mode: of Pillow, such as RGBA."""
+    with _opened(path.read_bytes()) as image:
+        return image.convert(mode)
 
 
 @contextmanager
-def _headers_of_bombs() -> Iterator[None]:
-    """Pillow warns of a huge picture when it is opened; we refuse it, and need its size to say so."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        yield
+def _opened(encoded: bytes) -> Iterator[Image.Image]:
+    """A picture of `FORMATS` that is decoded wholly or not at all, whatever other libraries set for Pillow.
+
+    Pillow warns of a huge picture when it is opened; we refuse it, and need its size to say so.
+    """
+    incomplete, ImageFile.LOAD_TRUNCATED_IMAGES = ImageFile.LOAD_TRUNCATED_IMAGES, False
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image = Image.open(BytesIO(encoded), formats=FORMATS)
+        with image:
+            yield image
+    finally:
+        ImageFile.LOAD_TRUNCATED_IMAGES = incomplete
 
 
-def _check_huge(image: Image.Image, path: Path) -> None:
-    if max(image.size) > LARGEST_PICTURE:
+def _refused_format(encoded: bytes) -> str | None:
+    """The name of a known format that is not decoded."""
+    start = encoded[:64].lstrip(b"\xef\xbb\xbf \t\r\n") if encoded[:1] in b"\xef <\t\r\n" else encoded[:64]
+    if encoded[4:8] == b"ftyp":
+        return "AVIF" if encoded[8:12] in (b"avif", b"avis") else "HEIF"
+    return next((name for beginning, name in _REFUSED if start.startswith(beginning)), None)
+
+
+def _check_still(image: Image.Image, name: str, error: type[ProbeKitError], largest: int) -> None:
+    """Raise `error` for a huge picture, and for several frames; a photo's second view (MPO) is not one."""
+    if max(image.size) > largest:
         width, height = image.size
-        raise SuiteError(
-            f"{path}: claims to be {width}×{height} pixels; at most {LARGEST_PICTURE} are read. Make it smaller."
-        )
+        raise error(f"{name} claims to be {width}×{height} pixels; at most {largest} are read. Make it smaller.")
+    frames = getattr(image, "n_frames", 1)
+    if frames > 1 and image.format in FORMATS:
+        raise error(f"{name} has {frames} frames; expected a still picture. Give the frame that is meant.")
 
 
-def _check_deep(image: Image.Image, path: Path) -> None:
-    if image.mode.startswith(("I", "F")):  # Pillow would clip these at 255
-        raise SuiteError(f"{path}: has more than 8 bits per channel ({image.mode}). Convert it to 8-bit RGB.")
+def _check_deep(image: Image.Image, encoded: bytes, name: str, error: type[ProbeKitError]) -> None:
+    """Raise `error` for a picture that Pillow would clip at 255, or cut to its upper 8 bits."""
+    png = encoded.startswith(_PNG)
+    if image.mode.startswith(("I", "F")) or (png and encoded[_PNG_DEPTH] > 8):
+        depth = f"{encoded[_PNG_DEPTH]} bits" if png else image.mode
+        raise error(f"{name} has more than 8 bits per channel ({depth}). Convert it to 8-bit RGB.")
 
 
 def on_white(image: Image.Image) -> Image.Image:

@@ -174,6 +174,7 @@ def train_on_column(
     from probe_kit.train import train_probes
 
     number, labels = _one_call(call), column.read(run)
+    _print_contents(labels)
     with progress() as bar:
         return train_probes(
             run,
@@ -186,6 +187,10 @@ def train_on_column(
             progress=counter(bar, "sites"),
             **options,
         )
+
+
+def _print_contents(labels: "Labels") -> None:
+    out.print(labels.contents, markup=False, highlight=False)
 
 
 def transfer_column(
@@ -203,12 +208,16 @@ def transfer_column(
     from probe_kit.train import transfer_probes
     from probe_kit.train.transfer.transfer_summary import transfer_sentences, transfer_table
 
+    fitted_on, scored_on = column.read(run), column.read(other, transfer.labels)
+    _print_contents(fitted_on)
+    if scored_on.contents != fitted_on.contents:
+        _print_contents(scored_on)
     with progress() as bar:
         results = transfer_probes(
             run,
             other,
-            column.read(run),
-            column.read(other, transfer.labels),
+            fitted_on,
+            scored_on,
             categories,
             call=_one_call(call),
             window=window,

@@ -10,7 +10,7 @@ from PIL import Image
 from probe_kit.env.rotations import Array
 from probe_kit.env.simulation.camera import Camera, Picture
 from probe_kit.errors import SceneError
-from probe_kit.suite.pictures import LARGEST_PICTURE
+from probe_kit.suite.pictures import decode_bytes
 
 PLANK_WIDTH = 0.14
 TABLE_END = 0.92
@@ -23,16 +23,13 @@ SUPERSAMPLING = 2
 
 def load_photo(path: Path, width: int, height: int) -> Picture:
     """The photo at `path`, squeezed to (height, width, 3). Raises SceneError if it cannot be read."""
+    remedy = "Give another file, or leave `background` out for our own wooden table."
     try:
-        with Image.open(path) as image:
-            if max(image.size) > LARGEST_PICTURE:
-                raise ValueError(f"{image.width}×{image.height} pixels; at most {LARGEST_PICTURE} are read")
-            return np.asarray(image.convert("RGB").resize((width, height), Image.Resampling.LANCZOS))
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise SceneError(
-            f"background {path}: not a picture that Pillow can decode ({error}). Give another file, or leave "
-            "`background` out for our own wooden table."
-        ) from error
+        encoded = path.read_bytes()
+    except OSError as error:
+        raise SceneError(f"background {path}: cannot be read ({error.strerror}). {remedy}") from error
+    picture = decode_bytes(encoded, f"background {path}:", SceneError, remedy)
+    return np.asarray(picture.resize((width, height), Image.Resampling.LANCZOS))
 
 
 @lru_cache(maxsize=8)

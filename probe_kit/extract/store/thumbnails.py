@@ -17,7 +17,10 @@ from probe_kit.extract.store.format.commits import FRAME_COUNT, pictures_of, rea
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.small_frames import SmallFrames, shrink
+from probe_kit.suite.pictures import decode_bytes
 
+_LARGEST_SHEET = 16_383
+"""Pixels of the longer side, as WebP has them."""
 _CODING: dict[FrameChoice, dict[str, int]] = {
     "ends": {"quality": 85, "method": 4},
     "all": {"quality": 80, "method": 0},
@@ -52,7 +55,9 @@ def decode_frames(content: bytes, count: int) -> SmallFrames:
     """The `count` frames of a picture that `as_thumbnail` made."""
     columns = min(count, FRAME_COLUMNS)
     rows = -(-count // columns)
-    pixels = np.asarray(Image.open(BytesIO(content)).convert("RGB"))
+    pixels = np.asarray(
+        decode_bytes(content, "the stored frames:", RunDamagedError, "Extract the run again.", largest=_LARGEST_SHEET)
+    )
     cells = pixels.reshape(rows, pixels.shape[0] // rows, columns, pixels.shape[1] // columns, 3).swapaxes(1, 2)
     return tuple(cells.reshape(-1, *cells.shape[2:])[:count])
 

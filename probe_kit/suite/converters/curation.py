@@ -1,8 +1,7 @@
 """The curation file: a person's decisions (accept, reject, reword) as JSON lines or CSV, with previews."""
 
-import csv
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,10 @@ from typing import Any
 from PIL import Image
 
 from probe_kit._system.bounded_json import parse_json
-from probe_kit._system.csv_text import csv_of_rows, rows_of_csv
+from probe_kit._system.csv_text import csv_of_rows
 from probe_kit._system.drafts import write_whole
+from probe_kit._system.table_cells import is_missing, plain_cell, truth_of
+from probe_kit._system.text_tables import open_table
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import SourcePicture, Wording
 from probe_kit.suite.converters.pairing import Proposal
@@ -23,6 +24,9 @@ COLUMNS = (
     *("proposed_instruction", "rule_id", "status", "instruction", "object_phrase", "polarity", "recognisable"),
     *("reason", "reviewer", "date", "llm"),
 )
+_DECIDED = ("question_sha256", "status", "instruction", "object_phrase", "polarity", "recognisable")
+"""Columns that decide what becomes of a candidate."""
+_TABLES = (".csv", ".tsv")
 _PREVIEW_PIXELS = 160
 
 Row = Mapping[str, Any]
@@ -41,7 +45,7 @@ def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) ->
     rows = [_row(proposal, _previews(proposal, previews, render)) for proposal in proposals]
     text = (
         _to_csv(rows)
-        if path.suffix == ".csv"
+        if path.suffix.lower() == ".csv"
         else "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
     )
     write_whole(path, text)
@@ -60,23 +64,50 @@ def _check_reviewed(path: Path) -> None:
 
 
 def read_curation(path: Path) -> list[dict[str, Any]]:
-    """The rows of a curation file. Raises SuiteError naming the line that cannot be used."""
+    """The rows of a curation file, one per candidate. Raises SuiteError naming the line that cannot be used.
+
+    Cells are texts without white space around them; `status` and `recognisable` are in lower case.
+    """
     if not path.is_file():
         raise SuiteError(f"curation file {path} not found. Make one with emit_curation (--emit-curation).")
-    text = path.read_text(encoding="utf-8")
-    rows = _from_csv(text, path) if path.suffix == ".csv" else _from_lines(text, path)
-    for number, row in enumerate(rows, start=1):
-        missing = [name for name in ("candidate_id", "question_sha256", "status") if not row.get(name)]
-        if missing:
+    rows: dict[str, tuple[str, dict[str, Any]]] = {}
+    for where, record in _from_csv(path) if path.suffix.lower() in _TABLES else _from_lines(path):
+        row = _checked({name: _text(cell) for name, cell in record.items()}, where)
+        before = rows.setdefault(row["candidate_id"], (where, row))
+        changed = [name for name in _DECIDED if before[1].get(name, "") != row.get(name, "")]
+        if changed:
             raise SuiteError(
-                f"{path}: row {number} has no {missing[0]}; expected the columns {', '.join(COLUMNS)}."
+                f"{where}: {row['candidate_id']} has {changed[0]} {row.get(changed[0], '')!r}, and in {before[0]} "
+                f"{before[1].get(changed[0], '')!r}. Leave one of the two out"
             )
-        if row["status"] not in STATUSES:
-            raise SuiteError(
-                f"{path}: row {number} ({row['candidate_id']}): status is {row['status']!r}; "
-                f"expected one of {', '.join(STATUSES)}."
-            )
-    return rows
+    return [row for _, row in rows.values()]
+
+
+def _text(cell: Any) -> Any:
+    """A cell as the reader of tables has it: an empty text for a missing one."""
+    if not isinstance(cell, str):
+        return "" if cell is None else cell
+    text = plain_cell(cell)
+    return "" if is_missing(text) else text
+
+
+def _checked(row: dict[str, Any], where: str) -> dict[str, Any]:
+    """The row with its decisions in lower case. Raises SuiteError."""
+    missing = [name for name in ("candidate_id", "question_sha256", "status") if not row.get(name)]
+    if missing:
+        raise SuiteError(f"{where} has no {missing[0]}; expected the columns {', '.join(COLUMNS)}.")
+    status = str(row["status"]).lower()
+    if status not in STATUSES:
+        raise SuiteError(
+            f"{where} ({row['candidate_id']}): status is {row['status']!r}; expected one of {', '.join(STATUSES)}."
+        )
+    recognisable = row.get("recognisable", "")
+    truth = None if recognisable == "" else truth_of(recognisable)
+    if truth is None and recognisable != "":
+        raise SuiteError(
+            f"{where} ({row['candidate_id']}): recognisable is {recognisable!r}; expected yes, no or an empty cell."
+        )
+    return {**row, "status": status, "recognisable": "" if truth is None else "yes" if truth else "no"}
 
 
 def apply_curation(proposals: Sequence[Proposal], rows: Sequence[Row], path: Path) -> dict[str, Proposal]:
@@ -102,7 +133,7 @@ def apply_curation(proposals: Sequence[Proposal], rows: Sequence[Row], path: Pat
     return {
         row["candidate_id"]: _reviewed(by_id[row["candidate_id"]], row, path)
         for row in rows
-        if row["status"] in ("accept", "edited") and str(row.get("recognisable") or "yes").lower() != "no"
+        if row["status"] in ("accept", "edited") and row["recognisable"] != "no"
     }
 
 
@@ -165,23 +196,25 @@ def _to_csv(rows: Sequence[Row]) -> str:
     return csv_of_rows(COLUMNS, ({**row, "llm": json.dumps(row["llm"])} for row in rows))
 
 
-def _from_csv(text: str, path: Path) -> list[dict[str, Any]]:
+def _from_csv(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    table = open_table(path, COLUMNS, SuiteError)
+    for line, cells in table.rows():
+        yield table.where(line), dict(cells)
+
+
+def _from_lines(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     try:
-        return rows_of_csv(text)
-    except csv.Error as problem:
-        raise SuiteError(f"{path}: not valid CSV ({problem}). Restore the file.") from problem
-
-
-def _from_lines(text: str, path: Path) -> list[dict[str, Any]]:
-    rows = []
-    for number, line in enumerate(text.splitlines(), start=1):
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as problem:
+        raise SuiteError(f"{path} is not UTF-8 text ({problem}). Save it as UTF-8.") from problem
+    for number, line in enumerate(text.split("\n"), start=1):
+        if not line.strip():
+            continue
+        where = f"{path}, line {number}"
         try:
             row = parse_json(line)
         except ValueError as problem:
-            raise SuiteError(f"{path}:{number}: not valid JSON ({problem}). Restore the line.") from problem
+            raise SuiteError(f"{where}: not valid JSON ({problem}). Restore the line.") from problem
         if not isinstance(row, dict):
-            raise SuiteError(
-                f"{path}:{number}: a JSON {type(row).__name__}; expected an object. Restore the line."
-            )
-        rows.append(row)
-    return rows
+            raise SuiteError(f"{where}: a JSON {type(row).__name__}; expected an object. Restore the line.")
+        yield where, row

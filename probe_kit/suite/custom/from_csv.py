@@ -4,13 +4,14 @@ instruction,correct,wrong,group,category
 Put the cube on the ripe fruit,banana-3.jpg,banana-1.jpg,banana,ripeness
 """
 
-import csv
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 
+from probe_kit._system.table_cells import group_names, problem_of
+from probe_kit._system.text_tables import TextTable, open_table
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.suite.card import new_suite
@@ -66,7 +67,7 @@ def suite_from_csv(
     read, questions that break a rule, or a `folder` that holds anything else. Nothing is written then.
     """
     table, folder = Path(table), Path(folder)
-    rows = list(read_rows(table, category))
+    rows = read_rows(table, category)
     check_foreign_folder(folder)
     name = name or table.stem
     pictures: dict[str, bytes] = {}
@@ -98,43 +99,61 @@ def _shown(table: Path, row: Row, column: str) -> Shown:
         raise SuiteError(f"{where}: {str(error).replace(RESTORE, 'Give another file.')}") from error
 
 
-def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> Iterator[Row]:
-    """The lines of the table. Raises UsageError for whatever cannot be a question, naming the line."""
-    try:
-        text = table.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{table} cannot be read as a table: {error}. Give a CSV file in UTF-8") from error
-    reader = csv.DictReader(text.splitlines())
-    columns = reader.fieldnames or []
-    missing = [column for column in COLUMNS if column not in columns]
-    unknown = [column for column in columns if column not in (*COLUMNS, *FURTHER)]
+def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> list[Row]:
+    """The rows of the table, one per question. Raises UsageError for what cannot be a question, naming the line."""
+    opened = open_table(table, COLUMNS)
+    named = [column for column in opened.names if column]
+    missing = [column for column in COLUMNS if column not in named]
+    unknown = [column for column in named if column not in (*COLUMNS, *FURTHER)]
     if missing or unknown:
         wrong = [f"lacks {', '.join(missing)}"] * bool(missing)
         wrong += [f"has {', '.join(map(repr, unknown))}, which no table has"] * bool(unknown)
         raise UsageError(
-            f"{table}, line 1, {' and '.join(wrong)}; expected {', '.join(COLUMNS)} and, where wanted, "
+            f"{table}, line {opened.line}, {' and '.join(wrong)}; expected {', '.join(COLUMNS)} and, where wanted, "
             f"{', '.join(FURTHER)}"
         )
-    seen: dict[tuple[str, Path, Path], int] = {}
-    for record in reader:
-        row = _row(record, reader.line_num, table, category)
-        first = seen.setdefault((row.instruction, row.correct, row.wrong), row.line)
+    rows = [_row(cells, line, opened, category) for line, cells in opened.rows()]
+    if not rows:
+        raise UsageError(f"{table} has no line below its heading; expected one per question")
+    _check_contradictions(rows, table)
+    return _with_group_names(rows, opened)
+
+
+def _check_contradictions(rows: Sequence[Row], table: Path) -> None:
+    """Raise UsageError for a question that is asked twice, or with another answer."""
+    lines: dict[tuple[str, Path, Path], int] = {}
+    for row in rows:
+        first = lines.setdefault((row.instruction, row.correct, row.wrong), row.line)
         if first != row.line:
             raise UsageError(f"{table}, lines {first} and {row.line} are the same question. Leave one out")
-        yield row
-    if not seen:
-        raise UsageError(f"{table} has no line below its heading; expected one per question")
+        opposite = lines.get((row.instruction, row.wrong, row.correct))
+        if opposite is not None and row.correct != row.wrong:
+            raise UsageError(
+                f"{table}, lines {opposite} and {row.line} are the same question with opposite answers. Correct one, "
+                "or leave it out"
+            )
 
 
-def _row(record: Mapping[str | None, str | None], line: int, table: Path, category: str) -> Row:
-    where = f"{table}, line {line}"
-    if None in record:
-        raise UsageError(f'{where} has more fields than the heading; put a text with commas between "quotes"')
-    cells = {str(column): (value or "").strip() for column, value in record.items()}
+def _with_group_names(rows: Sequence[Row], opened: TextTable) -> list[Row]:
+    """The rows with one spelling of every group, such as 7 for 7.0."""
+    grouped = [row for row in rows if row.group]
+    names = group_names(
+        [row.group for row in grouped], lambda number: opened.where(grouped[number].line, "group"), UsageError
+    )
+    by_line = {row.line: name for row, name in zip(grouped, names, strict=True)}
+    return [replace(row, group=by_line.get(row.line, "")) for row in rows]
+
+
+def _row(record: Mapping[str, str | None], line: int, opened: TextTable, category: str) -> Row:
+    where, table = opened.where(line), opened.path
+    cells = {column: cell or "" for column, cell in record.items()}
     empty = [column for column in COLUMNS if not cells[column]]
     if empty:
         columns = f"column{'s' * (len(empty) > 1)} {' and '.join(empty)}"
         raise UsageError(f"{where}, {columns}: it is empty; every question needs {', '.join(COLUMNS)}")
+    doubtful = {column: problem for column in (*COLUMNS, *FURTHER) if (problem := problem_of(cells.get(column, "")))}
+    for column, problem in doubtful.items():
+        raise UsageError(f"{where}, column {column}: {problem}")
     asked = cells.get("object") or _object_of(cells["instruction"])
     if asked is None or asked not in cells["instruction"]:
         raise UsageError(

@@ -1,9 +1,8 @@
 """Tables of labels: CSV, Parquet or a DataFrame, with the line of every cell."""
 
-import csv
-import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from datetime import date, time
 from decimal import Decimal
 from math import isinf, isnan
@@ -13,29 +12,25 @@ from uuid import UUID
 
 import numpy as np
 
-from probe_kit._system.csv_text import unescaped
 from probe_kit._system.optional_dependencies import require
+from probe_kit._system.table_cells import MOST_DIGITS, group_names, number_of
+from probe_kit._system.text_tables import MOST_BYTES, cell_of, open_table
 from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit.errors import UsageError
+from probe_kit.train.choices import Task
+from probe_kit.train.labels.cell_values import Cell, values_of
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Cell = str | int | float | bool | None
 Kind = Literal["text", "boolean", "integer", "number"]
 
 EPISODE, INFERENCE = "episode_id", "inference"
 """Key columns of a table: one label per episode, or with both one per captured inference."""
 SOURCE, FRAME = "source_episode", "frame"
 """The same of recordings, by the numbers of the data set; read where a table has no `episode_id`."""
-MOST_BYTES = 1 << 30
 EXACT = 2**53
 """Integers beyond it have no exact float64."""
-MOST_DIGITS = 400
-"""Of an integer that are read: with so many it is refused, and Python converts no more than 4,300."""
-_INTEGER = re.compile(r"[+-]?[0-9]+")
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-_INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
 _ARTICLE = {"text": "text", "boolean": "true or false", "integer": "a number", "number": "a number"}
 
 
@@ -44,7 +39,8 @@ class LabelTable:
     """Some columns of a table of labels, as cells of Python types.
 
     source: the file, or `DataFrame`. unit: `line` of a file, or `row` where there are no lines. names: all columns
-    of the table. columns: cells of those that were asked for. lines: number of every row in its file.
+    of the table. columns: cells of those that were asked for: texts of a CSV file, texts and typed values of a
+    data frame, None where missing. lines: number of every row in its file.
     """
 
     source: str
@@ -58,9 +54,24 @@ class LabelTable:
         place = f"{self.source}, {self.unit} {self.lines[row]}"
         return place if column is None else f"{place}, column {terminal_safe(column)!r}"
 
-    def cells(self, column: str) -> list[Cell]:
-        """The cells of one column, of one kind. Raises UsageError for mixed kinds and unusable cells."""
+    def at(self, rows: Sequence[int]) -> "LabelTable":
+        """The table of some rows."""
+        columns = {name: [cells[row] for row in rows] for name, cells in self.columns.items()}
+        return replace(self, columns=columns, lines=[self.lines[row] for row in rows])
+
+    def values(self, column: str, task: Task | None) -> list[Cell]:
+        """The cells of one column as `values_of` reads them, of one kind. Raises UsageError."""
         cells = self.columns[column]
+        for row, cell in enumerate(cells):
+            if isinstance(cell, str):
+                self._kind(row, column, cell)
+        return self._of_one_kind(column, values_of(cells, lambda row: self.where(row, column), task))
+
+    def typed(self, column: str) -> list[Cell]:
+        """The cells of one column as they are, of one kind. Raises UsageError for mixed kinds and unusable cells."""
+        return self._of_one_kind(column, self.columns[column])
+
+    def _of_one_kind(self, column: str, cells: list[Cell]) -> list[Cell]:
         first: tuple[Kind, int] | None = None
         for row, cell in enumerate(cells):
             if cell is None:
@@ -91,13 +102,23 @@ class LabelTable:
             )
 
     def texts(self, column: str) -> list[str]:
-        """The cells of one column as names, none of them empty. Raises UsageError."""
+        """The cells of one column as they are written, none of them missing. Raises UsageError."""
         cells = self.columns[column]
         for row, cell in enumerate(cells):
             if cell is None:
                 raise UsageError(f"{self.where(row, column)} is empty; expected a name in every {self.unit}")
             self._kind(row, column, cell)
         return [str(cell) for cell in cells]
+
+    def group_names(self, column: str) -> list[str]:
+        """The cells of one column as names of groups, none of them missing. Raises UsageError."""
+        self.texts(column)
+        return group_names(self.columns[column], lambda row: self.where(row, column), UsageError)
+
+    def numbers(self, column: str) -> list[Cell]:
+        """The cells of one column, with numbers in place of the texts that spell them."""
+        read = ((cell, number_of(cell) if isinstance(cell, str) else None) for cell in self.columns[column])
+        return [cell if number is None else number for cell, number in read]
 
     def _kind(self, row: int, column: str, cell: Cell) -> Kind:
         if isinstance(cell, bool):
@@ -124,7 +145,7 @@ class LabelTable:
 def read_table(table: "Path | str | pd.DataFrame", wanted: Sequence[str]) -> LabelTable:
     """The key columns and the columns `wanted` of a table. wanted: those that it lacks are left out.
 
-    table: a CSV file in UTF-8, a Parquet file (`.parquet`), or a DataFrame. Raises UsageError for a file that is
+    table: a CSV file (see `open_table`), a Parquet file (`.parquet`), or a DataFrame. Raises UsageError for a file that is
     no such table, or has no column `episode_id`; MissingExtraError for Parquet without pyarrow.
     """
     if not isinstance(table, str | Path):
@@ -148,88 +169,49 @@ def _check_file(path: Path) -> None:
 
 
 def _of_csv(path: Path, wanted: Sequence[str]) -> LabelTable:
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            records = _records(file, path)
-            header = next(records, (1, []))[1]
-            names = [unescaped(name.strip()) for name in header]
-            place = _places(names, wanted, str(path))
-            columns: dict[str, list[Cell]] = {name: [] for name in place}
-            lines = []
-            for line, record in records:
-                if len(record) != len(names):
-                    raise UsageError(
-                        f"{path}, line {line} has {len(record)} fields, the heading has {len(names)}. Put a text "
-                        'with commas between "quotes"'
-                    )
-                lines.append(line)
-                for name, position in place.items():
-                    columns[name].append(_parsed(unescaped(record[position].strip()), name))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path} cannot be read as a table: {error}. Give a CSV file in UTF-8") from error
-    return LabelTable(str(path), "line", tuple(names), columns, lines)
+    opened = open_table(path, (EPISODE, SOURCE))
+    read = list(_places(opened.names, wanted, str(path), opened.line))
+    columns: dict[str, list[Cell]] = {name: [] for name in read}
+    lines = []
+    for line, cells in opened.rows(read):
+        lines.append(line)
+        for name, cell in cells.items():
+            columns[name].append(cell)
+    return LabelTable(str(path), "line", opened.names, columns, lines)
 
 
-def _records(file: Any, path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line number and fields of every record that is not empty."""
-    reader = csv.reader(file, strict=True)
-    before = 0
-    try:
-        for record in reader:
-            if record:
-                yield before + 1, record
-            before = reader.line_num
-    except csv.Error as error:
-        raise UsageError(f"{path}, line {reader.line_num} is no CSV: {error}. Write the table again") from error
-
-
-def _places(names: Sequence[str], wanted: Sequence[str], source: str) -> dict[str, int]:
+def _places(names: Sequence[str], wanted: Sequence[str], source: str, line: int = 1) -> dict[str, int]:
     """Position of every column to read. Raises UsageError without the key, and for a name used twice."""
     if EPISODE not in names and SOURCE not in names:
         shown = ", ".join(terminal_safe(name) for name in names[:12]) or "no column"
         raise UsageError(
-            f"{source}, line 1 lacks the key column {EPISODE!r}; it has {shown}. "
+            f"{source}, line {line} lacks the key column {EPISODE!r}; it has {shown}. "
             f"{_other_delimiter(names)}`probe-kit labels RUN` writes a table with the keys of a run"
         )
     keys = (EPISODE, INFERENCE) if EPISODE in names else (SOURCE, FRAME)
     read = [name for name in dict.fromkeys((*keys, *wanted)) if name in names]
     if unsafe := [found for name in read if (found := UNSAFE.search(name))]:
         raise UsageError(
-            f"{source}, line 1: the name of a column holds the control or direction character "
+            f"{source}, line {line}: the name of a column holds the control or direction character "
             f"U+{ord(unsafe[0][0]):04X}; expected plain text. Rename the column"
         )
     if twice := [name for name in read if names.count(name) > 1]:
-        raise UsageError(f"{source}, line 1 has the column {terminal_safe(twice[0])!r} twice. Rename one of them")
+        raise UsageError(f"{source}, line {line} has the column {terminal_safe(twice[0])!r} twice. Rename one of them")
     return {name: names.index(name) for name in read}
 
 
 def _other_delimiter(names: Sequence[str]) -> str:
     """What to do about a heading that has the key beside another delimiter than a comma."""
-    for delimiter, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+    for delimiter, name in (("|", "bars"), (":", "colons")):
         fields = {field.strip().strip('"') for one in names for field in one.split(delimiter)}
         if len(fields) > len(names) and fields & {EPISODE, SOURCE}:
-            return f"Its fields are separated by {name}; save it with commas. "
+            return f"Its fields are separated by {name}; save it with commas, semicolons or tabs. "
     return ""
 
 
 def _short(number: int) -> str:
     digits = str(number)
     return digits if len(digits) <= 40 else f"{digits[:12]}… of {len(digits)} digits or more"
-
-
-def _parsed(text: str, column: str) -> Cell:
-    """A field of a CSV file as the type that it spells; ids stay text."""
-    if not text:
-        return None
-    if column == EPISODE:
-        return text
-    if _INTEGER.fullmatch(text):
-        return int(text[:MOST_DIGITS])
-    if _NUMBER.fullmatch(text) or _INFINITE.fullmatch(text):
-        return float(text)
-    if text.lower() == "nan":
-        return None
-    return {"true": True, "false": False}.get(text.lower(), text)
 
 
 def _of_parquet(path: Path, wanted: Sequence[str]) -> LabelTable:
@@ -282,8 +264,10 @@ def _plain(cell: Any, table: LabelTable, row: int, column: str) -> Cell:
         return None if isnan(cell) else cell
     if isinstance(cell, bool | int):
         return cell
-    if isinstance(cell, str | date | time | UUID):
-        return str(cell) or None
+    if isinstance(cell, str):
+        return cell_of(cell)
+    if isinstance(cell, date | time | UUID):
+        return str(cell)
     raise UsageError(
         f"{table.where(row, column)} is of type {type(cell).__name__}; expected text, a number, or true or false. "
         "Write one such value per row, a duration as a number of seconds"

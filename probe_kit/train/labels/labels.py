@@ -14,13 +14,15 @@ from probe_kit.hashing import sha256_json
 from probe_kit.train.choices import Task
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.labels.builtin_columns import builtin_column
-from probe_kit.train.labels.label_table import EPISODE, FRAME, INFERENCE, SOURCE, Cell, LabelTable, read_table
+from probe_kit.train.labels.cell_values import Cell
+from probe_kit.train.labels.label_table import EPISODE, FRAME, INFERENCE, SOURCE, LabelTable, read_table
 from probe_kit.train.labels.label_values import LabelValues, code_labels
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
+_MOST_CLASSES = 20
 _COUNTED = {INFERENCE: "a captured inference", FRAME: "a frame", SOURCE: "an episode"}
 
 
@@ -82,17 +84,19 @@ class Labels:
             episodes = tuple(map(str, _numbers(found, episode_key) or ()))
         else:
             episodes = tuple(found.texts(episode_key))
-        _check_keys(found, episodes, inferences)
+        cells = found.values(target, task)
+        groups, strata = _names(found, group_by), _names(found, exchange_within)
+        at = _once(found, episodes, inferences, [cells, *filter(None, (groups, strata))])
         return cls(
             target,
-            code_labels(found.cells(target), task, target),
-            episodes,
-            inferences,
-            found,
+            code_labels([cells[row] for row in at], task, target),
+            tuple(episodes[row] for row in at),
+            None if inferences is None else tuple(inferences[row] for row in at),
+            found.at(at),
             group_by,
             exchange_within,
-            _names(found, group_by),
-            _names(found, exchange_within),
+            None if groups is None else tuple(groups[row] for row in at),
+            None if strata is None else tuple(strata[row] for row in at),
             of_source,
         )
 
@@ -121,7 +125,7 @@ class Labels:
             coded=self.coded.of(at),
             episodes=tuple(episode for episode, _ in flat),
             inferences=None if self.inferences is None else tuple(call for _, call in flat),
-            table=replace(self.table, lines=[self.table.lines[number] for number in at]),
+            table=self.table.at(at),
             groups=None if self.groups is None else tuple(self.groups[number] for number in at),
             strata=None if self.strata is None else tuple(self.strata[number] for number in at),
             of_source=False,
@@ -145,7 +149,7 @@ class Labels:
         keys: dict[str, list[Cell]] = {EPISODE: list(column.episodes), target: list(column.cells)}
         lines = list(range(1, len(column.episodes) + 1))
         table = LabelTable(f"the built-in column {target}", "sample", tuple(keys), keys, lines)
-        coded = code_labels(table.cells(target), task or column.task, target)
+        coded = code_labels(table.typed(target), task or column.task, target)
         return cls(
             target, coded, column.episodes, column.inferences, table, group_by, exchange_within, builtin=True
         )
@@ -203,6 +207,21 @@ class Labels:
         kind = "built-in column" if self.builtin else "column of a table"
         return f"the {kind} {self.target!r} ({self.task}, per {'inference' if self.per_step else 'episode'})"
 
+    @property
+    def contents(self) -> str:
+        """The classes with their counts, or the range of a quantity, and how many labels are missing; one line."""
+        values = self.coded.values
+        present = values[np.isfinite(values)]
+        if self.coded.classes:
+            counts = np.bincount(present.astype(np.int64), minlength=len(self.coded.classes))
+            shown = [f"{terminal_safe(name)} {n}" for name, n in zip(self.coded.classes, counts, strict=True)]
+            more = f", and {len(shown) - _MOST_CLASSES} more" if len(shown) > _MOST_CLASSES else ""
+            text = f"{len(shown)} classes: {', '.join(shown[:_MOST_CLASSES])}{more}"
+        else:
+            text = f"{present.size} numbers from {present.min():g} to {present.max():g}"
+        missing = values.size - present.size
+        return f"{self.target} ({self.task}), {text}" + f"; {missing} missing" * (missing > 0)
+
     def __repr__(self) -> str:
         present = int(np.isfinite(self.coded.values).sum())
         of = "inferences" if self.per_step else "episodes"
@@ -224,7 +243,7 @@ def _numbers(table: LabelTable, column: str) -> tuple[int, ...] | None:
     """A key column of whole numbers; None where the table lacks it. Raises UsageError for other cells."""
     if column not in table.columns:
         return None
-    cells = table.columns[column]
+    cells = table.numbers(column)
     for row, cell in enumerate(cells):
         fraction = isinstance(cell, float) and not cell.is_integer()
         if isinstance(cell, bool | str | None) or fraction or cell < 0:
@@ -235,18 +254,25 @@ def _numbers(table: LabelTable, column: str) -> tuple[int, ...] | None:
     return tuple(int(cell) for cell in cells if cell is not None)
 
 
-def _check_keys(table: LabelTable, episodes: Sequence[str], inferences: Sequence[int] | None) -> None:
-    """Raise UsageError for two rows with one key."""
-    seen: dict[tuple[str, int], int] = {}
+def _once(
+    table: LabelTable, episodes: Sequence[str], inferences: Sequence[int] | None, columns: Sequence[Sequence[Cell]]
+) -> list[int]:
+    """The rows of a table, one per key: rows that are equal in all `columns` count once.
+
+    Raises UsageError for two rows with one key and other values.
+    """
+    first: dict[tuple[str, int], int] = {}
     for row, episode in enumerate(episodes):
         key = episode, -1 if inferences is None else inferences[row]
-        if (first := seen.setdefault(key, row)) != row:
-            named = f"episode {episode!r}" + ("" if inferences is None else f", inference {key[1]}")
-            raise UsageError(
-                f"{table.where(row)}: {named} has a label in {table.unit} {table.lines[first]} already. Leave one "
-                f"out{'' if inferences is not None else f', or add a column {INFERENCE!r}'}"
-            )
+        if (before := first.setdefault(key, row)) == row or all(cells[before] == cells[row] for cells in columns):
+            continue
+        named = f"episode {episode!r}" + ("" if inferences is None else f", inference {key[1]}")
+        raise UsageError(
+            f"{table.where(row)}: {named} has a label in {table.unit} {table.lines[before]} already. Leave one "
+            f"out{'' if inferences is not None else f', or add a column {INFERENCE!r}'}"
+        )
+    return list(first.values())
 
 
 def _names(table: LabelTable, column: str | None) -> tuple[str, ...] | None:
-    return None if column is None or column not in table.columns else tuple(table.texts(column))
+    return None if column is None or column not in table.columns else tuple(table.group_names(column))

@@ -1,18 +1,18 @@
 """The payload of one episode: paths, actions, events, outcomes, and log-odds of every site at every inference."""
 
-from io import BytesIO
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from probe_kit.env.scoring.events import EVENTS, Events
 from probe_kit.env.scoring.rules import RULES, judge, rule_of
 from probe_kit.env.scoring.trajectory import Trajectory
+from probe_kit.errors import RunDamagedError
 from probe_kit.extract.run_layout import CAPTURE_ONLY, FRAME_COLUMNS
 from probe_kit.extract.store.thumbnails import read_sheet
 from probe_kit.retention.behaviour.vlm_answers import SCORES
+from probe_kit.suite.pictures import picture_size
 from probe_kit.view.frozen_probes import toward
 from probe_kit.view.payloads.coding import pack_floats, pack_log_odds
 from probe_kit.view.viewed_run import ViewedRun
@@ -98,9 +98,12 @@ def _frames(viewed: ViewedRun, number: int, row: dict[str, Any]) -> dict[str, An
         return None
     count = sheet.count or (1 if viewed.answers or row["outcome"] == CAPTURE_ONLY else 2)
     columns = min(count, FRAME_COLUMNS)
-    width, height = Image.open(BytesIO(sheet.content)).size
-    size = {"width": width // columns, "height": height // -(-count // columns)}
-    return {"count": count, "columns": columns, **size, "all": sheet.count is not None}
+    size = picture_size(sheet.content)
+    if size is None:
+        raise RunDamagedError(f"the picture of episode {number} in {viewed.run.location} cannot be decoded")
+    width, height = size
+    cell = {"width": width // columns, "height": height // -(-count // columns)}
+    return {"count": count, "columns": columns, **cell, "all": sheet.count is not None}
 
 
 def _trajectory(trajectory: Trajectory) -> dict[str, Any]:

@@ -95,7 +95,7 @@ def test_two_rows_over_the_same_pictures_that_ask_the_other_way_round_are_twins(
         ("instruction,correct", "x,y", "line 1, lacks wrong; expected instruction, correct, wrong"),
         (f"{NEEDED},colour", "x,y,z,c", "line 1, has 'colour', which no table has; expected"),
         (NEEDED, "Put the cube on the lime,,green.png", "line 2, column correct: it is empty"),
-        (NEEDED, "Put it on a lime, please,green.png,red.png", "line 2 has more fields"),
+        (NEEDED, "Put it on a lime, please,green.png,red.png", "line 2 has 4 fields, the heading has 3"),
         (NEEDED, "Banana!,yellow.png,green.png", "line 2, column instruction: no target can be parsed"),
         (f"{NEEDED},category", "Put it on a lime,green.png,red.png,mean", "line 2, column category: 'mean'"),
         (f"{NEEDED},category", "Put it on a lime,green.png,red.png,A/B", "line 2, column category: 'A/B' cannot"),

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import SuiteError
-from probe_kit.suite.pictures import on_white
+from probe_kit.suite.pictures import rgb_of
 
 RELEASE_YAW = 90
 """Degrees by which Act2Answer turns its tiles: mesh +x lies to the viewer's right, mesh +y away from him."""
@@ -22,8 +22,6 @@ _LEVEL = 0.05  # of the tile's thickness: what counts as its top
 _STRAIGHT = 0.02  # of the picture: how far a texture may be from lying along the tile's sides
 _UNREADABLE = (
     ValueError, KeyError, IndexError, TypeError, AttributeError, NotImplementedError, OSError, struct.error,
-    Image.DecompressionBombError,
-    UnidentifiedImageError,
 )  # fmt: skip
 
 
@@ -123,7 +121,7 @@ def _texture(material: Any, path: Path) -> Image.Image:
     factor = getattr(material, "baseColorFactor", None)
     if factor is not None and (np.asarray(factor)[:3] != 255).any():
         raise SuiteError(f"{path}: its texture is tinted by baseColorFactor {list(factor)}; expected white.")
-    return on_white(texture)
+    return rgb_of(texture, f"{path}, texture:", "Check out the assets again.")
 
 
 def _slope(top: _Top, path: Path) -> NDArray[np.float64]:

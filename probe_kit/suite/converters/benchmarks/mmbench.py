@@ -2,19 +2,20 @@
 
 import base64
 import binascii
-import csv
 import re
 from collections.abc import Mapping, Sequence
 from functools import partial
-from io import BytesIO
 from pathlib import Path
 
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
+from probe_kit._system.table_cells import number_of
+from probe_kit._system.text_tables import open_table
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture
 from probe_kit.suite.converters.options import MmbenchOptions
 from probe_kit.suite.converters.rewriting import rewrite
+from probe_kit.suite.pictures import decode_bytes
 
 SOURCE = "mmbench"
 CATEGORIES = ("celebrity",)
@@ -24,6 +25,10 @@ _CATEGORY = "celebrity_recognition"
 _CIRCULAR_STEP = 1_000_000
 _LONGEST_REFERENCE = 64  # a shorter picture cell is the index of the row that holds the picture
 _COLUMNS = ("index", "question", "A", "B", "answer", "category", "image")
+_FURTHER = ("C", "D")
+_MOST_CHARACTERS = (1 << 31) - 1  # a picture is one cell
+
+Row = Mapping[str, str]
 
 
 def read(root: Path, categories: Sequence[str], options: MmbenchOptions) -> Reading:
@@ -74,41 +79,39 @@ def _file(root: Path) -> Path:
     raise SuiteError(f"{SOURCE}: no {' or '.join(_FILES)} in {root}. Name the file or its folder.")
 
 
-def _read_rows(path: Path) -> dict[int, dict[str, str]]:
-    limit = csv.field_size_limit(2**31 - 1)  # a picture is one cell
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            table = csv.DictReader(file, delimiter="\t")
-            missing = [name for name in _COLUMNS if name not in (table.fieldnames or ())]
-            if missing:
-                raise SuiteError(
-                    f"{SOURCE}: {path} lacks {', '.join(missing)}; it has {', '.join(table.fieldnames or ())}. "
-                    "Use the published TSV, tab separated, with its header."
-                )
-            return {_index(row, number, path): row for number, row in enumerate(table, start=2)}
-    except UnicodeDecodeError as problem:
-        raise SuiteError(f"{SOURCE}: {path} is not UTF-8 text ({problem}). Download it again.") from problem
-    finally:
-        csv.field_size_limit(limit)
-
-
-def _index(row: Mapping[str, str], number: int, path: Path) -> int:
-    try:
-        return int(float(row["index"]))
-    except (TypeError, ValueError) as problem:
+def _read_rows(path: Path) -> dict[int, Row]:
+    """The rows by their index. Raises SuiteError naming the line of a row that is cut off or has no index of its own."""
+    table = open_table(path, _COLUMNS, SuiteError, most_characters=_MOST_CHARACTERS)
+    missing = [name for name in _COLUMNS if name not in table.names]
+    if missing:
         raise SuiteError(
-            f"{SOURCE}: row {number} of {path}: index is {row['index']!r}; expected a number."
-        ) from problem
+            f"{SOURCE}: {path} lacks {', '.join(missing)}; it has {', '.join(table.names)}. "
+            "Use the published TSV, tab separated, with its header."
+        )
+    rows: dict[int, Row] = {}
+    lines: dict[int, int] = {}
+    for line, cells in table.rows([name for name in (*_COLUMNS, *_FURTHER) if name in table.names]):
+        row = {name: cell or "" for name, cell in cells.items()}
+        index = number_of(row["index"])
+        if index is None or not float(index).is_integer():
+            raise SuiteError(f"{SOURCE}: {table.where(line)}: index is {row['index']!r}; expected a number.")
+        if (first := lines.setdefault(int(index), line)) != line:
+            raise SuiteError(
+                f"{SOURCE}: {table.where(line)}: the index {int(index)} is that of line {first} too; expected one row "
+                "per index. Download the file again."
+            )
+        rows[int(index)] = row
+    return rows
 
 
 def _candidate(
-    index: int, row: Mapping[str, str], rows: Mapping[int, Mapping[str, str]], path: Path, reading: Reading
+    index: int, row: Row, rows: Mapping[int, Row], path: Path, reading: Reading
 ) -> Candidate | None:
     where = f"row with index {index} of {path.name}"
-    answer = (row["answer"] or "").strip()
+    answer = row["answer"]
     if not answer:
         raise SuiteError(f"{SOURCE}: {where}: no answer. TEST files are scored on a server; use {_FILES[0]}.")
-    name = (row.get(answer) or "").strip()
+    name = row.get(answer, "")
     if answer not in "ABCD" or not name:
         raise SuiteError(
             f"{SOURCE}: {where}: answer is {answer!r}, which is not an option. Download the file again."
@@ -137,7 +140,7 @@ def _candidate(
     )
 
 
-def _picture_cell(index: int, rows: Mapping[int, Mapping[str, str]], where: str) -> tuple[int, str]:
+def _picture_cell(index: int, rows: Mapping[int, Row], where: str) -> tuple[int, str]:
     """The row that holds the picture, and the picture as base64; references may point to references."""
     holder, seen = index, set()
     while len(rows[holder]["image"].strip()) <= _LONGEST_REFERENCE:
@@ -152,10 +155,9 @@ def _picture_cell(index: int, rows: Mapping[int, Mapping[str, str]], where: str)
 
 
 def _decode(encoded: str, where: str) -> Image.Image:
+    name = f"{SOURCE}: {where}, image:"
     try:
-        with Image.open(BytesIO(base64.b64decode(encoded, validate=True))) as image:
-            return image.convert("RGB")
-    except (binascii.Error, UnidentifiedImageError, OSError) as problem:
-        raise SuiteError(
-            f"{SOURCE}: {where}: its picture cannot be decoded ({problem}). Download it again."
-        ) from problem
+        content = base64.b64decode("".join(encoded.split()), validate=True)
+    except binascii.Error as problem:
+        raise SuiteError(f"{name} not base64 ({problem}). Download it again.") from problem
+    return decode_bytes(content, name, remedy="Download it again.")

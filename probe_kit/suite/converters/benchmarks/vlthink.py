@@ -3,19 +3,18 @@
 import struct
 from collections.abc import Iterator, Sequence
 from functools import partial
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
 from probe_kit.suite.converters.files import read_json, trimmed
 from probe_kit.suite.converters.options import VlThinkOptions
-from probe_kit.suite.pictures import WHITE
+from probe_kit.suite.pictures import decode_bytes
 from probe_kit.suite.wording import side_words
 
 SOURCE = "vl-think"
@@ -134,20 +133,13 @@ def upright_board(path: Path) -> Image.Image:
 
     Raises SuiteError if the file is not a binary glTF with one embedded picture.
     """
-    texture = _texture(path).transpose(Image.Transpose.TRANSPOSE)
-    if texture.has_transparency_data:
-        rgba = texture.convert("RGBA")
-        flat = Image.new("RGB", rgba.size, WHITE)
-        flat.paste(rgba, mask=rgba.getchannel("A"))
-        texture = flat
-    art = trimmed(texture.convert("RGB"))
+    art = trimmed(_texture(path).transpose(Image.Transpose.TRANSPOSE))
     art.thumbnail((_MOST_PIXELS, _MOST_PIXELS), Image.Resampling.LANCZOS)
     return art
 
 
 _UNREADABLE = (
-    AttributeError, KeyError, IndexError, TypeError, ValueError, struct.error,
-    UnidentifiedImageError, Image.DecompressionBombError, OSError,
+    AttributeError, KeyError, IndexError, TypeError, ValueError, struct.error, OSError,
 )  # fmt: skip
 
 
@@ -158,13 +150,12 @@ def _texture(path: Path) -> Image.Image:
         scene = parse_json(chunks[_JSON_CHUNK])
         view = scene["bufferViews"][scene["images"][0]["bufferView"]]
         start = view.get("byteOffset", 0)
-        with Image.open(BytesIO(chunks[_BINARY_CHUNK][start : start + view["byteLength"]])) as image:
-            image.load()
-            return image
+        encoded = chunks[_BINARY_CHUNK][start : start + view["byteLength"]]
     except _UNREADABLE as problem:
         raise SuiteError(
             f"{SOURCE}: {path} is not a glTF with an embedded picture ({problem!r}). Check out the assets again."
         ) from problem
+    return decode_bytes(encoded, f"{SOURCE}: {path}, texture:", remedy="Check out the assets again.", upright=False)
 
 
 def _chunks(content: bytes) -> Iterator[tuple[int, bytes]]:

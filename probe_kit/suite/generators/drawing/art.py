@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from probe_kit.suite.generators.drawing.palette import RGB
+from probe_kit.suite.pictures import stored_picture
 
 FOLDER = Path(__file__).parents[2] / "art"
 CELL_PIXELS = 128
@@ -52,5 +53,4 @@ def _index() -> dict[str, Any]:
 
 @cache
 def _sheet(name: str) -> Image.Image:
-    with Image.open(FOLDER / f"{name}.png") as sheet:
-        return sheet.convert("RGBA" if name == "fluent" else "L")
+    return stored_picture(FOLDER / f"{name}.png", "RGBA" if name == "fluent" else "L")

@@ -1,0 +1,216 @@
+"""The one reader of tables of text (CSV, TSV): encoding, separator, heading, rows and cells."""
+
+import csv
+import re
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO
+
+from probe_kit._system.csv_text import unescaped
+from probe_kit._system.table_cells import is_missing, plain_cell
+from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
+from probe_kit.errors import ProbeKitError, UsageError
+
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+MOST_CHARACTERS = 131_072
+"""Of a cell; a picture in a cell needs more."""
+MOST_BYTES = 1 << 30
+_ANY_LENGTH = (1 << 31) - 1
+_DECLARED = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
+_BYTE_ORDER = ((b"\xff\xfe\0\0", "UTF-32"), (b"\0\0\xfe\xff", "UTF-32"), (b"\xff\xfe", "UTF-16"), (b"\xfe\xff", "UTF-16"))
+_QUOTE = 'Put a text with the separator between "quotes"'
+
+
+class _BrokenHeading(ProbeKitError):
+    """A heading that is no CSV with the separator that was tried."""
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A file whose heading was read.
+
+    names: the headings. line: of the heading. encoding: of Python. error: raised for rows that cannot be used.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    line: int
+    separator: str
+    encoding: str
+    error: type[ProbeKitError]
+    most_characters: int
+
+    def where(self, line: int, column: str | None = None) -> str:
+        """The place of a cell, as errors name it."""
+        return f"{self.path}, line {line}" + ("" if column is None else f", column {terminal_safe(column)!r}")
+
+    def rows(self, columns: Sequence[str] | None = None) -> Iterator[tuple[int, dict[str, str | None]]]:
+        """Line and cells by heading of every row, None for a missing cell; rows without any text are left out.
+
+        columns: those to read; by default all with a heading. Raises `error` for a column that occurs twice, for
+        a row with more or fewer cells than the heading, and by default for a cell without a heading.
+        """
+        read = [name for name in self.names if name] if columns is None else columns
+        unnamed = [at for at, name in enumerate(self.names) if not name] if columns is None else []
+        if twice := [name for name in read if self.names.count(name) > 1]:
+            raise self.error(
+                f"{self.path}, line {self.line} has the column {terminal_safe(twice[0])!r} twice. Rename one of them"
+            )
+        positions = {name: self.names.index(name) for name in read}
+        width = len(self.names)
+        with _opened(self.path, self.encoding, self.error) as file:
+            for line, record in _records(file, self.separator, self.path, self.error, self.most_characters):
+                if line <= self.line or not any(map(str.strip, record)):
+                    continue
+                if len(record) != width:
+                    raise self.error(
+                        f"{self.path}, line {line} has {len(record)} fields, the heading has {width}. {_QUOTE}; a "
+                        "row may also be cut off"
+                    )
+                if extra := next((record[at] for at in unnamed if record[at].strip()), None):
+                    raise self.error(
+                        f"{self.path}, line {line} has {terminal_safe(extra)!r} in a column without a heading. Give "
+                        "the column a heading, or remove it"
+                    )
+                yield line, {name: cell_of(record[position]) for name, position in positions.items()}
+
+
+def cell_of(text: str) -> str | None:
+    """A field as the text of its cell; None where it means "no value"."""
+    cell = plain_cell(unescaped(plain_cell(text)))
+    return None if is_missing(cell) else cell
+
+
+def open_table(
+    path: Path,
+    keys: Collection[str],
+    error: type[ProbeKitError] = UsageError,
+    most_characters: int = MOST_CHARACTERS,
+) -> TextTable:
+    """Read the heading of a CSV or TSV file in UTF-8 or UTF-16.
+
+    keys: headings of such a table; they decide where a heading has more than one separator. The separator is a
+    comma, a semicolon or a tab, or what a first line `sep=;` declares. Raises `error` for a file that cannot be
+    read, is in another encoding, or has a heading that several separators explain.
+    """
+    encoding = _encoding(path, error)
+    with _opened(path, encoding, error) as file:
+        declared = _DECLARED.fullmatch(file.readline(64).strip())
+    if declared and declared[1] not in SEPARATORS:
+        raise error(f"{path}, line 1 declares the separator {declared[1]!r}; expected one of , ; and tab")
+    headings: dict[str, tuple[int, tuple[str, ...]]] = {}
+    for separator in SEPARATORS if declared is None else [declared[1]]:
+        with suppress(_BrokenHeading), _opened(path, encoding, error) as file:
+            records = _records(file, separator, path, _BrokenHeading, most_characters=_ANY_LENGTH)
+            if declared:
+                next(records, None)
+            line, record = next(records, (1 + bool(declared), []))
+            headings[separator] = line, tuple(plain_cell(unescaped(plain_cell(name))) for name in record)
+    if not headings:
+        raise error(f"{path}, line {1 + bool(declared)} is no CSV: its quotation marks do not close a cell")
+    separator = _separator(headings, keys, path, error)
+    line, names = headings[separator]
+    if unsafe := next((found for name in names if (found := UNSAFE.search(name))), None):
+        raise error(
+            f"{path}, line {line}: the name of a column holds the control or direction character "
+            f"U+{ord(unsafe[0]):04X}; expected plain text. Rename the column"
+        )
+    return TextTable(path, names, line, separator, encoding, error, most_characters)
+
+
+def _separator(
+    headings: dict[str, tuple[int, tuple[str, ...]]], keys: Collection[str], path: Path, error: type[ProbeKitError]
+) -> str:
+    """The only separator of a heading, or of several the one that gives the most keys."""
+    several = [separator for separator, (_, names) in headings.items() if len(names) > 1]
+    if len(several) < 2:
+        return (several or list(headings))[0]
+    keyed = {separator: len(set(keys) & set(headings[separator][1])) for separator in several}
+    most = max(keyed.values())
+    best = [separator for separator in several if keyed[separator] == most]
+    if len(best) > 1 and most:
+        raise error(
+            f"{path}: its heading has {' and '.join(SEPARATORS[one] for one in best)}; expected one separator. "
+            "Write sep=; as the first line, with the right one"
+        )
+    return best[0]
+
+
+def _encoding(path: Path, error: type[ProbeKitError]) -> str:
+    """UTF-8, or UTF-16 where a byte order mark says so. Raises `error` for a file without end, or too large."""
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            start = file.read(4)
+    except OSError as problem:
+        raise error(f"{path} cannot be read as a table: {problem.strerror}. Give a CSV file in UTF-8") from problem
+    if size > MOST_BYTES:
+        raise error(f"{path} has {size / 1e6:,.0f} MB; expected a table of at most {MOST_BYTES / 1e6:,.0f} MB")
+    found = next((name for mark, name in _BYTE_ORDER if start.startswith(mark)), None)
+    if found == "UTF-32" or (found is None and b"\0" in start):
+        raise error(
+            f"{path} is in {found or 'UTF-16 without a byte order mark'}. Give a CSV file in UTF-8, as spreadsheets "
+            "save it under the name CSV UTF-8"
+        )
+    return "utf-8-sig" if found is None else "utf-16"
+
+
+@contextmanager
+def _opened(path: Path, encoding: str, error: type[ProbeKitError]) -> Iterator[TextIO]:
+    try:
+        with path.open(encoding=encoding, newline="") as file:
+            yield file
+    except UnicodeError as problem:
+        raise error(
+            f"{path} cannot be read as a table: {_undecodable(path, encoding, problem)}. Give a CSV file in UTF-8, as "
+            f"spreadsheets save it under the name CSV UTF-8, or convert it: iconv -f WINDOWS-1252 -t UTF-8 "
+            f"{path.name} > utf8.csv"
+        ) from problem
+    except OSError as problem:
+        raise error(f"{path} cannot be read as a table: {problem}. Give a CSV file in UTF-8") from problem
+
+
+def _undecodable(path: Path, encoding: str, problem: UnicodeError) -> str:
+    """The line and the byte that are not of the file's encoding."""
+    if encoding == "utf-16":
+        return str(problem)
+    with path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            try:
+                line.decode("utf-8")
+            except UnicodeDecodeError as found:
+                return f"line {number} holds the byte 0x{line[found.start]:02X}, which is not UTF-8 (perhaps Windows-1252)"
+    return str(problem)
+
+
+def _records(
+    file: TextIO, separator: str, path: Path, error: type[ProbeKitError], most_characters: int
+) -> Iterator[tuple[int, list[str]]]:
+    """Line number and fields of every record that is not empty."""
+    reader = csv.reader(file, delimiter=separator, strict=True)
+    before = 0
+    while True:
+        try:
+            with _cells_of(most_characters):
+                record: Any = next(reader, None)
+        except csv.Error as problem:
+            raise error(
+                f"{path}, line {reader.line_num} is no CSV: {problem}. Write the table again"
+            ) from problem
+        if record is None:
+            return
+        if record:
+            yield before + 1, record
+        before = reader.line_num
+
+
+@contextmanager
+def _cells_of(most_characters: int) -> Iterator[None]:
+    """The csv module has one limit for all readers of a process."""
+    limit = csv.field_size_limit(most_characters)
+    try:
+        yield
+    finally:
+        csv.field_size_limit(limit)

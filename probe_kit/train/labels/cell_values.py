@@ -1,0 +1,145 @@
+"""Cells of a label column as values: numbers, true and false, classes, or missing."""
+
+import re
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+from probe_kit._system.table_cells import check_spellings, name_of, number_of, problem_of, with_minus
+from probe_kit.errors import UsageError
+from probe_kit.train.choices import Task
+
+Cell = str | int | float | bool | None
+Where = Callable[[int], str]
+_Value = TypeVar("_Value", bool, str)
+
+_BOOLEANS = {"true": True, "t": True, "false": False, "f": False}
+_ANSWERS = {"yes": "yes", "y": "yes", "true": "yes", "t": "yes", "no": "no", "n": "no", "false": "no", "f": "no"}
+_FOREIGN = {"ja", "j", "nein", "oui", "non", "si", "sí", "1", "0"}
+_COMMA = re.compile(r"[+-]?([0-9]+,[0-9]+|,[0-9]+)([eE][+-]?[0-9]+)?")
+_THOUSAND = re.compile(r"[+-]?[1-9][0-9]{0,2},[0-9]{3}")
+_PERCENT = re.compile(r"(.*\S)\s*%")
+_UNITS = (
+    "%|‰|°|º|°?[CFK]|nm|µm|μm|um|mm|cm|dm|m|km|in|inch|inches|ft|feet|ns|µs|μs|us|ms|s|sec|secs|seconds?|min|mins|"
+    "minutes?|h|hours?|mg|g|kg|lb|lbs|N|mN|kN|Nm|N·m|Pa|kPa|V|mV|A|mA|W|Hz|kHz|deg|degrees?|rad|rad/s|m/s|m/s²|"
+    "cm/s|mm/s|px|pixels?|met(?:er|re)s?|centimet(?:er|re)s?|millimet(?:er|re)s?|[$€£¥]"
+)
+_DIGITS = r"\d+(?:[ \u00a0\u202f'’_.,]\d{3})*(?:[.,]\d*)?|[.,]\d+"
+_QUANTITY = re.compile(
+    rf"[=~≈<>≤≥±(]*\s*[$€£¥]?\s*[+\-‐‑−–—－±]?\s*[$€£¥]?\s*(?:{_DIGITS})(?:[eE][+-]?\d+|\s*[x×·*]\s*10\^?\S+)?"
+    rf"\s*(?:{_UNITS})?\)?"
+)
+_FRACTION = re.compile(r"[+-]?\d+\s*[/⁄]\s*\d+|\d*[½¼¾⅓⅔⅛]|\d+:\d\d(?::\d\d)?(?:[.,]\d+)?")
+_DECIMAL_AND_WORD = re.compile(r"[+-]?(?:\d+[.,]\d+|[.,]\d+)\s*[^\W\d].*")
+_NUMBER_AND_WORD = re.compile(r"[+-]?\d+\s*([^\W\d_].*)")
+
+
+def values_of(cells: Sequence[Cell], where: Where, task: Task | None) -> list[Cell]:
+    """The values of a column whose texts spell numbers, true and false, classes, or nothing.
+
+    cells: texts as `cell_of` gives them, or typed values of a data frame. where: the place of a row, for messages.
+    Numbers may have a decimal comma or a percent sign where the whole column has it. A column with yes or no has
+    the classes `yes` and `no`. Raises UsageError for a text that looks like a quantity and is not a plain number
+    (unless `task` is `classes` or `binary`), for a cell that may mean a missing value, and for two spellings of
+    one class.
+    """
+    found: list[Cell] = [name_of(cell) if isinstance(cell, str) else cell for cell in cells]
+    for row, cell in enumerate(found):
+        if isinstance(cell, str) and (problem := problem_of(cell)):
+            raise UsageError(f"{where(row)}: {problem}")
+    answers = _answers(found, where)
+    if answers is not None:
+        return answers
+    numbers = _numbers(found, where, task)
+    if task in (None, "continuous"):
+        _check_quantities(numbers, where)
+    check_spellings(found, where, UsageError)
+    return numbers
+
+
+def _answers(cells: Sequence[Cell], where: Where) -> list[Cell] | None:
+    """Truth values, or the texts `yes` and `no`; None for a column of anything else."""
+    words = {cell.lower() for cell in cells if isinstance(cell, str)}
+    words |= {str(cell).lower() for cell in cells if isinstance(cell, bool)}
+    others = any(isinstance(cell, int | float) and not isinstance(cell, bool) for cell in cells)
+    if words & {"yes", "no"} and (foreign := words & _FOREIGN):
+        row = next(row for row, cell in enumerate(cells) if isinstance(cell, str) and cell.lower() in foreign)
+        raise UsageError(f"{where(row)} is {cells[row]!r} in a column of yes and no; expected yes or no. Write one")
+    if others or not words:
+        return None
+    if words <= set(_BOOLEANS) and words & {"true", "false"}:
+        return [_word(cell, _BOOLEANS) for cell in cells]
+    if words <= set(_ANSWERS) and words & {"yes", "no"}:
+        return [_word(cell, _ANSWERS) for cell in cells]
+    return None
+
+
+def _word(cell: Cell, words: dict[str, _Value]) -> _Value | None:
+    return None if cell is None else words[str(cell).lower()]
+
+
+def _numbers(cells: Sequence[Cell], where: Where, task: Task | None) -> list[Cell]:
+    """The cells with numbers in place of the texts that spell them."""
+    texts = {row: with_minus(cell) for row, cell in enumerate(cells) if isinstance(cell, str)}
+    found = [_number_or_text(cell) for cell in cells]
+    if task in ("classes", "binary"):
+        return found
+    percents = {row: match[1] for row, text in texts.items() if (match := _PERCENT.fullmatch(text))}
+    percents = {row: text for row, text in percents.items() if _COMMA.fullmatch(text) or number_of(text) is not None}
+    _check_all_percent(cells, percents, where)
+    texts |= percents
+    commas = [row for row, text in texts.items() if _COMMA.fullmatch(text)]
+    points = [row for row, text in texts.items() if "." in text and number_of(text) is not None]
+    if commas and points:
+        raise UsageError(
+            f"{where(commas[0])} is {cells[commas[0]]!r} and {where(points[0])} is {cells[points[0]]!r}; expected "
+            "one decimal sign. Write all numbers with a decimal point and without separators of thousands"
+        )
+    if commas and all(_THOUSAND.fullmatch(texts[row]) for row in commas):
+        raise UsageError(
+            f"{where(commas[0])}: {cells[commas[0]]!r} may be {texts[commas[0]].replace(',', '.')} or "
+            f"{texts[commas[0]].replace(',', '')}. Write numbers with a decimal point and without separators of "
+            "thousands"
+        )
+    for row in commas:
+        found[row] = number_of(texts[row].replace(",", "."))
+    for row, text in percents.items():
+        number = found[row] if row in commas else number_of(text)
+        assert isinstance(number, int | float)
+        found[row] = number / 100
+    return found
+
+
+def _number_or_text(cell: Cell) -> Cell:
+    if not isinstance(cell, str):
+        return cell
+    number = number_of(cell)
+    return cell if number is None else number
+
+
+def _check_all_percent(cells: Sequence[Cell], percents: dict[int, str], where: Where) -> None:
+    """Raise UsageError for a column in which some numbers have a percent sign and other cells have none."""
+    if not percents:
+        return
+    for row, cell in enumerate(cells):
+        if cell is not None and row not in percents:
+            first = next(iter(percents))
+            raise UsageError(
+                f"{where(row)} is {cell!r} and {where(first)} is {cells[first]!r}; expected a percent sign in every "
+                "cell or in none. Write all numbers in one unit"
+            )
+
+
+def _check_quantities(cells: Sequence[Cell], where: Where) -> None:
+    """Raise UsageError for a text that looks like a quantity, because it would be decoded as a class."""
+    texts = {row: cell for row, cell in enumerate(cells) if isinstance(cell, str)}
+    counted = {row: match[1] for row, text in texts.items() if (match := _NUMBER_AND_WORD.fullmatch(text))}
+    units = {word.casefold().rstrip("s") for word in counted.values()}
+    alike = len(counted) == len(texts) and len(units) == 1 and len(set(texts.values())) > 1
+    for row, text in texts.items():
+        matches = (pattern.fullmatch(text) for pattern in (_QUANTITY, _FRACTION, _DECIMAL_AND_WORD))
+        if alike or any(matches):
+            raise UsageError(
+                f"{where(row)}: {text!r} looks like a quantity, and is not a plain number. Write the number alone, "
+                "such as -0.5 or 1200, and its unit in the heading; or say that the texts are classes with --task "
+                "classes or --task binary (task=…)"
+            )
