@@ -1,7 +1,7 @@
 """The meaning of a cell in a table that people edit: missing, true or false, a number, a name."""
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 from unicodedata import normalize
 
@@ -14,7 +14,9 @@ DOUBTFUL = frozenset(
     | {mark * times for mark in "-‐‑−–—" for times in (1, 2, 3)}
 )
 """Cells that some write for "no value" and others for a class, in lower case; `MISSING` comes first."""
-FAILED = frozenset({"#value!", "#ref!", "#div/0!", "#name?", "#num!", "#null!", "#spill!", "#calc!", "#getting_data"})
+FAILED = frozenset(
+    {"#value!", "#ref!", "#div/0!", "#name?", "#num!", "#null!", "#spill!", "#calc!", "#getting_data"}
+)
 """Cells in which a spreadsheet's formula failed, in lower case."""
 TRUE = frozenset({"yes", "y", "true", "t", "1", "1.0"})
 FALSE = frozenset({"no", "n", "false", "f", "0", "0.0"})
@@ -36,7 +38,7 @@ def plain_cell(text: str) -> str:
 
 
 def is_missing(cell: str) -> bool:
-    """Whether a cell that `plain_cell` gave means "no value"."""
+    """Return whether a cell that `plain_cell` gave means "no value"."""
     return cell in MISSING
 
 
@@ -51,7 +53,7 @@ def problem_of(cell: str) -> str | None:
 
 
 def truth_of(cell: Any) -> bool | None:
-    """True for yes, y, true, t and 1, false for no, n, false, f and 0, in any case; None for others."""
+    """Return True for yes, y, true, t and 1, false for no, n, false, f and 0, in any case; None for others."""
     word = str(cell).strip().lower()
     return True if word in TRUE else False if word in FALSE else None
 
@@ -76,17 +78,14 @@ def name_of(cell: str) -> str:
     return " ".join(normalize("NFC", cell).split())
 
 
-def check_spellings(
-    cells: Sequence[Any], where: Callable[[int], str], error: Callable[[str], Exception], first: Iterable[int] = ()
-) -> None:
+def check_spellings(cells: Sequence[Any], where: Callable[[int], str], error: Callable[[str], Exception]) -> None:
     """Raise `error` for two spellings of what is probably one name: `red` and `Red`, `7` and `007`.
 
     cells: texts as they were written, and values of other types, which have one spelling. where: the place of a
-    row, for the message. first: rows to look at; all if there are none.
+    row, for the message.
     """
     spelled: dict[str, tuple[str, int]] = {}
-    for row in first or range(len(cells)):
-        cell = cells[row]
+    for row, cell in enumerate(cells):
         if not isinstance(cell, str):
             continue
         text, written = _spelling(name_of(cell))
@@ -109,14 +108,12 @@ def _spelling(cell: str) -> tuple[str, str]:
     return value, f"{zeros[0] if zeros else ''}{value.lstrip('-')}"
 
 
-def group_names(
-    cells: Sequence[Any], where: Callable[[int], str], error: Callable[[str], Exception]
-) -> list[str]:
+def group_names(cells: Sequence[Any], where: Callable[[int], str], error: Callable[[str], Exception]) -> list[str]:
     """Cells as names of groups: `7` and `7.0` are one group, texts are compared as `name_of` has them.
 
     Raises `error` for two spellings of one name, and for a cell that may mean a missing value.
     """
-    found = []
+    names = []
     for row, cell in enumerate(cells):
         if isinstance(cell, str):
             if problem := problem_of(cell):
@@ -125,6 +122,6 @@ def group_names(
             cell = name_of(cell) if number is None else number
         if isinstance(cell, float) and cell.is_integer():
             cell = int(cell)
-        found.append(str(cell))
+        names.append(str(cell))
     check_spellings(cells, where, error)
-    return found
+    return names

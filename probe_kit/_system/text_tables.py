@@ -19,11 +19,17 @@ MOST_CHARACTERS = 131_072
 MOST_BYTES = 1 << 30
 _ANY_LENGTH = (1 << 31) - 1
 _DECLARED = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
-_BYTE_ORDER = ((b"\xff\xfe\0\0", "UTF-32"), (b"\0\0\xfe\xff", "UTF-32"), (b"\xff\xfe", "UTF-16"), (b"\xfe\xff", "UTF-16"))
+_BYTE_ORDER = (
+    (b"\xff\xfe\0\0", "UTF-32"),
+    (b"\0\0\xfe\xff", "UTF-32"),
+    (b"\xff\xfe", "UTF-16"),
+    (b"\xfe\xff", "UTF-16"),
+)
+_REMEDY = "Give a CSV file in UTF-8, as spreadsheets save it under the name CSV UTF-8"
 _QUOTE = 'Put a text with the separator between "quotes"'
 
 
-class _BrokenHeading(ProbeKitError):
+class _BrokenHeadingError(ProbeKitError):
     """A heading that is no CSV with the separator that was tried."""
 
 
@@ -56,7 +62,8 @@ class TextTable:
         unnamed = [at for at, name in enumerate(self.names) if not name] if columns is None else []
         if twice := [name for name in read if self.names.count(name) > 1]:
             raise self.error(
-                f"{self.path}, line {self.line} has the column {terminal_safe(twice[0])!r} twice. Rename one of them"
+                f"{self.path}, line {self.line} has the column {terminal_safe(twice[0])!r} twice. Rename one of "
+                "them"
             )
         positions = {name: self.names.index(name) for name in read}
         width = len(self.names)
@@ -71,15 +78,15 @@ class TextTable:
                     )
                 if extra := next((record[at] for at in unnamed if record[at].strip()), None):
                     raise self.error(
-                        f"{self.path}, line {line} has {terminal_safe(extra)!r} in a column without a heading. Give "
-                        "the column a heading, or remove it"
+                        f"{self.path}, line {line} has {terminal_safe(extra)!r} in a column without a heading. "
+                        "Give the column a heading, or remove it"
                     )
                 yield line, {name: cell_of(record[position]) for name, position in positions.items()}
 
 
 def cell_of(text: str) -> str | None:
     """A field as the text of its cell; None where it means "no value"."""
-    cell = plain_cell(unescaped(plain_cell(text)))
+    cell = plain_cell(unescaped(text.lstrip()))
     return None if is_missing(cell) else cell
 
 
@@ -97,22 +104,22 @@ def open_table(
     """
     encoding = _encoding(path, error)
     with _opened(path, encoding, error) as file:
-        declared = _DECLARED.fullmatch(file.readline(64).strip())
+        declared = _DECLARED.fullmatch(file.readline(64).rstrip("\r\n"))
     if declared and declared[1] not in SEPARATORS:
         raise error(f"{path}, line 1 declares the separator {declared[1]!r}; expected one of , ; and tab")
     headings: dict[str, tuple[int, tuple[str, ...]]] = {}
     for separator in SEPARATORS if declared is None else [declared[1]]:
-        with suppress(_BrokenHeading), _opened(path, encoding, error) as file:
-            records = _records(file, separator, path, _BrokenHeading, most_characters=_ANY_LENGTH)
+        with suppress(_BrokenHeadingError), _opened(path, encoding, error) as file:
+            records = _records(file, separator, path, _BrokenHeadingError, most_characters=_ANY_LENGTH)
             if declared:
                 next(records, None)
             line, record = next(records, (1 + bool(declared), []))
-            headings[separator] = line, tuple(plain_cell(unescaped(plain_cell(name))) for name in record)
+            headings[separator] = line, tuple(plain_cell(unescaped(name.lstrip())) for name in record)
     if not headings:
         raise error(f"{path}, line {1 + bool(declared)} is no CSV: its quotation marks do not close a cell")
     separator = _separator(headings, keys, path, error)
     line, names = headings[separator]
-    if unsafe := next((found for name in names if (found := UNSAFE.search(name))), None):
+    if unsafe := next((match for name in names if (match := UNSAFE.search(name))), None):
         raise error(
             f"{path}, line {line}: the name of a column holds the control or direction character "
             f"U+{ord(unsafe[0]):04X}; expected plain text. Rename the column"
@@ -145,16 +152,13 @@ def _encoding(path: Path, error: type[ProbeKitError]) -> str:
         with path.open("rb") as file:
             start = file.read(4)
     except OSError as problem:
-        raise error(f"{path} cannot be read as a table: {problem.strerror}. Give a CSV file in UTF-8") from problem
+        raise error(f"{path} cannot be read as a table: {problem.strerror}. {_REMEDY}") from problem
     if size > MOST_BYTES:
         raise error(f"{path} has {size / 1e6:,.0f} MB; expected a table of at most {MOST_BYTES / 1e6:,.0f} MB")
-    found = next((name for mark, name in _BYTE_ORDER if start.startswith(mark)), None)
-    if found == "UTF-32" or (found is None and b"\0" in start):
-        raise error(
-            f"{path} is in {found or 'UTF-16 without a byte order mark'}. Give a CSV file in UTF-8, as spreadsheets "
-            "save it under the name CSV UTF-8"
-        )
-    return "utf-8-sig" if found is None else "utf-16"
+    marked = next((name for mark, name in _BYTE_ORDER if start.startswith(mark)), None)
+    if marked == "UTF-32" or (marked is None and b"\0" in start):
+        raise error(f"{path} is in {marked or 'UTF-16 without a byte order mark'}. {_REMEDY}")
+    return "utf-8-sig" if marked is None else "utf-16"
 
 
 @contextmanager
@@ -164,12 +168,11 @@ def _opened(path: Path, encoding: str, error: type[ProbeKitError]) -> Iterator[T
             yield file
     except UnicodeError as problem:
         raise error(
-            f"{path} cannot be read as a table: {_undecodable(path, encoding, problem)}. Give a CSV file in UTF-8, as "
-            f"spreadsheets save it under the name CSV UTF-8, or convert it: iconv -f WINDOWS-1252 -t UTF-8 "
-            f"{path.name} > utf8.csv"
+            f"{path} cannot be read as a table: {_undecodable(path, encoding, problem)}. {_REMEDY}; or convert "
+            f"it: iconv -f WINDOWS-1252 -t UTF-8 {path.name} > utf8.csv"
         ) from problem
     except OSError as problem:
-        raise error(f"{path} cannot be read as a table: {problem}. Give a CSV file in UTF-8") from problem
+        raise error(f"{path} cannot be read as a table: {problem}. {_REMEDY}") from problem
 
 
 def _undecodable(path: Path, encoding: str, problem: UnicodeError) -> str:
@@ -180,8 +183,9 @@ def _undecodable(path: Path, encoding: str, problem: UnicodeError) -> str:
         for number, line in enumerate(file, start=1):
             try:
                 line.decode("utf-8")
-            except UnicodeDecodeError as found:
-                return f"line {number} holds the byte 0x{line[found.start]:02X}, which is not UTF-8 (perhaps Windows-1252)"
+            except UnicodeDecodeError as broken:
+                byte = line[broken.start]
+                return f"line {number} holds the byte 0x{byte:02X}, which is not UTF-8 (perhaps Windows-1252)"
     return str(problem)
 
 
@@ -196,9 +200,7 @@ def _records(
             with _cells_of(most_characters):
                 record: Any = next(reader, None)
         except csv.Error as problem:
-            raise error(
-                f"{path}, line {reader.line_num} is no CSV: {problem}. Write the table again"
-            ) from problem
+            raise error(f"{path}, line {reader.line_num} is no CSV: {problem}. Write the table again") from problem
         if record is None:
             return
         if record:

@@ -35,7 +35,8 @@ _REFUSED = (
     (b"\xff\x4f\xff\x51", "JPEG 2000"), (b"\0\0\0\x0cjP", "JPEG 2000"), (b"\xff\x0a", "JPEG XL"),
     (b"\0\0\0\x0cJXL", "JPEG XL"), (b"v/1\1", "OpenEXR"), (b"#?RADIANCE", "Radiance HDR"), (b"DDS ", "DDS"),
     (b"qoif", "QOI"), (b"icns", "ICNS"), (b"%!PS", "PostScript"), (b"\x0a\x05\1\x08", "PCX"), (b"BPG\xfb", "BPG"),
-    *((f"P{number}{end}".encode(), "PNM") for number in range(1, 8) for end in " \n\t\r"), (b"Pf\n", "PFM"), (b"PF\n", "PFM"),
+    *((f"P{number}{end}".encode(), "PNM") for number in range(1, 8) for end in " \n\t\r"),
+    (b"Pf\n", "PFM"), (b"PF\n", "PFM"),
 )  # fmt: skip
 """Beginnings of files in other formats, so that they are refused by name."""
 
@@ -115,7 +116,9 @@ def decode_bytes(
     8 bits per channel.
     """
     if refused := _refused_format(encoded):
-        raise error(f"{name} is {refused}; expected one of {', '.join(FORMATS)}. Convert it, or give another file.")
+        raise error(
+            f"{name} is {refused}; expected one of {', '.join(FORMATS)}. Convert it, or give another file."
+        )
     try:
         with _opened(encoded) as image:
             _check_still(image, name, error, largest)

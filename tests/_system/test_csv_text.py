@@ -12,7 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probe_kit._system.csv_text import csv_of_frame, csv_of_rows, escaped, rows_of_csv, unescaped
+from probe_kit._system.csv_text import csv_of_frame, csv_of_rows, escaped, unescaped
+from probe_kit._system.table_cells import plain_cell
+from probe_kit._system.text_tables import open_table
 from probe_kit.errors import SuiteError
 from probe_kit.suite import Suite
 from probe_kit.suite.converters.curation import read_curation
@@ -53,10 +55,17 @@ def test_every_text_comes_back(text: str) -> None:
     assert not escaped(text).lstrip().startswith(("=", "+", "-", "@"))
 
 
-@given(st.lists(st.tuples(texts, texts), max_size=4))
-def test_rows_come_back_from_csv(rows: list[tuple[str, str]]) -> None:
+@given(rows=st.lists(st.tuples(texts, texts), max_size=4))
+def test_rows_come_back_from_csv_as_cells(
+    rows: list[tuple[str, str]], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """White space around a cell and line breaks in it are all that is lost, and rows without a text."""
+    path = tmp_path_factory.mktemp("rows") / "rows.csv"
     written = [dict(zip(("=a", "b"), row, strict=True)) for row in rows]
-    assert rows_of_csv(csv_of_rows(("=a", "b"), written)) == written
+    path.write_text(csv_of_rows(("=a", "b"), written), encoding="utf-8", newline="")
+    expected = [{name: plain_cell(cell) or None for name, cell in row.items()} for row in written]
+    read = [row for _, row in open_table(path, ("=a",)).rows()]
+    assert [row for row in read if any(row.values())] == [row for row in expected if any(row.values())]
 
 
 def test_a_frame_keeps_its_numbers_and_marks_its_texts() -> None:
@@ -117,7 +126,7 @@ def test_the_attribution_of_a_suite_is_no_formula(small_suite: Suite, tmp_path: 
 def test_a_curation_file_that_is_no_csv_is_named(tmp_path: Path) -> None:
     path = tmp_path / "review.csv"
     path.write_text('candidate_id\n"' + "x" * 200_000, encoding="utf-8")
-    with pytest.raises(SuiteError, match=r"review\.csv: not valid CSV \(field larger"):
+    with pytest.raises(SuiteError, match=r"review\.csv, line 2 is no CSV: field larger"):
         read_curation(path)
 
 

@@ -56,7 +56,9 @@ def decode_frames(content: bytes, count: int) -> SmallFrames:
     columns = min(count, FRAME_COLUMNS)
     rows = -(-count // columns)
     pixels = np.asarray(
-        decode_bytes(content, "the stored frames:", RunDamagedError, "Extract the run again.", largest=_LARGEST_SHEET)
+        decode_bytes(
+            content, "the stored frames:", RunDamagedError, "Extract the run again.", largest=_LARGEST_SHEET
+        )
     )
     cells = pixels.reshape(rows, pixels.shape[0] // rows, columns, pixels.shape[1] // columns, 3).swapaxes(1, 2)
     return tuple(cells.reshape(-1, *cells.shape[2:])[:count])

@@ -105,7 +105,8 @@ def _checked(row: dict[str, Any], where: str) -> dict[str, Any]:
     truth = None if recognisable == "" else truth_of(recognisable)
     if truth is None and recognisable != "":
         raise SuiteError(
-            f"{where} ({row['candidate_id']}): recognisable is {recognisable!r}; expected yes, no or an empty cell."
+            f"{where} ({row['candidate_id']}): recognisable is {recognisable!r}; expected yes, no or an empty "
+            "cell."
         )
     return {**row, "status": status, "recognisable": "" if truth is None else "yes" if truth else "no"}
 

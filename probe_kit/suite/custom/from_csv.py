@@ -100,17 +100,17 @@ def _shown(table: Path, row: Row, column: str) -> Shown:
 
 
 def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> list[Row]:
-    """The rows of the table, one per question. Raises UsageError for what cannot be a question, naming the line."""
+    """The rows of the table, one per question. Raises UsageError, naming the line that cannot be used."""
     opened = open_table(table, COLUMNS)
-    named = [column for column in opened.names if column]
-    missing = [column for column in COLUMNS if column not in named]
-    unknown = [column for column in named if column not in (*COLUMNS, *FURTHER)]
+    headings = [column for column in opened.names if column]
+    missing = [column for column in COLUMNS if column not in headings]
+    unknown = [column for column in headings if column not in (*COLUMNS, *FURTHER)]
     if missing or unknown:
         wrong = [f"lacks {', '.join(missing)}"] * bool(missing)
         wrong += [f"has {', '.join(map(repr, unknown))}, which no table has"] * bool(unknown)
         raise UsageError(
-            f"{table}, line {opened.line}, {' and '.join(wrong)}; expected {', '.join(COLUMNS)} and, where wanted, "
-            f"{', '.join(FURTHER)}"
+            f"{table}, line {opened.line}, {' and '.join(wrong)}; expected {', '.join(COLUMNS)} and, where "
+            f"wanted, {', '.join(FURTHER)}"
         )
     rows = [_row(cells, line, opened, category) for line, cells in opened.rows()]
     if not rows:
@@ -129,8 +129,8 @@ def _check_contradictions(rows: Sequence[Row], table: Path) -> None:
         opposite = lines.get((row.instruction, row.wrong, row.correct))
         if opposite is not None and row.correct != row.wrong:
             raise UsageError(
-                f"{table}, lines {opposite} and {row.line} are the same question with opposite answers. Correct one, "
-                "or leave it out"
+                f"{table}, lines {opposite} and {row.line} are the same question with opposite answers. Correct "
+                "one, or leave it out"
             )
 
 
@@ -151,9 +151,9 @@ def _row(record: Mapping[str, str | None], line: int, opened: TextTable, categor
     if empty:
         columns = f"column{'s' * (len(empty) > 1)} {' and '.join(empty)}"
         raise UsageError(f"{where}, {columns}: it is empty; every question needs {', '.join(COLUMNS)}")
-    doubtful = {column: problem for column in (*COLUMNS, *FURTHER) if (problem := problem_of(cells.get(column, "")))}
-    for column, problem in doubtful.items():
-        raise UsageError(f"{where}, column {column}: {problem}")
+    for column, cell in cells.items():
+        if problem := problem_of(cell):
+            raise UsageError(f"{where}, column {column}: {problem}")
     asked = cells.get("object") or _object_of(cells["instruction"])
     if asked is None or asked not in cells["instruction"]:
         raise UsageError(

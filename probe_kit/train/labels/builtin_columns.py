@@ -12,7 +12,8 @@ from probe_kit.extract.store.recorded.action_errors import compare_actions, why_
 from probe_kit.train.choices import Task
 from probe_kit.train.data.captured_call import captured_calls
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.labels.label_table import EPISODE, INFERENCE, Cell
+from probe_kit.train.labels.cell_values import Cell
+from probe_kit.train.labels.label_table import EPISODE, INFERENCE
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable, Sequence
-from typing import TypeVar
 
 from probe_kit._system.table_cells import check_spellings, name_of, number_of, problem_of, with_minus
 from probe_kit.errors import UsageError
@@ -10,7 +9,6 @@ from probe_kit.train.choices import Task
 
 Cell = str | int | float | bool | None
 Where = Callable[[int], str]
-_Value = TypeVar("_Value", bool, str)
 
 _BOOLEANS = {"true": True, "t": True, "false": False, "f": False}
 _ANSWERS = {"yes": "yes", "y": "yes", "true": "yes", "t": "yes", "no": "no", "n": "no", "false": "no", "f": "no"}
@@ -42,17 +40,17 @@ def values_of(cells: Sequence[Cell], where: Where, task: Task | None) -> list[Ce
     (unless `task` is `classes` or `binary`), for a cell that may mean a missing value, and for two spellings of
     one class.
     """
-    found: list[Cell] = [name_of(cell) if isinstance(cell, str) else cell for cell in cells]
-    for row, cell in enumerate(found):
+    texts: list[Cell] = [name_of(cell) if isinstance(cell, str) else cell for cell in cells]
+    for row, cell in enumerate(texts):
         if isinstance(cell, str) and (problem := problem_of(cell)):
             raise UsageError(f"{where(row)}: {problem}")
-    answers = _answers(found, where)
+    answers = _answers(texts, where)
     if answers is not None:
         return answers
-    numbers = _numbers(found, where, task)
+    numbers = _numbers(texts, where, task)
     if task in (None, "continuous"):
         _check_quantities(numbers, where)
-    check_spellings(found, where, UsageError)
+    check_spellings(texts, where, UsageError)
     return numbers
 
 
@@ -61,9 +59,12 @@ def _answers(cells: Sequence[Cell], where: Where) -> list[Cell] | None:
     words = {cell.lower() for cell in cells if isinstance(cell, str)}
     words |= {str(cell).lower() for cell in cells if isinstance(cell, bool)}
     others = any(isinstance(cell, int | float) and not isinstance(cell, bool) for cell in cells)
-    if words & {"yes", "no"} and (foreign := words & _FOREIGN):
+    strange = _FOREIGN if words <= set(_ANSWERS) | _FOREIGN else _FOREIGN | set(_ANSWERS) - {"yes", "no"}
+    if words & {"yes", "no"} and (foreign := words & strange):
         row = next(row for row, cell in enumerate(cells) if isinstance(cell, str) and cell.lower() in foreign)
-        raise UsageError(f"{where(row)} is {cells[row]!r} in a column of yes and no; expected yes or no. Write one")
+        raise UsageError(
+            f"{where(row)} is {cells[row]!r} in a column of yes and no; expected yes or no. Write one"
+        )
     if others or not words:
         return None
     if words <= set(_BOOLEANS) and words & {"true", "false"}:
@@ -73,40 +74,43 @@ def _answers(cells: Sequence[Cell], where: Where) -> list[Cell] | None:
     return None
 
 
-def _word(cell: Cell, words: dict[str, _Value]) -> _Value | None:
+def _word[Value: (bool, str)](cell: Cell, words: dict[str, Value]) -> Value | None:
     return None if cell is None else words[str(cell).lower()]
 
 
 def _numbers(cells: Sequence[Cell], where: Where, task: Task | None) -> list[Cell]:
     """The cells with numbers in place of the texts that spell them."""
     texts = {row: with_minus(cell) for row, cell in enumerate(cells) if isinstance(cell, str)}
-    found = [_number_or_text(cell) for cell in cells]
+    numbers = [_number_or_text(cell) for cell in cells]
     if task in ("classes", "binary"):
-        return found
+        return numbers
     percents = {row: match[1] for row, text in texts.items() if (match := _PERCENT.fullmatch(text))}
-    percents = {row: text for row, text in percents.items() if _COMMA.fullmatch(text) or number_of(text) is not None}
+    percents = {
+        row: text for row, text in percents.items() if _COMMA.fullmatch(text) or number_of(text) is not None
+    }
     _check_all_percent(cells, percents, where)
     texts |= percents
-    commas = [row for row, text in texts.items() if _COMMA.fullmatch(text)]
+    commas = dict.fromkeys(row for row, text in texts.items() if _COMMA.fullmatch(text))
     points = [row for row, text in texts.items() if "." in text and number_of(text) is not None]
+    first = next(iter(commas), 0)
     if commas and points:
         raise UsageError(
-            f"{where(commas[0])} is {cells[commas[0]]!r} and {where(points[0])} is {cells[points[0]]!r}; expected "
+            f"{where(first)} is {cells[first]!r} and {where(points[0])} is {cells[points[0]]!r}; expected "
             "one decimal sign. Write all numbers with a decimal point and without separators of thousands"
         )
     if commas and all(_THOUSAND.fullmatch(texts[row]) for row in commas):
         raise UsageError(
-            f"{where(commas[0])}: {cells[commas[0]]!r} may be {texts[commas[0]].replace(',', '.')} or "
-            f"{texts[commas[0]].replace(',', '')}. Write numbers with a decimal point and without separators of "
+            f"{where(first)}: {cells[first]!r} may be {texts[first].replace(',', '.')} or "
+            f"{texts[first].replace(',', '')}. Write numbers with a decimal point and without separators of "
             "thousands"
         )
     for row in commas:
-        found[row] = number_of(texts[row].replace(",", "."))
+        numbers[row] = number_of(texts[row].replace(",", "."))
     for row, text in percents.items():
-        number = found[row] if row in commas else number_of(text)
+        number = numbers[row] if row in commas else number_of(text)
         assert isinstance(number, int | float)
-        found[row] = number / 100
-    return found
+        numbers[row] = number / 100
+    return numbers
 
 
 def _number_or_text(cell: Cell) -> Cell:
@@ -124,8 +128,8 @@ def _check_all_percent(cells: Sequence[Cell], percents: dict[int, str], where: W
         if cell is not None and row not in percents:
             first = next(iter(percents))
             raise UsageError(
-                f"{where(row)} is {cell!r} and {where(first)} is {cells[first]!r}; expected a percent sign in every "
-                "cell or in none. Write all numbers in one unit"
+                f"{where(row)} is {cell!r} and {where(first)} is {cells[first]!r}; expected a percent sign in "
+                "every cell or in none. Write all numbers in one unit"
             )
 
 
@@ -139,7 +143,7 @@ def _check_quantities(cells: Sequence[Cell], where: Where) -> None:
         matches = (pattern.fullmatch(text) for pattern in (_QUANTITY, _FRACTION, _DECIMAL_AND_WORD))
         if alike or any(matches):
             raise UsageError(
-                f"{where(row)}: {text!r} looks like a quantity, and is not a plain number. Write the number alone, "
-                "such as -0.5 or 1200, and its unit in the heading; or say that the texts are classes with --task "
-                "classes or --task binary (task=…)"
+                f"{where(row)}: {text!r} looks like a quantity, and is not a plain number. Write the number "
+                "alone, such as -0.5 or 1200, and its unit in the heading; or say that the texts are classes "
+                "with --task classes or --task binary (task=…)"
             )

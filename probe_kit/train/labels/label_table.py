@@ -1,6 +1,5 @@
 """Tables of labels: CSV, Parquet or a DataFrame, with the line of every cell."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import date, time
@@ -13,7 +12,7 @@ from uuid import UUID
 import numpy as np
 
 from probe_kit._system.optional_dependencies import require
-from probe_kit._system.table_cells import MOST_DIGITS, group_names, number_of
+from probe_kit._system.table_cells import group_names, number_of
 from probe_kit._system.text_tables import MOST_BYTES, cell_of, open_table
 from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit.errors import UsageError
@@ -68,7 +67,7 @@ class LabelTable:
         return self._of_one_kind(column, values_of(cells, lambda row: self.where(row, column), task))
 
     def typed(self, column: str) -> list[Cell]:
-        """The cells of one column as they are, of one kind. Raises UsageError for mixed kinds and unusable cells."""
+        """The cells of one column as they are, of one kind. Raises UsageError for others."""
         return self._of_one_kind(column, self.columns[column])
 
     def _of_one_kind(self, column: str, cells: list[Cell]) -> list[Cell]:
@@ -98,7 +97,7 @@ class LabelTable:
         if beyond and all(cell.is_integer() for cell in numbers.values()):
             raise UsageError(
                 f"{self.where(beyond[0], column)}: the whole number {numbers[beyond[0]]:g} is beyond 2^53, so it "
-                "may be a rounded integer. Write it as text if it is a name, or give a larger unit"
+                "may be a rounded integer. Put a letter in front if it is a name, or give a larger unit"
             )
 
     def texts(self, column: str) -> list[str]:
@@ -117,8 +116,8 @@ class LabelTable:
 
     def numbers(self, column: str) -> list[Cell]:
         """The cells of one column, with numbers in place of the texts that spell them."""
-        read = ((cell, number_of(cell) if isinstance(cell, str) else None) for cell in self.columns[column])
-        return [cell if number is None else number for cell, number in read]
+        spelled = ((cell, number_of(cell) if isinstance(cell, str) else None) for cell in self.columns[column])
+        return [cell if number is None else number for cell, number in spelled]
 
     def _kind(self, row: int, column: str, cell: Cell) -> Kind:
         if isinstance(cell, bool):
@@ -127,7 +126,7 @@ class LabelTable:
             if abs(cell) > EXACT:
                 raise UsageError(
                     f"{self.where(row, column)}: the integer {_short(cell)} is beyond 2^53, so it has no exact "
-                    "float64. Write it as text if it is a name, or subtract an offset"
+                    "float64. Put a letter in front if it is a name, or subtract an offset"
                 )
             return "integer"
         if isinstance(cell, float):
@@ -145,14 +144,14 @@ class LabelTable:
 def read_table(table: "Path | str | pd.DataFrame", wanted: Sequence[str]) -> LabelTable:
     """The key columns and the columns `wanted` of a table. wanted: those that it lacks are left out.
 
-    table: a CSV file (see `open_table`), a Parquet file (`.parquet`), or a DataFrame. Raises UsageError for a file that is
-    no such table, or has no column `episode_id`; MissingExtraError for Parquet without pyarrow.
+    table: a CSV file (see `open_table`), a Parquet file (`.parquet`), or a DataFrame. Raises UsageError for a file
+    that is no such table, or has no column `episode_id`; MissingExtraError for Parquet without pyarrow.
     """
     if not isinstance(table, str | Path):
         return _of_frame(table, "DataFrame", wanted)
     path = Path(table)
-    _check_file(path)
     if path.suffix.lower() in (".parquet", ".pq"):
+        _check_file(path)
         return _of_parquet(path, wanted)
     return _of_csv(path, wanted)
 
@@ -196,7 +195,9 @@ def _places(names: Sequence[str], wanted: Sequence[str], source: str, line: int 
             f"U+{ord(unsafe[0][0]):04X}; expected plain text. Rename the column"
         )
     if twice := [name for name in read if names.count(name) > 1]:
-        raise UsageError(f"{source}, line {line} has the column {terminal_safe(twice[0])!r} twice. Rename one of them")
+        raise UsageError(
+            f"{source}, line {line} has the column {terminal_safe(twice[0])!r} twice. Rename one of them"
+        )
     return {name: names.index(name) for name in read}
 
 

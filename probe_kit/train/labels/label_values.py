@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.train.choices import TASKS, Task
-from probe_kit.train.labels.label_table import Cell
+from probe_kit.train.labels.cell_values import Cell
 
 MOST_DOUBTFUL = 20
 """Integers of 3 to so many values can be classes or quantities; only the user knows."""
@@ -108,5 +108,5 @@ def _check_task(task: Task, distinct: Sequence[Cell], target: str) -> None:
         found = next(value for value in distinct if not isinstance(value, str | int))
         raise UsageError(
             f"column {target!r} has decimals such as {cast(float, found)!r}; classes need texts or integers. Use "
-            "--task continuous, or write the classes as text"
+            "--task continuous, or write the classes as words"
         )

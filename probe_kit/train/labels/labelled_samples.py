@@ -16,7 +16,7 @@ from probe_kit.train.labels.labels import Labels
 
 REACHED = 0.9
 """Share of the episodes that reach the last inference of the default window."""
-_TRUE_OR_FALSE = (("False", "True"), ("0", "1"))
+_TRUE_OR_FALSE = (("False", "True"), ("no", "yes"), ("0", "1"))
 EVERYWHERE = "all"
 """The only stratum where groups exchange everywhere."""
 
@@ -151,7 +151,8 @@ def _events(run: RunReader, labels: Labels, align_to: Labels) -> NDArray[np.intp
         raise UsageError(
             f"windows of {labels.described} aligned to {event.described}"
             + (f" with the values {', '.join(event.coded.classes[:4])}" if event.coded.classes else "")
-            + "; expected labels per inference, and a column of true and false, or 1 and 0, per inference"
+            + "; expected labels per inference, and a column of true and false, yes and no, or 1 and 0, per "
+            "inference"
         )
     happened = _label_grid(run, event) == 1
     return np.where(happened.any(axis=1), happened.argmax(axis=1), -1)

@@ -213,14 +213,14 @@ class Labels:
         values = self.coded.values
         present = values[np.isfinite(values)]
         if self.coded.classes:
-            counts = np.bincount(present.astype(np.int64), minlength=len(self.coded.classes))
-            shown = [f"{terminal_safe(name)} {n}" for name, n in zip(self.coded.classes, counts, strict=True)]
-            more = f", and {len(shown) - _MOST_CLASSES} more" if len(shown) > _MOST_CLASSES else ""
-            text = f"{len(shown)} classes: {', '.join(shown[:_MOST_CLASSES])}{more}"
+            counts = np.bincount(present.astype(np.int64), minlength=len(self.coded.classes)).tolist()
+            counted = [f"{terminal_safe(name)} {n}" for name, n in zip(self.coded.classes, counts, strict=True)]
+            more = f", and {len(counted) - _MOST_CLASSES} more" if len(counted) > _MOST_CLASSES else ""
+            text = f"{len(counted)} classes: {', '.join(counted[:_MOST_CLASSES])}{more}"
         else:
             text = f"{present.size} numbers from {present.min():g} to {present.max():g}"
-        missing = values.size - present.size
-        return f"{self.target} ({self.task}), {text}" + f"; {missing} missing" * (missing > 0)
+        missing = int(np.isnan(values).sum())
+        return f"{terminal_safe(self.target)} ({self.task}), {text}" + f"; {missing} missing" * (missing > 0)
 
     def __repr__(self) -> str:
         present = int(np.isfinite(self.coded.values).sum())

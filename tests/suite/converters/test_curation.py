@@ -72,8 +72,8 @@ def test_rejected_and_unrecognisable_ones_are_left_out(review: Callable[[Callabl
     [
         ({"candidate_id": "emotion-unknown", "status": "accept"}, "1 unknown ids, such as emotion-unknown"),
         ({"question_sha256": "0" * 64, "status": "accept"}, "1 stale rows, such as"),
-        ({"status": "yes"}, "row 1 .*status is 'yes'; expected one of pending"),
-        ({"status": ""}, "row 1 has no status"),
+        ({"status": "yes"}, "line 1 .*status is 'yes'; expected one of pending"),
+        ({"status": ""}, "line 1 has no status"),
         ({"status": "edited", "instruction": "Take the cube"}, "do not fit; expected 'Put the cube on the"),
     ],
 )

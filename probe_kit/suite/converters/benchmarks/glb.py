@@ -22,6 +22,7 @@ _LEVEL = 0.05  # of the tile's thickness: what counts as its top
 _STRAIGHT = 0.02  # of the picture: how far a texture may be from lying along the tile's sides
 _UNREADABLE = (
     ValueError, KeyError, IndexError, TypeError, AttributeError, NotImplementedError, OSError, struct.error,
+    Image.DecompressionBombError,
 )  # fmt: skip
 
 

@@ -80,7 +80,7 @@ def _file(root: Path) -> Path:
 
 
 def _read_rows(path: Path) -> dict[int, Row]:
-    """The rows by their index. Raises SuiteError naming the line of a row that is cut off or has no index of its own."""
+    """The rows by their index. Raises SuiteError naming the line of a row that is cut off or has no own index."""
     table = open_table(path, _COLUMNS, SuiteError, most_characters=_MOST_CHARACTERS)
     missing = [name for name in _COLUMNS if name not in table.names]
     if missing:
@@ -97,16 +97,14 @@ def _read_rows(path: Path) -> dict[int, Row]:
             raise SuiteError(f"{SOURCE}: {table.where(line)}: index is {row['index']!r}; expected a number.")
         if (first := lines.setdefault(int(index), line)) != line:
             raise SuiteError(
-                f"{SOURCE}: {table.where(line)}: the index {int(index)} is that of line {first} too; expected one row "
-                "per index. Download the file again."
+                f"{SOURCE}: {table.where(line)}: the index {int(index)} is that of line {first} too; expected one "
+                "row per index. Download the file again."
             )
         rows[int(index)] = row
     return rows
 
 
-def _candidate(
-    index: int, row: Row, rows: Mapping[int, Row], path: Path, reading: Reading
-) -> Candidate | None:
+def _candidate(index: int, row: Row, rows: Mapping[int, Row], path: Path, reading: Reading) -> Candidate | None:
     where = f"row with index {index} of {path.name}"
     answer = row["answer"]
     if not answer:

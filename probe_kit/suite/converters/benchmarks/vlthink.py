@@ -14,7 +14,7 @@ from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
 from probe_kit.suite.converters.files import read_json, trimmed
 from probe_kit.suite.converters.options import VlThinkOptions
-from probe_kit.suite.pictures import decode_bytes
+from probe_kit.suite.pictures import WHITE, decode_bytes
 from probe_kit.suite.wording import side_words
 
 SOURCE = "vl-think"
@@ -155,7 +155,9 @@ def _texture(path: Path) -> Image.Image:
         raise SuiteError(
             f"{SOURCE}: {path} is not a glTF with an embedded picture ({problem!r}). Check out the assets again."
         ) from problem
-    return decode_bytes(encoded, f"{SOURCE}: {path}, texture:", remedy="Check out the assets again.", upright=False)
+    return decode_bytes(
+        encoded, f"{SOURCE}: {path}, texture:", remedy="Check out the assets again.", upright=False
+    )
 
 
 def _chunks(content: bytes) -> Iterator[tuple[int, bytes]]:
