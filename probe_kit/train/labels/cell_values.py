@@ -21,7 +21,7 @@ _UNITS = (
     "minutes?|h|hours?|mg|g|kg|lb|lbs|N|mN|kN|Nm|N·m|Pa|kPa|V|mV|A|mA|W|Hz|kHz|deg|degrees?|rad|rad/s|m/s|m/s²|"
     "cm/s|mm/s|px|pixels?|met(?:er|re)s?|centimet(?:er|re)s?|millimet(?:er|re)s?|[$€£¥]"
 )
-_DIGITS = r"\d+(?:[ \u00a0\u202f'’_.,]\d{3})*(?:[.,]\d*)?|[.,]\d+"
+_DIGITS = r"\d+(?:[ '’_.,]\d{3})*(?:[.,．，٫]\d*)?|[.,]\d+"
 _QUANTITY = re.compile(
     rf"[=~≈<>≤≥±(]*\s*[$€£¥]?\s*[+\-‐‑−–—－±]?\s*[$€£¥]?\s*(?:{_DIGITS})(?:[eE][+-]?\d+|\s*[x×·*]\s*10\^?\S+)?"
     rf"\s*(?:{_UNITS})?\)?"
