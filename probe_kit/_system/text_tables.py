@@ -10,7 +10,6 @@ from typing import Any, TextIO
 
 from probe_kit._system.csv_text import unescaped
 from probe_kit._system.table_cells import is_missing, plain_cell
-from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit.errors import ProbeKitError, UsageError
 
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
@@ -50,7 +49,7 @@ class TextTable:
 
     def where(self, line: int, column: str | None = None) -> str:
         """The place of a cell, as errors name it."""
-        return f"{self.path}, line {line}" + ("" if column is None else f", column {terminal_safe(column)!r}")
+        return f"{self.path}, line {line}" + ("" if column is None else f", column {column!r}")
 
     def rows(self, columns: Sequence[str] | None = None) -> Iterator[tuple[int, dict[str, str | None]]]:
         """Line and cells by heading of every row, None for a missing cell; rows without any text are left out.
@@ -62,8 +61,7 @@ class TextTable:
         unnamed = [at for at, name in enumerate(self.names) if not name] if columns is None else []
         if twice := [name for name in read if self.names.count(name) > 1]:
             raise self.error(
-                f"{self.path}, line {self.line} has the column {terminal_safe(twice[0])!r} twice. Rename one of "
-                "them"
+                f"{self.path}, line {self.line} has the column {twice[0]!r} twice. Rename one of them"
             )
         positions = {name: self.names.index(name) for name in read}
         width = len(self.names)
@@ -78,7 +76,7 @@ class TextTable:
                     )
                 if extra := next((record[at] for at in unnamed if record[at].strip()), None):
                     raise self.error(
-                        f"{self.path}, line {line} has {terminal_safe(extra)!r} in a column without a heading. "
+                        f"{self.path}, line {line} has {extra!r} in a column without a heading. "
                         "Give the column a heading, or remove it"
                     )
                 yield line, {name: cell_of(record[position]) for name, position in positions.items()}
@@ -119,11 +117,6 @@ def open_table(
         raise error(f"{path}, line {1 + bool(declared)} is no CSV: its quotation marks do not close a cell")
     separator = _separator(headings, keys, path, error)
     line, names = headings[separator]
-    if unsafe := next((match for name in names if (match := UNSAFE.search(name))), None):
-        raise error(
-            f"{path}, line {line}: the name of a column holds the control or direction character "
-            f"U+{ord(unsafe[0]):04X}; expected plain text. Rename the column"
-        )
     return TextTable(path, names, line, separator, encoding, error, most_characters)
 
 

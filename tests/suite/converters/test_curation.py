@@ -10,6 +10,7 @@ from PIL import Image
 from probe_kit.errors import SuiteError
 from probe_kit.suite import Suite
 from probe_kit.suite.converters import convert
+from probe_kit.suite.converters.curation import read_curation
 from tests.suite.converters.conftest import write_compbench
 
 Rows = list[dict[str, Any]]
@@ -145,3 +146,46 @@ def test_a_review_is_not_written_over(name: str, compbench_root: Path, tmp_path:
 def test_a_missing_curation_file_is_named(compbench_root: Path, tmp_path: Path) -> None:
     with pytest.raises(SuiteError, match=r"curation file .*no\.jsonl not found"):
         convert("mllm-compbench", compbench_root, tmp_path / "suite", curation=tmp_path / "no.jsonl")
+
+
+HEADING = "candidate_id,question_sha256,status,instruction,object_phrase,recognisable"
+
+
+def review_of(folder: Path, *rows: str, ending: str = "csv") -> Rows:
+    path = folder / f"review.{ending}"
+    path.write_text("\n".join((HEADING, *rows)), encoding="utf-8")
+    return read_curation(path)
+
+
+@pytest.mark.parametrize("status", ["Accept", "ACCEPT", " accept "])
+@pytest.mark.parametrize(
+    ("recognisable", "expected"), [("No", "no"), ("FALSE", "no"), ("0", "no"), ("Yes", "yes")]
+)
+def test_decisions_are_read_in_the_spellings_of_a_spreadsheet(
+    status: str, recognisable: str, expected: str, tmp_path: Path
+) -> None:
+    (row,) = review_of(tmp_path, f"a,0,{status},,,{recognisable}")
+    assert (row["status"], row["recognisable"]) == ("accept", expected)
+
+
+def test_an_answer_that_is_neither_yes_nor_no_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SuiteError, match=r"line 2 \(a\): recognisable is 'hardly'; expected yes, no or an empty"):
+        review_of(tmp_path, "a,0,accept,,,hardly")
+
+
+def test_an_equal_decision_counts_once_and_a_contradicting_one_is_refused(tmp_path: Path) -> None:
+    assert len(review_of(tmp_path, "a,0,accept,,,yes", "b,0,reject,,,", "a,0,Accept,,,TRUE")) == 2
+    for row in ("a,0,reject,,,yes", "a,0,accept,,,no", "a,0,edited,Put it on red,red,yes", "a,1,accept,,,yes"):
+        with pytest.raises(SuiteError, match=r"line 3: a has .*, and in .*line 2"):
+            review_of(tmp_path, "a,0,accept,,,yes", row)
+
+
+def test_a_review_as_json_lines_follows_the_same_rules(tmp_path: Path) -> None:
+    path = tmp_path / "review.jsonl"
+    row = {"candidate_id": "a", "question_sha256": "0", "status": "Edited", "instruction": "Put it\u2028on red"}
+    other = {**row, "status": "reject"}
+    path.write_text("\ufeff" + json.dumps(row, ensure_ascii=False) + "\n\n", encoding="utf-8")
+    assert read_curation(path) == [{**row, "status": "edited", "instruction": "Put it on red", "recognisable": ""}]
+    path.write_text(f"{json.dumps(row)}\n{json.dumps(other)}\n", encoding="utf-8")
+    with pytest.raises(SuiteError, match=r"line 2: a has status 'reject', and in .*line 1 'edited'"):
+        read_curation(path)

@@ -116,6 +116,42 @@ def test_the_same_question_twice_is_refused_with_both_lines(pictures: Path) -> N
         made(pictures, line, line)
 
 
+def test_the_same_question_with_opposite_answers_is_refused_with_both_lines(pictures: Path) -> None:
+    with pytest.raises(UsageError, match="lines 2 and 4 are the same question with opposite answers"):
+        made(
+            pictures,
+            "Put the cube on the banana,yellow.png,green.png",
+            "Put the cube on the lime,green.png,yellow.png",
+            "Put the cube on the banana,green.png,yellow.png",
+            header=NEEDED,
+        )
+
+
+def test_groups_of_numbers_are_compared_by_value_and_missing_ones_are_no_group(pictures: Path) -> None:
+    suite = made(
+        pictures,
+        "Put the cube on the banana,yellow.png,green.png,7,a",
+        "Put the cube on the apple,red.png,orange.png,7.0,a",
+        "Put the cube on the plum,purple.png,brown.png,NA,a",
+    )
+    one, two, three = (item.group_id for item in suite.items)
+    assert one == two != three
+    for group in ("007", "-"):
+        with pytest.raises(UsageError, match=r"fruit\.csv, line 3, column"):
+            made(
+                pictures,
+                "Put it on a lime,green.png,red.png,7,a",
+                f"Put it on a plum,purple.png,brown.png,{group},a",
+            )
+
+
+def test_words_on_two_lines_are_two_words_and_a_heading_twice_is_refused(pictures: Path) -> None:
+    suite = made(pictures, '"Put the cube on the\nripe\u2028banana",yellow.png,green.png', header=NEEDED)
+    assert suite.items[0].instruction == "Put the cube on the ripe banana"
+    with pytest.raises(UsageError, match="line 1 has the column 'correct' twice"):
+        made(pictures, "Put it on a lime,green.png,red.png,brown.png", header=f"{NEEDED},correct")
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [

@@ -1,11 +1,16 @@
+import base64
+import csv
 import json
 import os
+import textwrap
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from probe_kit.errors import SuiteError, UsageError
+from probe_kit.suite import Suite
 from probe_kit.suite.converters import convert
 
 REAL = Path(os.environ.get("PROBE_KIT_SHARED", Path(__file__).parents[5] / "shared")) / "data" / "mmbench"
@@ -74,3 +79,58 @@ def test_the_published_sample_has_no_celebrities(tmp_path: Path) -> None:
         pytest.skip(f"no MMBench sample at {REAL} (set PROBE_KIT_SHARED); it is not part of the repository")
     with pytest.raises(SuiteError, match=r"0 rows of category celebrity_recognition among 10"):
         convert("mmbench", REAL, tmp_path / "suite", include_real_faces=True)
+
+
+def rewritten(root: Path, change: Callable[[list[list[str]]], None]) -> None:
+    """Lets `change` edit the heading and the rows of the file."""
+    path = root / "MMBench_DEV_EN.tsv"
+    limit = csv.field_size_limit(1 << 30)
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.reader(file, delimiter="\t"))
+    csv.field_size_limit(limit)
+    change(rows)
+    with path.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, delimiter="\t").writerows(rows)
+
+
+def converted(root: Path, folder: Path) -> Suite:
+    return convert("mmbench", root, folder / "suite", include_real_faces=True)
+
+
+@pytest.mark.parametrize("index", ["0", "0.0", "00"])
+def test_an_index_that_occurs_twice_is_refused_with_both_lines(
+    index: str, mmbench_root: Path, tmp_path: Path
+) -> None:
+    rewritten(mmbench_root, lambda rows: rows[2].__setitem__(0, index))
+    with pytest.raises(SuiteError, match=r"line 3: the index 0 is that of line 2 too"):
+        converted(mmbench_root, tmp_path)
+
+
+def test_a_file_that_ends_inside_a_row_is_refused(mmbench_root: Path, tmp_path: Path) -> None:
+    rewritten(mmbench_root, lambda rows: rows.__setitem__(-1, rows[-1][:9]))
+    with pytest.raises(SuiteError, match=r"line \d+ has 9 fields, the heading has 11"):
+        converted(mmbench_root, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (lambda whole: whole[: len(whole) // 2 // 4 * 4], "image: not a picture that Pillow can decode"),
+        (lambda whole: whole[:-3], "image: not base64"),
+        (lambda _: base64.b64encode(b"II*\0" + bytes(60)).decode(), "image: is TIFF"),
+    ],
+)
+def test_a_picture_that_is_cut_or_of_another_format_is_refused_with_its_row(
+    content: Callable[[str], str], message: str, mmbench_root: Path, tmp_path: Path
+) -> None:
+    rewritten(mmbench_root, lambda rows: rows[3].__setitem__(9, content(rows[3][9])))
+    with pytest.raises(SuiteError, match=f"row with index 2 of .*{message}"):
+        converted(mmbench_root, tmp_path)
+
+
+def test_a_picture_in_several_lines_of_base64_is_read(mmbench_root: Path, tmp_path: Path) -> None:
+    before = converted(mmbench_root, tmp_path / "before")
+    rewritten(
+        mmbench_root, lambda rows: [row.__setitem__(9, "\n".join(textwrap.wrap(row[9], 76))) for row in rows[1:]]
+    )
+    assert converted(mmbench_root, tmp_path / "after").content_sha256 == before.content_sha256
