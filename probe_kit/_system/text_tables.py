@@ -24,6 +24,13 @@ _BYTE_ORDER = (
     (b"\xff\xfe", "UTF-16"),
     (b"\xfe\xff", "UTF-16"),
 )
+_NO_TEXT = (
+    (b"PK\x03\x04", "a spreadsheet or an archive (XLSX, ODS, ZIP)"),
+    (b"\xd0\xcf\x11\xe0", "a spreadsheet (XLS)"),
+    (b"PAR1", "a Parquet file without the ending .parquet"),
+    (b"\x1f\x8b", "compressed (gzip)"),
+)
+"""Beginnings of files that are taken for tables of text."""
 _REMEDY = "Give a CSV file in UTF-8, as spreadsheets save it under the name CSV UTF-8"
 _QUOTE = 'Put a text with the separator between "quotes"'
 
@@ -148,6 +155,8 @@ def _encoding(path: Path, error: type[ProbeKitError]) -> str:
         raise error(f"{path} cannot be read as a table: {problem.strerror}. {_REMEDY}") from problem
     if size > MOST_BYTES:
         raise error(f"{path} has {size / 1e6:,.0f} MB; expected a table of at most {MOST_BYTES / 1e6:,.0f} MB")
+    if other := next((name for beginning, name in _NO_TEXT if start.startswith(beginning)), None):
+        raise error(f"{path} is {other}, not a table of text. {_REMEDY}")
     marked = next((name for mark, name in _BYTE_ORDER if start.startswith(mark)), None)
     if marked == "UTF-32" or (marked is None and b"\0" in start):
         raise error(f"{path} is in {marked or 'UTF-16 without a byte order mark'}. {_REMEDY}")

@@ -189,6 +189,15 @@ def test_another_encoding_is_refused_by_name_with_what_to_do(
 
 
 @every_reader
+@pytest.mark.parametrize(
+    ("start", "name"),
+    [(b"PK\x03\x04", "XLSX"), (b"\xd0\xcf\x11\xe0", "XLS"), (b"PAR1", "Parquet"), (b"\x1f\x8b", "gzip")],
+)
+def test_a_file_that_is_no_text_is_refused_by_name(reader: str, start: bytes, name: str, tmp_path: Path) -> None:
+    assert name in refusal(reader, start + bytes(100), tmp_path)
+
+
+@every_reader
 def test_a_separator_that_is_not_read_is_refused(reader: str, tmp_path: Path) -> None:
     refusal(reader, lines(rows_of(reader, TEXTS), "|").encode(), tmp_path)
     assert "declares the separator '|'" in refusal(reader, b"sep=|\na|b\n", tmp_path)

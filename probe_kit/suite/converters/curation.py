@@ -36,8 +36,8 @@ Render = Callable[[SourcePicture], Image.Image]
 def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) -> None:
     """The file at `path`, and previews in a folder beside it.
 
-    In the previews the picture asked for lies left. `.csv` gives CSV, anything else JSON lines. Raises SuiteError
-    if the file is there and a person has reviewed any row of it.
+    In the previews the picture asked for lies left. `.csv` and `.tsv` give CSV, anything else JSON lines. Raises
+    SuiteError if the file is there and a person has reviewed any row of it, or if it cannot be read.
     """
     _check_reviewed(path)
     previews = path.with_name(f"{path.stem}-previews")
@@ -45,17 +45,22 @@ def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) ->
     rows = [_row(proposal, _previews(proposal, previews, render)) for proposal in proposals]
     text = (
         _to_csv(rows)
-        if path.suffix.lower() == ".csv"
+        if path.suffix.lower() in _TABLES
         else "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
     )
     write_whole(path, text)
 
 
 def _check_reviewed(path: Path) -> None:
+    if not path.exists():
+        return
     try:
         reviewed = sum(row["status"] != STATUSES[0] for row in read_curation(path))
-    except SuiteError:  # no such file, or no curation
-        return
+    except SuiteError as error:
+        raise SuiteError(
+            f"{path} exists and would be written anew, and is no review that can be read: {error} Name another "
+            "file as emit_curation (--emit-curation), or remove this one"
+        ) from error
     if reviewed:
         raise SuiteError(
             f"{path} holds the review of {reviewed} pairs, and would be written anew without it. Give it as "

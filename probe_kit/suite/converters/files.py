@@ -1,6 +1,6 @@
 """Reading of a source's folder: annotation files, and pictures in one of several places."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,6 +44,23 @@ def field_of(record: Any, name: str, kind: type, source: str, where: str) -> Any
             "Check that this is the release the converter was made for (docs/suite.md)."
         )
     return value
+
+
+def by_key[Key, Value](entries: Iterable[tuple[Key, Value, str]], source: str, key: str) -> dict[Key, Value]:
+    """The values of (key, value, where) by their key. key: its name, for messages.
+
+    Raises SuiteError naming both records of a key that occurs twice.
+    """
+    values: dict[Key, Value] = {}
+    places: dict[Key, str] = {}
+    for name, value, where in entries:
+        if name in values:
+            raise SuiteError(
+                f"{source}: {where}: {key} {name!r} is that of {places[name]} too; expected one record per {key}. "
+                "Unpack the release again."
+            )
+        values[name], places[name] = value, where
+    return values
 
 
 def photo(path: Path) -> partial[Image.Image]:

@@ -189,3 +189,17 @@ def test_a_review_as_json_lines_follows_the_same_rules(tmp_path: Path) -> None:
     path.write_text(f"{json.dumps(row)}\n{json.dumps(other)}\n", encoding="utf-8")
     with pytest.raises(SuiteError, match=r"line 2: a has status 'reject', and in .*line 1 'edited'"):
         read_curation(path)
+
+
+@pytest.mark.parametrize("ending", ["csv", "tsv", "jsonl"])
+def test_a_review_that_cannot_be_read_is_never_written_anew(
+    ending: str, compbench_root: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / f"review.{ending}"
+    convert("mllm-compbench", compbench_root, tmp_path / "one", emit_curation=path)
+    convert("mllm-compbench", compbench_root, tmp_path / "two", emit_curation=path)
+    reviewed = path.read_text(encoding="utf-8").replace("pending", "acept", 1)
+    path.write_text(reviewed, encoding="utf-8")
+    with pytest.raises(SuiteError, match=r"no review that can be read: .*line [12].* status is 'acept'"):
+        convert("mllm-compbench", compbench_root, tmp_path / "three", emit_curation=path)
+    assert path.read_text(encoding="utf-8") == reviewed

@@ -8,7 +8,7 @@ from typing import Any
 from probe_kit.errors import SuiteError
 from probe_kit.hashing import derive_seed
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
-from probe_kit.suite.converters.files import field_of, first_existing, read_json, trimmed_art
+from probe_kit.suite.converters.files import by_key, field_of, first_existing, read_json, trimmed_art
 from probe_kit.suite.converters.options import IconQaOptions
 from probe_kit.suite.pictures import decode_picture, pixels_sha256
 
@@ -46,7 +46,11 @@ def read(root: Path, categories: Sequence[str], options: IconQaOptions) -> Readi
     problems = _mapping(base / "problems.json", reading)
     splits = _mapping(base / "pid_splits.json", reading)
     skills = _mapping(base / "pid2skills.json", reading)
-    home = {pid: name for name, pids in sorted(splits.items()) if _is_home(name) for pid in pids}
+    home = by_key(
+        ((pid, name, name) for name, pids in sorted(splits.items()) if _is_home(name) for pid in pids),
+        SOURCE,
+        "pid",
+    )
     _note_sizes(problems, reading)
     for pid in sorted(problems, key=str):
         problem, where = problems[pid], f"problem {pid} of problems.json"

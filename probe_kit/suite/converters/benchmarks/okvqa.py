@@ -10,7 +10,7 @@ from typing import Any
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.benchmarks.living_nouns import COCO_CLASS, KIND_OF, singular
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture
-from probe_kit.suite.converters.files import field_of, first_existing, photo, read_json
+from probe_kit.suite.converters.files import by_key, field_of, first_existing, photo, read_json
 from probe_kit.suite.converters.options import OkVqaOptions
 from probe_kit.suite.converters.rewriting import rewrite
 
@@ -64,15 +64,11 @@ def read(root: Path, categories: Sequence[str], options: OkVqaOptions) -> Readin
 
 def _read_split(root: Path, split: str, questions: Path, options: OkVqaOptions, reading: Reading) -> None:
     annotations = root / f"mscoco_{split}_annotations.json"
-    texts = {
-        field_of(record, "question_id", int, SOURCE, f"question {number} of {questions.name}"): record
-        for number, record in enumerate(_records(questions, "questions"))
-    }
+    texts = _by_question(questions, "questions", "question")
     boxes = _read_boxes(options, split, reading)
     reading.files += [questions, annotations]
-    for number, record in enumerate(_records(annotations, "annotations")):
+    for number, (question_id, record) in enumerate(_by_question(annotations, "annotations", "annotation").items()):
         where = f"annotation {number} of {annotations.name}"
-        question_id = field_of(record, "question_id", int, SOURCE, where)
         if str(record.get("question_type")) != _PLANTS_AND_ANIMALS:
             continue
         reading.pool["living-world"] += 1
@@ -90,6 +86,13 @@ def _read_split(root: Path, split: str, questions: Path, options: OkVqaOptions, 
             reading.reasons[candidate] += 1
         else:
             reading.candidates.append(candidate)
+
+
+def _by_question(path: Path, key: str, name: str) -> dict[int, Any]:
+    """The records of a file by their question, in its order. Raises SuiteError for a question with two."""
+    places = ((f"{name} {number} of {path.name}", record) for number, record in enumerate(_records(path, key)))
+    entries = ((field_of(record, "question_id", int, SOURCE, where), record, where) for where, record in places)
+    return by_key(entries, SOURCE, "question_id")
 
 
 def _records(path: Path, key: str) -> list[Any]:

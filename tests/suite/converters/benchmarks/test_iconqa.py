@@ -72,3 +72,11 @@ def test_an_answer_beyond_the_choices_is_refused(iconqa_root: Path, tmp_path: Pa
 def test_a_folder_without_problems_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SuiteError, match=r"problems\.json not found. Name the folder"):
         convert("iconqa", tmp_path, tmp_path / "suite")
+
+
+def test_a_problem_in_two_splits_is_refused(iconqa_root: Path, tmp_path: Path) -> None:
+    path = iconqa_root / "iconqa_data" / "pid_splits.json"
+    splits = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps({**splits, "choose_img_val": ["2"]}), encoding="utf-8")
+    with pytest.raises(SuiteError, match=r"choose_img_val: pid '2' is that of choose_img_train too"):
+        convert("iconqa", iconqa_root, tmp_path / "suite")

@@ -61,3 +61,13 @@ def test_annotations_of_another_release_are_refused(okvqa_root: Path, tmp_path: 
 def test_a_folder_without_questions_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SuiteError, match=r"no OpenEnded_mscoco_<split>_questions.json"):
         convert("ok-vqa", tmp_path, tmp_path / "suite")
+
+
+@pytest.mark.parametrize(("name", "key"), [("OpenEnded_mscoco", "questions"), ("mscoco", "annotations")])
+def test_a_question_that_occurs_twice_is_refused(name: str, key: str, okvqa_root: Path, tmp_path: Path) -> None:
+    path = okvqa_root / f"{name}_train2014_{key}.json"
+    records = json.loads(path.read_text(encoding="utf-8"))
+    records[key].append({**records[key][1]})
+    path.write_text(json.dumps(records), encoding="utf-8")
+    with pytest.raises(SuiteError, match=rf"question_id 10 is that of {key[:-1]} 1 of .* too"):
+        convert("ok-vqa", okvqa_root, tmp_path / "suite")
