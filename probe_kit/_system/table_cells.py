@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Sequence
 from typing import Any
-from unicodedata import normalize
+from unicodedata import category, normalize
 
 MISSING = frozenset(
     {"", "NA", "N/A", "n/a", "#N/A", "#NA", "<NA>", "NaN", "nan", "NAN", "NaT", "None", "null", "NULL", "Null"}
@@ -81,6 +81,7 @@ def name_of(cell: str) -> str:
 def check_spellings(cells: Sequence[Any], where: Callable[[int], str], error: Callable[[str], Exception]) -> None:
     """Raise `error` for two spellings of what is probably one name: `red` and `Red`, `7` and `007`.
 
+    Signs that print nothing, such as a soft hyphen, are a spelling too.
     cells: texts as they were written, and values of other types, which have one spelling. where: the place of a
     row, for the message.
     """
@@ -101,7 +102,7 @@ def _spelling(cell: str) -> tuple[str, str]:
     """What two spellings of one name share, and the spelling: of a number its zeros in front."""
     number = number_of(cell)
     if number is None:
-        return cell.casefold(), cell
+        return "".join(sign for sign in cell.casefold() if category(sign) != "Cf"), cell
     digits = with_minus(cell).lstrip("+-")
     zeros = re.match(r"0+(?=[0-9])", digits)
     value = f"{number:.17g}" if isinstance(number, float) else str(number)

@@ -14,7 +14,7 @@ _BOOLEANS = {"true": True, "t": True, "false": False, "f": False}
 _ANSWERS = {"yes": "yes", "y": "yes", "true": "yes", "t": "yes", "no": "no", "n": "no", "false": "no", "f": "no"}
 _FOREIGN = {"ja", "j", "nein", "oui", "non", "si", "sí", "1", "0"}
 _COMMA = re.compile(r"[+-]?([0-9]+,[0-9]+|,[0-9]+)([eE][+-]?[0-9]+)?")
-_THOUSAND = re.compile(r"[+-]?[1-9][0-9]{0,2},[0-9]{3}")
+_THOUSAND = re.compile(r"[+-]?[1-9][0-9]{0,2}[,.][0-9]{3}")
 _PERCENT = re.compile(r"(.*\S)\s*%")
 _UNITS = (
     "%|‰|°|º|°?[CFK]|nm|µm|μm|um|mm|cm|dm|m|km|in|inch|inches|ft|feet|ns|µs|μs|us|ms|s|sec|secs|seconds?|min|mins|"
@@ -31,10 +31,11 @@ _DECIMAL_AND_WORD = re.compile(r"[+-]?(?:\d+[.,]\d+|[.,]\d+)\s*[^\W\d].*")
 _NUMBER_AND_WORD = re.compile(r"[+-]?\d+\s*([^\W\d_].*)")
 
 
-def values_of(cells: Sequence[Cell], where: Where, task: Task | None) -> list[Cell]:
+def values_of(cells: Sequence[Cell], where: Where, task: Task | None, semicolons: bool = False) -> list[Cell]:
     """The values of a column whose texts spell numbers, true and false, classes, or nothing.
 
     cells: texts as `cell_of` gives them, or typed values of a data frame. where: the place of a row, for messages.
+    semicolons: whether they separate the cells: where a comma is the decimal sign, `1.000` may be a thousand.
     Numbers may have a decimal comma or a percent sign where the whole column has it. A column with yes or no has
     the classes `yes` and `no`. Raises UsageError for a text that looks like a quantity and is not a plain number
     (unless `task` is `classes` or `binary`), for a cell that may mean a missing value, and for two spellings of
@@ -47,7 +48,7 @@ def values_of(cells: Sequence[Cell], where: Where, task: Task | None) -> list[Ce
     answers = _answers(texts, where)
     if answers is not None:
         return answers
-    numbers = _numbers(texts, where, task)
+    numbers = _numbers(texts, where, task, semicolons)
     if task in (None, "continuous"):
         _check_quantities(numbers, where)
     check_spellings(texts, where, UsageError)
@@ -78,7 +79,7 @@ def _word[Value: (bool, str)](cell: Cell, words: dict[str, Value]) -> Value | No
     return None if cell is None else words[str(cell).lower()]
 
 
-def _numbers(cells: Sequence[Cell], where: Where, task: Task | None) -> list[Cell]:
+def _numbers(cells: Sequence[Cell], where: Where, task: Task | None, semicolons: bool) -> list[Cell]:
     """The cells with numbers in place of the texts that spell them."""
     texts = {row: with_minus(cell) for row, cell in enumerate(cells) if isinstance(cell, str)}
     numbers = [_number_or_text(cell) for cell in cells]
@@ -98,12 +99,13 @@ def _numbers(cells: Sequence[Cell], where: Where, task: Task | None) -> list[Cel
             f"{where(first)} is {cells[first]!r} and {where(points[0])} is {cells[points[0]]!r}; expected "
             "one decimal sign. Write all numbers with a decimal point and without separators of thousands"
         )
-    if commas and all(_THOUSAND.fullmatch(texts[row]) for row in commas):
-        raise UsageError(
-            f"{where(first)}: {cells[first]!r} may be {texts[first].replace(',', '.')} or "
-            f"{texts[first].replace(',', '')}. Write numbers with a decimal point and without separators of "
-            "thousands"
-        )
+    for rows in (list(commas), points if semicolons else []):
+        if rows and all(_THOUSAND.fullmatch(texts[row]) for row in rows):
+            digits = texts[rows[0]].replace(",", ".")
+            raise UsageError(
+                f"{where(rows[0])}: {cells[rows[0]]!r} may be {digits} or {digits.replace('.', '')}. Write "
+                "numbers with a decimal point and without separators of thousands, in a table with commas"
+            )
     for row in commas:
         numbers[row] = number_of(texts[row].replace(",", "."))
     for row, text in percents.items():

@@ -39,7 +39,8 @@ class LabelTable:
 
     source: the file, or `DataFrame`. unit: `line` of a file, or `row` where there are no lines. names: all columns
     of the table. columns: cells of those that were asked for: texts of a CSV file, texts and typed values of a
-    data frame, None where missing. lines: number of every row in its file.
+    data frame, None where missing. lines: number of every row in its file. semicolons: whether they separate
+    the cells.
     """
 
     source: str
@@ -47,6 +48,7 @@ class LabelTable:
     names: tuple[str, ...]
     columns: dict[str, list[Cell]]
     lines: list[int]
+    semicolons: bool = False
 
     def where(self, row: int, column: str | None = None) -> str:
         """The place of a cell, as errors name it."""
@@ -64,7 +66,8 @@ class LabelTable:
         for row, cell in enumerate(cells):
             if isinstance(cell, str):
                 self._kind(row, column, cell)
-        return self._of_one_kind(column, values_of(cells, lambda row: self.where(row, column), task))
+        values = values_of(cells, lambda row: self.where(row, column), task, self.semicolons)
+        return self._of_one_kind(column, values)
 
     def typed(self, column: str) -> list[Cell]:
         """The cells of one column as they are, of one kind. Raises UsageError for others."""
@@ -176,7 +179,7 @@ def _of_csv(path: Path, wanted: Sequence[str]) -> LabelTable:
         lines.append(line)
         for name, cell in cells.items():
             columns[name].append(cell)
-    return LabelTable(str(path), "line", opened.names, columns, lines)
+    return LabelTable(str(path), "line", opened.names, columns, lines, opened.separator == ";")
 
 
 def _places(names: Sequence[str], wanted: Sequence[str], source: str, line: int = 1) -> dict[str, int]:

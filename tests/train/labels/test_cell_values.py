@@ -80,6 +80,22 @@ def test_a_number_with_two_readings_is_refused_with_what_to_write(
         read(cells, tmp_path)
 
 
+@pytest.mark.parametrize(("cells", "is_read"), [("1.000;1.250;999", False), ("1.000;1.250;0.999", True)])
+def test_a_point_may_separate_thousands_in_a_table_with_semicolons(
+    cells: str, is_read: bool, tmp_path: Path
+) -> None:
+    file = tmp_path / "labels.csv"
+    rows = "".join(f"e{number};{cell}\n" for number, cell in enumerate(cells.split(";")))
+    file.write_text("episode_id;y\n" + rows, encoding="utf-8")
+    if is_read:
+        assert Labels.read(file, "y").coded.values.tolist() == [1, 1.25, 0.999]
+    else:
+        with pytest.raises(UsageError, match=r"line 2.*'1.000' may be 1.000 or 1000"):
+            Labels.read(file, "y")
+    file.write_text(file.read_text(encoding="utf-8").replace(";", ","), encoding="utf-8")
+    assert Labels.read(file, "y").coded.values[0] == 1
+
+
 QUANTITIES = [
     "{}.5 m", "0.{}m", "{} cm", "{}mm", "{} °", "{}°C", "0,{} m", "$ {}", "{} €", "~{}", "≈ 0.{}", "<{}", "±0.{}",
     "({}.5)",
@@ -148,6 +164,7 @@ def test_spellings_of_one_class_are_one_class(
     ("cells", "expected"),
     [
         (["Red", "red", "blue"], "'red', and .*'Red'; expected one spelling"),
+        (["red", "re\u00add", "blue"], "'re.*d', and .*'red'; expected one spelling"),
         (["7", "007", "8"], "'007', and .*'7'; expected one spelling"),
         (["yes", "ja", "no"], "'ja' in a column of yes and no"),
         (["yes", "no", "1"], "'1' in a column of yes and no"),
