@@ -219,7 +219,22 @@ def test_the_command_prints_one_table_and_a_sentence(run: Run, tmp_path: Path) -
         in done.stdout
     )
     assert "control instruction" in done.stdout
+    assert done.stdout.splitlines()[0] == Labels.read(file, "y").contents
     assert isinstance(load_label_results(run, target="y"), LabelResults)
+
+
+def test_the_command_prints_the_classes_once_with_their_counts(run: Run, tmp_path: Path) -> None:
+    file = tmp_path / "own.csv"
+    by_group(run, lambda draw: str(draw.choice(["Yes", "no"]))).to_csv(file, index=False)
+    lines = file.read_text(encoding="utf-8").splitlines()
+    lines[1] = lines[1].rpartition(",")[0] + ",NA"
+    file.write_text("\n".join(lines), encoding="utf-8")
+    options = ["--labels", str(file), "--target", "y", "--permutations", "0", "--controls", "instruction"]
+    done = CliRunner().invoke(app, ["train", str(run.location), *options], env={"COLUMNS": "100"})
+    assert done.exit_code == 0, done.stderr
+    counts = {word: sum(line.endswith(f",{word}") for line in lines) for word in ("no", "Yes")}
+    line = f"y (binary), 2 classes: no {counts['no']}, yes {counts['Yes']}; 1 missing"
+    assert done.stdout.splitlines().count(line) == 1
 
 
 @pytest.mark.parametrize(
