@@ -126,6 +126,8 @@ def decode_bytes(
             image.verify()  # decoding alone does not compare the checksums
         with _opened(encoded) as image:
             return on_white(ImageOps.exif_transpose(image) if upright else image)
+    except UnidentifiedImageError as problem:  # its own message names an address in memory
+        raise error(f"{name} not a picture that Pillow can decode (unknown format). {remedy}") from problem
     except _DECODING_ERRORS as problem:
         raise error(f"{name} not a picture that Pillow can decode ({problem}). {remedy}") from problem
 

@@ -72,7 +72,7 @@ def test_each_other_format_is_refused_by_name(kind: str, picture: Image.Image) -
         (b"%PDF-1.7", "PDF"),
         (b"II*\0", "TIFF"),
         (b"", "not a picture"),
-        (b"<!doctype html>", "not a picture"),
+        (b"<!doctype html>", r"not a picture that Pillow can decode \(unknown format\)\. Restore"),
         (b"version https://git-lfs.github.com/spec/v1", "not a picture"),
     ],
 )
