@@ -91,7 +91,7 @@ class TextTable:
 
 def cell_of(text: str) -> str | None:
     """A field as the text of its cell; None where it means "no value"."""
-    cell = plain_cell(unescaped(text.lstrip()))
+    cell = plain_cell(unescaped(text))
     return None if is_missing(cell) else cell
 
 
@@ -119,7 +119,7 @@ def open_table(
             if declared:
                 next(records, None)
             line, record = next(records, (1 + bool(declared), []))
-            headings[separator] = line, tuple(plain_cell(unescaped(name.lstrip())) for name in record)
+            headings[separator] = line, tuple(plain_cell(unescaped(name)) for name in record)
     if not headings:
         raise error(f"{path}, line {1 + bool(declared)} is no CSV: its quotation marks do not close a cell")
     separator = _separator(headings, keys, path, error)
