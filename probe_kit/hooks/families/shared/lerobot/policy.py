@@ -123,6 +123,11 @@ class LerobotPolicy(Policy):
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """A file's tensors under the names the network has."""
 
+    @classmethod
+    def _current_key(cls, name: str) -> str:
+        """The network's name of one tensor of a file."""
+        return next(iter(cls.current_keys({name: torch.empty(0)})), name)
+
     @abstractmethod
     def _stacks(self) -> dict[str, Stack]:
         """The stacks `backbone`, `vision` and the acting one."""
@@ -178,7 +183,8 @@ class LerobotPolicy(Policy):
             weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
         else:
             weights = read_weights(folder)
-        audit = load_weights(network, weights, cls.current_keys(weights.tensors), cls.unread)
+        tensors = cls.current_keys(weights.tensors)
+        audit = load_weights(network, weights, tensors, cls.unread, named=cls._current_key)
         config.device = device
         policy = cls(network.to(device), folder)
         policy.prepare(checkpoint, evaluation)
