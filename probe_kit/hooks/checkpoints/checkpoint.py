@@ -190,8 +190,8 @@ def check_unambiguous(folder: Path) -> None:
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
         raise WeightsError(
-            f"{folder} holds two sets of weights: {WEIGHTS_FILE}, and {INDEX_FILE} with {others[0]}{more}. Nothing "
-            "says which one is meant: remove the other one"
+            f"{folder} holds two sets of weights: {WEIGHTS_FILE}, and {INDEX_FILE} with {others[0]}{more}. "
+            "Nothing says which one is meant: remove the other one"
         )
 
 

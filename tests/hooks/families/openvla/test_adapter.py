@@ -11,9 +11,9 @@ import torch
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.families.openvla.adapter import PROMPTS, OpenVLA, load_openvla
-from probe_kit.hooks.families.prismatic.checkpoint import STATISTICS_FILE
 from probe_kit.hooks.testing import AdapterContract
 from probe_kit.hooks.verification.verify import verify_keys, verify_reference
+from probe_kit.models.statistics_choice import STATISTICS_FILE
 from tests.support.prismatic_checkpoints import SINGLE, config_values, write_checkpoint, write_tokenizer
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
