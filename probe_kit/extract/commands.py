@@ -13,9 +13,10 @@ from probe_kit.extract.recordings import options as recorded
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
-    from probe_kit.extract import Extraction, ExtractSettings, Run
+    from probe_kit.extract import Extraction, Run
     from probe_kit.extract.own_environments.environment_plan import EnvironmentPlan
     from probe_kit.extract.recordings.recorded_plan import RecordedPlan
+    from probe_kit.extract.settings import RunSettings
     from probe_kit.extract.store.locations.location import Location
     from probe_kit.suite.ladder import Wording
 
@@ -147,7 +148,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     err.print(table)
 
 
-def _units_row(settings: "ExtractSettings") -> dict[str, str]:
+def _units_row(settings: "RunSettings") -> dict[str, str]:
     """Whose units the actions get, of a family whose checkpoints have several."""
     from probe_kit.hooks.registry import get_family
 

@@ -51,13 +51,13 @@ def chosen_name(known: Collection[str], chosen: str | None, option: str, place: 
         if len(names) == 1:
             return names[0]
         raise UsageError(
-            f"{place} has action statistics of {len(names)} data sets, and nothing says whose units the actions "
-            f"get. Choose -M {option}=NAME among {listed}"
+            f"{place} has several action statistics, and nothing says whose units the actions get. Choose one with "
+            f"-M {option}=NAME: {listed}"
         )
     if chosen not in known:
         near = get_close_matches(chosen, names, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
         raise UsageError(
-            f"{place} has no action statistics of {chosen!r}; choose -M {option} among {listed}.{hint}"
+            f"{place} has no action statistics of {chosen!r}. Choose one with -M {option}=NAME: {listed}.{hint}"
         )
     return chosen

@@ -33,7 +33,7 @@ WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "prismatic": (prismatic_checkpoints.write_checkpoint, _BYTES),
     "spatialvla": (spatialvla_checkpoints.write_checkpoint, {}),
     "magma": (magma_checkpoints.write_checkpoint, {}),
-    "xiaomi-r0": (xiaomi_checkpoints.write_checkpoint, {}),
+    "xiaomi-r0": (xiaomi_checkpoints.write_checkpoint, {"robot": "bridge_delta"}),
     "internvla-m1": (internvla_checkpoints.write_checkpoint, {}),
     "paligemma": (vlm_checkpoints.write_paligemma, {}),
     "qwen2.5-vl": (vlm_checkpoints.write_qwen2_5_vl, {}),

@@ -122,7 +122,8 @@ class Adapter:
             wrapped = peft.get_peft_model(tree, config)
         except (ValueError, TypeError) as error:
             raise WeightsError(f"the LoRA adapter in {self.folder} cannot be merged at {path}: {error}") from error
-        expected = {name: tensor.shape for name, tensor in peft.get_peft_model_state_dict(wrapped).items()}
+        placed = peft.get_peft_model_state_dict(wrapped, save_embedding_layers=False)
+        expected = {name: tensor.shape for name, tensor in placed.items()}
         own = {name: tensor.shape for name, tensor in factors.items()}
         if wrong := sorted(name for name in expected.keys() | own.keys() if expected.get(name) != own.get(name)):
             raise WeightsError(

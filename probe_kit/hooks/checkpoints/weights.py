@@ -267,17 +267,15 @@ def _wrapper(stored: Sequence[str], model: Sequence[str]) -> str:
     Wrappers of torch and of training libraries put their name before all names or between their parts; a module
     of a larger one has the name that it has there in front.
     """
-    parts = {part for name in stored for part in name.split(".")[:-1]}
-    own = {part for name in model for part in name.split(".")[:-1]}
-    if inside := [part for part in _WRAPPERS if part in parts - own]:
-        return f"{inside[0]}."
-    common = _common_path(stored)
+    common = _common_path(stored) if len(stored) >= _FEWEST else ""
+    if common and not any(name.startswith(f"{common.partition('.')[0]}.") for name in model):
+        for end in accumulate(common.split("."), "{}.{}".format):
+            if {name.removeprefix(f"{end}.") for name in stored} & set(model):
+                return f"{end}."
+    parts, own = ({part for name in names for part in name.split(".")[:-1]} for names in (stored, model))
+    inside = [part for part in _WRAPPERS if part in parts - own]
     first = common.partition(".")[0]
-    if not common or len(stored) < _FEWEST or any(name.startswith(f"{first}.") for name in model):
-        return ""
-    ends = accumulate(common.split("."), "{}.{}".format)
-    fitting = [end for end in ends if {name.removeprefix(f"{end}.") for name in stored} & set(model)]
-    return f"{fitting[0] if fitting else first}."
+    return f"{inside[0]}." if inside else f"{first}." if first and first not in own else ""
 
 
 def _common_path(names: Sequence[str]) -> str:

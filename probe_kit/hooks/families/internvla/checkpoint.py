@@ -14,7 +14,14 @@ from typing import Any
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.adapter_files import adapter_in
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, checkpoint_folder, hub_files
-from probe_kit.hooks.checkpoints.weights import INDEX_FILE, SINGLE_FILE, Weights, read_pickle, read_weights
+from probe_kit.hooks.checkpoints.weights import (
+    INDEX_FILE,
+    SINGLE_FILE,
+    Weights,
+    read_pickle,
+    read_weights,
+    with_adapter,
+)
 from probe_kit.models.internvla import InternVLAConfig, find_config
 from probe_kit.models.statistics_choice import stored_statistics
 
@@ -42,18 +49,26 @@ class Parts:
 
     def read(self) -> Weights:
         """The tensors. Raises WeightsError, and CheckpointError for an adapter beside a `.pt` file."""
-        if not self.weights.is_file():
-            return read_weights(self.weights)
-        if adapter_in(self.place) is not None:
+        adapter = adapter_in(self.place)
+        if adapter is None:
+            return _read(self.weights)
+        if self.weights.is_file():
             raise CheckpointError(
                 f"{self.place} holds a LoRA adapter beside {self.weights.name}: nothing says whether that file is "
                 "merged. Merge the adapter with peft and pass the merged folder, or remove the adapter's files"
             )
-        return read_pickle(self.weights)
+        base = adapter.base_folder()
+        return (
+            read_weights(base) if base == self.place else with_adapter(_read(_weights(base, None, None)), adapter)
+        )
 
     def statistics(self) -> Mapping[str, Any]:
         """Per data set, what un-normalises its actions; empty without the file."""
         return stored_statistics((self.place,), {}, str(self.place))[0]
+
+
+def _read(place: Path) -> Weights:
+    return read_pickle(place) if place.is_file() else read_weights(place)
 
 
 def find_parts(checkpoint: str, vlm: str | None, weights: str | None = None, unread: bool = False) -> Parts:
