@@ -51,8 +51,8 @@ def chosen_name(known: Collection[str], chosen: str | None, option: str, place: 
         if len(names) == 1:
             return names[0]
         raise UsageError(
-            f"{place} has several action statistics, and nothing says whose units the actions get. Choose one with "
-            f"-M {option}=NAME: {listed}"
+            f"{place} has several action statistics, and nothing says whose units the actions get. Choose one "
+            f"with -M {option}=NAME: {listed}"
         )
     if chosen not in known:
         near = get_close_matches(chosen, names, n=1)

@@ -34,7 +34,7 @@ WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "spatialvla": (spatialvla_checkpoints.write_checkpoint, {}),
     "magma": (magma_checkpoints.write_checkpoint, {}),
     "xiaomi-r0": (xiaomi_checkpoints.write_checkpoint, {"robot": "bridge_delta"}),
-    "internvla-m1": (internvla_checkpoints.write_checkpoint, {}),
+    "internvla-m1": (internvla_checkpoints.write_checkpoint, {"unnorm_key": "bridge_dataset"}),
     "paligemma": (vlm_checkpoints.write_paligemma, {}),
     "qwen2.5-vl": (vlm_checkpoints.write_qwen2_5_vl, {}),
     "qwen3-vl": (vlm_checkpoints.write_qwen3_vl, {}),

@@ -196,9 +196,7 @@ def test_two_sets_of_weights_are_refused_because_nothing_says_which_is_meant(che
     write_index(checkpoint, "model-00001-of-00001.safetensors")
     shutil.copy(checkpoint / SINGLE_FILE, checkpoint / "model-00001-of-00001.safetensors")
     for load in (read_weights, lambda folder: load_pi0(str(folder))):
-        with pytest.raises(
-            WeightsError, match="two sets of weights: model.safetensors, and model.safetensors.index"
-        ):
+        with pytest.raises(WeightsError, match="two sets of weights"):
             load(checkpoint)
 
 

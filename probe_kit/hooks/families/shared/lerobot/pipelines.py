@@ -146,8 +146,8 @@ def check_fields(step: SavedStep, source: str) -> None:
             fields = ", ".join(known) or "none"
             raise CheckpointError(
                 f"{source}: the step {step.name!r} has the field {name}: {value!r}, which may change numbers in "
-                f"a way probe_kit does not know. Known are {fields}. If it changes nothing, remove it from a copy of "
-                "the file"
+                f"a way probe_kit does not know. Known are {fields}. If it changes nothing, remove it from a copy "
+                "of the file"
             )
         plain = known[name]
         if plain is not None and not any(value == one and type(value) is type(one) for one in plain):
