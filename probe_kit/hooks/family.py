@@ -182,7 +182,7 @@ class Family:
         model.card = replace(
             model.card,
             settings={**said, **model.card.settings},
-            notes=(*model.card.notes, *([merged] if merged else [])),
+            notes=tuple(dict.fromkeys((*model.card.notes, *([merged] if merged else [])))),
             **self._source_of(model.card, place),
         )
         return model

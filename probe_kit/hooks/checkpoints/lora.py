@@ -107,7 +107,7 @@ class Adapter:
         self, path: str, layer: nn.Module, parts: Mapping[str, Tensor], factors: Mapping[str, Tensor]
     ) -> dict[str, Tensor]:
         """Weight and bias of one layer after peft merged its factors, float32."""
-        peft: Any = require("peft", "openvla")
+        peft: Any = require("peft", "lora")
         twin = deepcopy(layer).to_empty(device="cpu").float()
         twin.load_state_dict({name: tensor.float() for name, tensor in parts.items()})
         tree, (*parents, last) = nn.Module(), path.split(".")

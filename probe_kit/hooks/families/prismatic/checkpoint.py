@@ -88,7 +88,7 @@ def load_checkpoint(
     else:
         network, audit = _stored(config, base, _DTYPES[name], adapter)
     network.requires_grad_(False)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = (audit.adapter,) if audit.adapter else ()
     if bits is not None:
         quantise(network, bits)
         notes += (f"not exact: language model in {bits} bits",)

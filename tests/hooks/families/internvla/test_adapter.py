@@ -261,4 +261,4 @@ def test_statistics_of_other_arms_are_refused(run: Path, tmp_path: Path, observa
     two = {"both_arms": {"action": {"q01": [0.0] * 14, "q99": [1.0] * 14}}}
     (copy / "dataset_statistics.json").write_text(json.dumps(two), encoding="utf-8")
     with pytest.raises(CheckpointError, match="14 dimensions"):
-        load_internvla(str(copy), unnorm_key="bridge_dataset").act([observation], [0])
+        load_internvla(str(copy)).act([observation], [0])

@@ -189,7 +189,7 @@ def test_a_checkpoint_without_statistics_says_so_and_refuses_to_act(
     file.write_text(
         json.dumps({**json.loads(file.read_text(encoding="utf-8")), "action_config": {}}), encoding="utf-8"
     )
-    policy = load_xiaomi(str(copy), robot="bridge_delta")
+    policy = load_xiaomi(str(copy))
     assert "cannot act" in policy.card.notes[0]
     assert policy.card.chunk == 30
     with pytest.raises(CheckpointError, match="action_config"):
