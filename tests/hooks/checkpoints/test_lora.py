@@ -56,7 +56,7 @@ def factors(module: str, weight: torch.Tensor, seed: int = 0) -> dict[str, torch
 
 
 def last_linear(network: nn.Module) -> str:
-    """The path of a linear layer whose weight is nobody's double."""
+    """The path of a linear layer whose weight is not tied to another's."""
     shared = [id(parameter) for _, parameter in network.named_parameters(remove_duplicate=False)]
     return [
         name

@@ -209,7 +209,7 @@ class Magma(Policy, AnswerModel):
 
     @property
     def statistics(self) -> ActionStatistics:
-        """What gives actions their units. Raises UsageError where nobody said whose."""
+        """What gives actions their units. Raises UsageError where none were chosen."""
         if isinstance(self._units, str):
             raise UsageError(self._units)
         return self._units

@@ -39,6 +39,7 @@ class Pi05(StatePrompt, Pi0):
 
     family = "pi05"
     config_type = "pi05"
+    takes_unread = False
     newer_fields: ClassVar[Inert] = {
         "use_visual_memory": (False,),
         "use_proprioceptive_memory": (False,),

@@ -328,4 +328,4 @@ def test_every_option_reaches_the_card(folder: Path, tmp_path: Path) -> None:
         {"tokenizer": str(folder)},
         {"layer_scale": "weight"},
     ):
-        assert load_magma(str(folder), **options, unnorm_key="bridge_orig").card.settings != base, options
+        assert load_magma(str(folder), **{"unnorm_key": "bridge_orig", **options}).card.settings != base, options

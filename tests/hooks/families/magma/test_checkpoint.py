@@ -155,5 +155,5 @@ def test_statistics_come_from_the_package_the_checkpoint_or_a_file_and_the_last_
     assert (mine.statistics.key, mine.statistics.high[0]) == ("mine", 4)
     with pytest.raises(UsageError, match="Choose"):
         load_magma(str(folder), unnorm_key="fractal")
-    with pytest.raises(CheckpointError, match="does not exist"):
+    with pytest.raises(CheckpointError, match="is missing"):
         load_magma(str(folder), statistics=str(tmp_path / "nowhere.json"), unnorm_key="bridge_orig")

@@ -268,7 +268,7 @@ def variants(tmp_path: Path) -> dict[str, SpatialVLA]:
         name: load_spatialvla(
             str(write_checkpoint(tmp_path / name, processor=change)),
             constrained=True,
-            unnorm_key="bridge_orig/1.0.0",
+            unnorm_key=FRACTAL if name == "sft-fractal" else "bridge_orig/1.0.0",
         )
         for name, change in changes.items()
     }
@@ -330,11 +330,12 @@ def test_a_prompt_longer_than_the_model_is_refused(plain: SpatialVLA, seen: list
 
 
 def test_options_are_declared_and_checked(folder: Path) -> None:
-    policy = load_policy("spatialvla", str(folder), lowercase="false", iterations="chunk")
+    units = {"unnorm_key": "bridge_orig/1.0.0"}
+    policy = load_policy("spatialvla", str(folder), lowercase="false", iterations="chunk", **units)
     assert policy.card.settings["lowercase"] == "False"
     for wrong in ({"iterations": "all"}, {"lowercase": "perhaps"}, {"lower_case": "true"}):
         with pytest.raises(UsageError):
-            load_policy("spatialvla", str(folder), **wrong)
+            load_policy("spatialvla", str(folder), **units, **wrong)
 
 
 def test_every_choice_is_part_of_the_identity(folder: Path, plain: SpatialVLA) -> None:

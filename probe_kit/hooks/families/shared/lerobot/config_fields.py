@@ -13,11 +13,16 @@ _DELTAS = "observation_delta_indices"
 
 
 def known_values(
-    values: Mapping[str, Any], known: Collection[str], inert: Inert, unread: Collection[str], source: Path
+    values: Mapping[str, Any],
+    known: Collection[str],
+    inert: Inert,
+    unread: Collection[str],
+    source: Path,
+    waived: bool = False,
 ) -> dict[str, Any]:
     """`values` without the fields that do nothing here.
 
-    known: fields that the installed lerobot reads. inert: of a newer one. unread: those that the caller says
+    waived: whether -M unread says so. known: fields that the installed lerobot reads. inert: of a newer one. unread: those that the caller says
     change nothing. Raises CheckpointError naming every other field that lerobot does not know, and its value.
     """
     others = {name: value for name, value in values.items() if name not in known and name not in unread}
@@ -33,9 +38,12 @@ def known_values(
         )
     if unknown := sorted(set(others) - set(inert)):
         listed = ", ".join(f"{name}: {others[name]!r}" for name in unknown)
+        way_out = (
+            f"accept them with -M unread={','.join(unknown)}" if waived else "remove them from a copy of the file"
+        )
         raise CheckpointError(
             f"{source} has unknown settings: {listed}. lerobot {version('lerobot')} does not read them. If they "
-            "change nothing that a picture, a state or an action depends on, remove them from a copy of the file"
+            f"change nothing that a picture, a state or an action depends on, {way_out}"
         )
     return {name: value for name, value in values.items() if name in known}
 

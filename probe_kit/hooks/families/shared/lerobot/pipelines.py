@@ -185,14 +185,10 @@ def adds_state(folder: Path) -> bool:
 
 
 def text_length(folder: Path) -> int | None:
-    """Positions that the text is padded to; None where no step says. Raises CheckpointError for other padding."""
+    """Positions that the text is padded to; None where no step says."""
     step = next((step for step in saved_steps(folder, PREPROCESSOR) if step.name == TOKENIZER), None)
     if step is None:
         return None
-    if step.config.get("padding_side", "right") != "right":
-        raise CheckpointError(
-            f"{folder} pads its text in front; probe_kit pads behind it. Save it with lerobot's own"
-        )
     length = step.config.get("max_length")
     return None if length is None else int(length)
 

@@ -73,6 +73,8 @@ class LerobotPolicy(Policy):
     """Parameters that inference never reads and a file may lack."""
     newer_fields: ClassVar[Inert] = {}
     """Fields of its configuration in a newer lerobot than the installed one."""
+    takes_unread: ClassVar[bool] = False
+    """Whether users can say with -M unread which fields change nothing."""
     known_steps: ClassVar[tuple[str, ...] | None] = (CROP,)
     """Steps of lerobot's processors that only this family has; None where it reads the pipelines itself."""
     other_roles: ClassVar[tuple[str, ...]]
@@ -253,7 +255,9 @@ class LerobotPolicy(Policy):
                 f"{folder} holds a {kind!r} policy; expected {cls.config_type}. Pass the right --model"
             )
         known = {field.name for field in fields(PreTrainedConfig.get_choice_class(cls.config_type))}
-        values = known_values(values, {*known, "type"}, cls.newer_fields, evaluation.unread, path)
+        values = known_values(
+            values, {*known, "type"}, cls.newer_fields, evaluation.unread, path, cls.takes_unread
+        )
         if "rtc_config" in values:
             values["rtc_config"] = None  # real-time chunking mixes in actions of the chunk before
         with tempfile.TemporaryDirectory() as place:
