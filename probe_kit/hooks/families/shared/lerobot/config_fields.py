@@ -22,8 +22,9 @@ def known_values(
 ) -> dict[str, Any]:
     """`values` without the fields that do nothing here.
 
-    waived: whether -M unread says so. known: fields that the installed lerobot reads. inert: of a newer one. unread: those that the caller says
-    change nothing. Raises CheckpointError naming every other field that lerobot does not know, and its value.
+    known: fields that the installed lerobot reads. inert: of a newer one. unread: those that the caller says
+    change nothing. waived: whether users can say so, with -M unread.
+    Raises CheckpointError naming every other field that lerobot does not know, and its value.
     """
     others = {name: value for name, value in values.items() if name not in known and name not in unread}
     changing = {
