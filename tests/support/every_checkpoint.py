@@ -32,7 +32,7 @@ WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "openvla": (prismatic_checkpoints.write_checkpoint, _BYTES),
     "prismatic": (prismatic_checkpoints.write_checkpoint, _BYTES),
     "spatialvla": (spatialvla_checkpoints.write_checkpoint, {}),
-    "magma": (magma_checkpoints.write_checkpoint, {}),
+    "magma": (magma_checkpoints.write_checkpoint, {"unnorm_key": "bridge_orig"}),
     "xiaomi-r0": (xiaomi_checkpoints.write_checkpoint, {"robot": "bridge_delta"}),
     "internvla-m1": (internvla_checkpoints.write_checkpoint, {"unnorm_key": "bridge_dataset"}),
     "paligemma": (vlm_checkpoints.write_paligemma, {}),
