@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from probe_kit.extract import Extraction, Run
     from probe_kit.extract.own_environments.environment_plan import EnvironmentPlan
     from probe_kit.extract.recordings.recorded_plan import RecordedPlan
+    from probe_kit.extract.settings import RunSettings
     from probe_kit.extract.store.locations.location import Location
     from probe_kit.suite.ladder import Wording
 
@@ -127,6 +128,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     declared = " (of the released size; the weights were not read)" if extraction.declared and plan.streams else ""
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
+        **_units_row(extraction.settings),
         **_protocol_row(identity),
         **_rows_of_plan(extraction),
         **({"grows": growth.words} if growth and growth.words else {}),
@@ -144,6 +146,15 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     for name, value in rows.items():
         table.add_row(marked("[dim]{}[/]", name), value)
     err.print(table)
+
+
+def _units_row(settings: "RunSettings") -> dict[str, str]:
+    """Whose units the actions get, of a family whose checkpoints have several."""
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(settings.model)
+    units = "" if family is None else family.whose_units(settings.checkpoint, settings.options, fetch=False)
+    return {"units": units} if units else {}
 
 
 def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> None:

@@ -264,11 +264,15 @@ def check_run(
 
 
 def _check_instructions(settings: RunSettings, instructions: Sequence[str], fetch: bool) -> None:
-    """Raise InstructionError for what a policy cannot read, before its network is loaded."""
+    """Raise InstructionError for what a policy cannot read, and UsageError for units that have to be chosen.
+
+    Before its network is loaded.
+    """
     from probe_kit.hooks.registry import get_family
 
     family = get_family(settings.model)
     if family is not None and isinstance(settings, ExtractSettings):
+        family.whose_units(settings.checkpoint, settings.options, fetch)
         family.check_instructions(settings.checkpoint, instructions, settings.options, fetch)
 
 

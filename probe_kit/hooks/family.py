@@ -22,12 +22,12 @@ from probe_kit.errors import (
 from probe_kit.hooks.checkpoints.checkpoint import (
     CONFIG_FILE,
     PATTERNS,
-    check_files,
     checkpoint_folder,
     hub_name,
     is_on_hub,
     missing_weights,
 )
+from probe_kit.hooks.checkpoints.file_checks import check_files
 from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
 from probe_kit.hooks.contract.card import ModelCard, SourceWeights
 from probe_kit.hooks.contract.declared import DeclaredStream
@@ -71,6 +71,9 @@ class Family:
     declared: streams of the released sizes, by name of the size, which is empty where there is one; a plan is made
     of them where no weights are read. words: `module:function(checkpoint, instructions, **options)` that raises
     InstructionError for what cannot be read, from the checkpoint's small files alone; see `check_instructions`.
+    units: `module:function(checkpoint, **options)` that says whose units the actions get, and where they stand,
+    from the small files; it raises UsageError where that has to be chosen. of_default: options that belong to the
+    default checkpoint, and to no other; they count where they are not given.
     files: patterns of the files of a hub repository that are needed.
     home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
     `words_in`, of a family whose default checkpoint knows few words; empty for one that reads any text.
@@ -103,6 +106,8 @@ class Family:
     interventions: Interventions = ALL_EDITS
     declared: Mapping[str, tuple[DeclaredStream, ...]] = MappingProxyType({})
     words: str | None = None
+    units: str | None = None
+    of_default: Mapping[str, Any] = MappingProxyType({})
     files: tuple[str, ...] = PATTERNS
     home: DefaultScene = RELEASED
     vocabulary: str = ""
@@ -173,8 +178,12 @@ class Family:
             _check_streams(model, str(place))
         # Options that the adapter does not record itself are part of the identity too.
         said = {name: str(value) for name, value in chosen.items() if name != "weights_seed"}
+        merged = model.card.audit.get("adapter")
         model.card = replace(
-            model.card, settings={**said, **model.card.settings}, **self._source_of(model.card, place)
+            model.card,
+            settings={**said, **model.card.settings},
+            notes=tuple(dict.fromkeys((*model.card.notes, *([merged] if merged else [])))),
+            **self._source_of(model.card, place),
         )
         return model
 
@@ -225,7 +234,12 @@ class Family:
             with naming_checkpoint(self.name, place):
                 weights = fetch and not random_weights
                 check_files(checkpoint_folder(place, self.files), self.config_types, weights, self.instead)
-        return chosen
+        return self._with_own(chosen, place)
+
+    def _with_own(self, chosen: Mapping[str, Any], place: str | None) -> dict[str, Any]:
+        """The options with those that belong to the default checkpoint, where it is the one."""
+        own = self.of_default if place is not None and place == self.default_checkpoint else {}
+        return {**own, **chosen}
 
     def declared_streams(self, options: Mapping[str, Any]) -> tuple[DeclaredStream, ...] | None:
         """The streams of the size that `options` choose; None for a family that declares none."""
@@ -247,6 +261,23 @@ class Family:
             check = imported(self.words)
         with naming_checkpoint(self.name, str(place or "what it brings")):
             check(place, instructions, **chosen)
+
+    def whose_units(
+        self, checkpoint: str | None, options: Mapping[str, Any] = MappingProxyType({}), fetch: bool = True
+    ) -> str:
+        """The data set or robot whose units the actions get, and what says so; empty where the family has one way.
+
+        fetch: download small files that are not here; without it, nothing is said of a checkpoint on the hub.
+        Raises UsageError where several are there and none was chosen.
+        """
+        chosen = check_options(self.name, self.options, options)
+        place = self.place(checkpoint, chosen.pop(SIZE, None))
+        if self.units is None or place is None or (not fetch and is_on_hub(place)):
+            return ""
+        with while_loading(self.name, self.units):
+            told = imported(self.units)
+        with naming_checkpoint(self.name, place):
+            return str(told(place, **self._with_own(chosen, place)))
 
     def check_intervention(self, kind: InterventionKind) -> None:
         """Raises UnsupportedInterventionError, before anything is loaded, for what the family does not support."""

@@ -1,6 +1,7 @@
 """A policy that can say that it put out no action: environment, store, probes, one table with another family."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,8 +21,10 @@ STEPS = 2
 
 
 def settings(
-    model: str, suite: Suite, checkpoint: Path | None = None, items: int = 4, **more: object
+    model: str, suite: Suite, checkpoint: Path | None = None, items: int = 4, **more: Any
 ) -> ExtractSettings:
+    if model == "magma":
+        more["options"] = {"unnorm_key": "bridge_orig", **more.get("options", {})}
     return ExtractSettings(
         model,
         None if checkpoint is None else str(checkpoint),

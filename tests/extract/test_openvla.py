@@ -28,7 +28,7 @@ def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Ex
         items=2,
         scene=SceneSpec(max_steps=2),
         env_workers=0,
-        options={"tokenizer": "bytes"},
+        options={"tokenizer": "bytes", "unnorm_key": "bridge_orig"},
         tokens="all",
     )
 

@@ -38,7 +38,7 @@ def settings(
 @pytest.fixture(scope="module")
 def xiaomi_settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> ExtractSettings:
     folder = xiaomi_checkpoints.write_checkpoint(tmp_path_factory.mktemp("xiaomi"))
-    return settings("xiaomi-r0", small_suite, folder, batch=2, options={"steps": 2})
+    return settings("xiaomi-r0", small_suite, folder, batch=2, options={"steps": 2, "robot": "bridge_delta"})
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def xiaomi(xiaomi_settings: ExtractSettings, tmp_path_factory: pytest.TempPathFa
 @pytest.fixture(scope="module")
 def internvla_settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> ExtractSettings:
     folder = internvla_checkpoints.write_checkpoint(tmp_path_factory.mktemp("internvla"))
-    return settings("internvla-m1", small_suite, folder, options={"steps": 2})
+    return settings("internvla-m1", small_suite, folder, options={"steps": 2, "unnorm_key": "bridge_dataset"})
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,8 @@ def test_internvla_refuses_a_batch_before_it_begins(internvla_settings: ExtractS
 def test_other_options_are_another_run(internvla_settings: ExtractSettings, internvla: Run) -> None:
     with pytest.raises(SettingsMismatchError, match="guidance"):
         extract_run(
-            replace(internvla_settings, options={"steps": 2, "guidance": 2.0}), Path(str(internvla.location))
+            replace(internvla_settings, options={**internvla_settings.options, "guidance": 2.0}),
+            Path(str(internvla.location)),
         )
 
 

@@ -96,7 +96,8 @@ def copied(family: str, place: Path) -> Path:
 
 def load(family: str, checkpoint: Path) -> Any:
     try:
-        return find_family(family).load(str(checkpoint))
+        options = {"unnorm_key": "bridge_orig"} if family == "openvla" else {}
+        return find_family(family).load(str(checkpoint), options=options)
     except MissingExtraError as error:
         pytest.skip(str(error))
 

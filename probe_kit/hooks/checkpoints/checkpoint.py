@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from probe_kit._system.bounded_json import parse_json, read_json
+from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks.checkpoints.hub import unreachable
 from probe_kit.models.bounds import check_sizes
@@ -158,46 +158,41 @@ def content_hashes(files: Mapping[str, Path]) -> dict[str, str]:
     return {f"file {name}": hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
 
 
-def check_files(
-    folder: Path, types: Sequence[str], weights: bool = True, instead: Sequence[tuple[str, str]] = ()
-) -> None:
-    """Look at what can be wrong with a checkpoint before anything heavy is imported.
-
-    types: what `type` or `model_type` of its config may be. weights: whether its weights will be read. instead:
-    for other types that people may take for one of them, what to do.
-    Raises CheckpointError for a missing or unreadable config or one of another model, WeightsError for missing
-    weights.
-    A folder of a LoRA adapter is left to its loader, which knows its base.
-    """
-    if (folder / ADAPTER_FILE).is_file():
-        return
-    file = folder / CONFIG_FILE
-    if not file.is_file():
-        raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}")
-    config = read_json(file, CheckpointError, "Download the checkpoint again")
-    found = _type_of(config)
-    if not isinstance(found, str) or found not in types:
-        way_out = dict(instead).get(str(found), "Pass the right --model")
-        raise CheckpointError(f"{file} holds a {found!r} model; expected {' or '.join(types)}. {way_out}")
-    if weights and (lacking := missing_weights(folder)):
-        raise WeightsError(f"no weights in {folder}: {lacking}. Download the checkpoint again")
-
-
-def _type_of(config: Any) -> Any:
-    """What kind of model a config.json describes; that of a training run of Prismatic has a part `model`."""
-    if not isinstance(config, dict):
-        return None
-    part = config.get("model")
-    if isinstance(part, dict) and "vision_backbone_id" in part:
-        return "prismatic"
-    return config.get("type") or config.get("model_type")
-
-
 def shard_name(name: object) -> str:
     """A file's name as an index gives it. Raises ValueError for a path: shards lie beside their index."""
     if not isinstance(name, str) or name in ("", ".", "..") or Path(name).name != name or "\\" in name:
         raise ValueError(f"{name!r} is no name of a file beside it")
     return name
+
+
+def listed_shards(index: Path) -> list[str]:
+    """Names of the files that an index of shards lists, sorted. Raises ValueError for one that is none."""
+    try:
+        return sorted({shard_name(name) for name in parse_json(index.read_bytes())["weight_map"].values()})
+    except (OSError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(error) from error
+
+
+def check_unambiguous(folder: Path) -> None:
+    """Raise WeightsError for a folder with two sets of weights: one file, and an index that lists other files.
+
+    Some loaders take the one, some the other; nothing says which of them is meant.
+    """
+    single, index = folder / WEIGHTS_FILE, folder / INDEX_FILE
+    if not (single.is_file() and index.is_file()):
+        return
+    try:
+        others = [name for name in listed_shards(index) if name != WEIGHTS_FILE]
+    except ValueError as error:
+        raise WeightsError(
+            f"{index} is damaged ({error}), beside {WEIGHTS_FILE}. Remove the one that is not meant"
+        ) from error
+    if others:
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        raise WeightsError(
+            f"{folder} holds two sets of weights: {WEIGHTS_FILE}, and {INDEX_FILE} with {others[0]}{more}. "
+            "Nothing says which one is meant: remove the other one"
+        )
 
 
 def missing_weights(folder: Path) -> str:
@@ -207,8 +202,8 @@ def missing_weights(folder: Path) -> str:
         return ""
     if index.is_file():
         try:
-            shards = sorted({shard_name(name) for name in parse_json(index.read_bytes())["weight_map"].values()})
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            shards = listed_shards(index)
+        except ValueError as error:
             return f"{INDEX_FILE} is damaged ({error})"
         absent = [name for name in shards if not (folder / name).is_file()]
         return f"{', '.join(absent)} of {INDEX_FILE} are missing" if absent else ""

@@ -2,8 +2,9 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import accumulate, takewhile
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -14,25 +15,45 @@ from torch import Tensor, nn
 
 from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import WeightsError
-from probe_kit.hooks.checkpoints.checkpoint import shard_name
+from probe_kit.hooks.checkpoints.adapter_files import AdapterFiles, adapter_in
+from probe_kit.hooks.checkpoints.checkpoint import check_unambiguous, shard_name
+from probe_kit.hooks.checkpoints.lora import Adapter
 
 SINGLE_FILE = "model.safetensors"
 INDEX_FILE = "model.safetensors.index.json"
 RANDOM_MARK = "probe_kit.weights"
+_WRAPPERS = (
+    "_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module", "_forward_module", "_ddp_module", "module",
+)  # fmt: skip
+"""What torch.compile, FSDP, activation checkpoints, DeepSpeed, lightning and DDP call the module inside them."""
+_FEWEST = 2
+"""Names that can have something in common."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """The tensors of a checkpoint as its files hold them; `random`: the weights are untrained."""
+    """The tensors of a checkpoint as its files hold them; `random`: the weights are untrained.
+
+    adapter: what `load_weights` merges into them, if anything.
+    """
 
     tensors: Mapping[str, Tensor]
     source: str
     random: bool
+    adapter: Adapter | None = None
 
     def sha256(self) -> str:
-        """Hex sha256 over (name, dtype, shape, bytes) of every tensor, in name order."""
+        """Hex sha256 over (name, dtype, shape, bytes) of every tensor, in name order.
+
+        Of base and adapter where there is one, and over the settings that scale what it adds: their merge is
+        rounded, and its last bits may differ between machines.
+        """
         digest = hashlib.sha256()
-        for name, tensor in sorted(self.tensors.items()):
+        tensors = dict(self.tensors)
+        if self.adapter is not None:
+            digest.update(json.dumps(["adapter", self.adapter.scaling], sort_keys=True).encode())
+            tensors |= self.adapter.tensors
+        for name, tensor in sorted(tensors.items()):
             header = [name, str(tensor.dtype).removeprefix("torch."), list(tensor.shape)]
             digest.update(json.dumps(header).encode())
             digest.update(tensor.contiguous().flatten().view(torch.uint8).numpy().tobytes())
@@ -41,13 +62,17 @@ class Weights:
 
 @dataclass(frozen=True)
 class WeightsAudit:
-    """What loading proved: `tensors` in the model equal the file, the `allowed_missing` ones do not."""
+    """What loading proved: `tensors` in the model equal the file, the `allowed_missing` ones do not.
+
+    adapter: what was merged into the file's tensors, in words; empty for nothing.
+    """
 
     sha256: str
     random: bool
     tensors: int
     parameters: int
     allowed_missing: tuple[str, ...]
+    adapter: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """The audit as stored with a run."""
@@ -57,10 +82,30 @@ class WeightsAudit:
 def read_weights(folder: Path, unlisted: Iterable[str] = ()) -> Weights:
     """Read `model.safetensors`, every shard of `model.safetensors.index.json`, or the only `.pt` file.
 
-    A `.pt` file is read with `weights_only=True`: it cannot run code. unlisted: tensors that shards may hold
-    although the index does not name them.
-    Raises WeightsError if a file is missing or damaged, or if the index and the shards disagree.
+    Of a LoRA adapter its tensors and those of its base, which `load_weights` merges. A `.pt` file is read with
+    `weights_only=True`: it cannot run code. unlisted: tensors that shards may hold although the index does not
+    name them.
+    Raises WeightsError if a file is missing or damaged, if the index and the shards disagree, or if there are two
+    sets of weights; CheckpointError for an adapter that cannot be merged exactly.
     """
+    files = adapter_in(folder)
+    return _read_folder(folder, unlisted) if files is None else with_adapter(
+        _read_folder(files.base_folder(), unlisted), files
+    )  # fmt: skip
+
+
+def with_adapter(base: Weights, files: AdapterFiles) -> Weights:
+    """The base's weights with an adapter to be merged. Raises WeightsError if its file cannot be read."""
+    path = files.weights
+    if path.suffix == ".bin":
+        tensors = dict(read_pickle(path).tensors)
+    else:
+        tensors, _ = _read_file(path)
+    return replace(base, source=f"{base.source} and {files.folder}", adapter=Adapter(files, tensors))
+
+
+def _read_folder(folder: Path, unlisted: Iterable[str]) -> Weights:
+    check_unambiguous(folder)
     index, pickles = folder / INDEX_FILE, sorted(folder.glob("*.pt"))
     if (folder / SINGLE_FILE).is_file():
         shards: dict[str, set[str] | None] = {SINGLE_FILE: None}
@@ -152,15 +197,18 @@ def load_weights(
     tensors: Mapping[str, Tensor],
     allowed_missing: Iterable[str] = (),
     assign: bool = False,
+    named: Callable[[str], str] = str,
 ) -> WeightsAudit:
     """Copy `tensors` into `module` and prove that they arrived.
 
     weights: the files, which give the audit its hash. tensors: the same content under the module's names.
     allowed_missing: parameters that inference never reads and the file may lack.
     assign: make `tensors` themselves the parameters instead of copying them; for a module on the meta device.
+    named: the module's name of a tensor in a file, for the adapter that is merged.
     Raises WeightsError naming missing, extra, mis-shaped and non-finite tensors; the module is then not used.
     """
     state = module.state_dict()
+    _refuse_wrapped(weights, tensors, state)
     allowed = set(allowed_missing) & (set(state) - set(tensors))
     _refuse(weights.source, "missing", sorted(set(state) - set(tensors) - allowed))
     _refuse(weights.source, "not part of the model", sorted(set(tensors) - set(state)))
@@ -176,6 +224,8 @@ def load_weights(
         if tensor.is_floating_point() != state[name].is_floating_point()
     ]
     _refuse(weights.source, "of another kind of number", kinds)
+    if weights.adapter is not None:
+        tensors = weights.adapter.merged(module, tensors, named)
     damaged = [n for n, t in tensors.items() if t.is_floating_point() and not torch.isfinite(t).all()]
     _refuse(weights.source, "NaN or infinite", damaged)
     module.load_state_dict(dict(tensors), strict=not allowed, assign=assign)
@@ -188,7 +238,51 @@ def load_weights(
         len(tensors),
         sum(parameter.numel() for parameter in module.parameters()),
         tuple(sorted(allowed)),
+        "" if weights.adapter is None else f"LoRA adapter merged into {weights.adapter.files.base}",
     )
+
+
+def _refuse_wrapped(weights: Weights, tensors: Mapping[str, Tensor], state: Mapping[str, Tensor]) -> None:
+    """Raise WeightsError where tensors are missing because all names are another's: a wrapper's, or factors'."""
+    missing = set(state) - set(tensors)
+    strange = sorted(set(tensors) - set(state))
+    if factors := [name for name in strange if ".lora_A." in name or ".lora_B." in name]:
+        raise WeightsError(
+            f"weights in {weights.source} hold {len(factors)} low-rank factors that were not merged: "
+            f"{_names(factors, 2)}. Merge them with the tool that trained the model, and save it again"
+        )
+    wrapper = _wrapper(list(weights.tensors), list(state)) if missing and strange else ""
+    if wrapper:
+        held = [name for name in weights.tensors if wrapper in name]
+        raise WeightsError(
+            f"weights in {weights.source}: {len(held)} of {len(weights.tensors)} names hold {wrapper!r}, "
+            f"such as {min(held)}, and the model does not. A module that was compiled, distributed or part "
+            f"of a larger one was saved: save its tensors again without {wrapper!r}. Nothing was run"
+        )
+
+
+def _wrapper(stored: Sequence[str], model: Sequence[str]) -> str:
+    """What stands in the names of a file and in none of the model's; empty where nothing does.
+
+    Wrappers of torch and of training libraries put their name before all names or between their parts; a module
+    of a larger one has the name that it has there in front.
+    """
+    common = _common_path(stored) if len(stored) >= _FEWEST else ""
+    if common and not any(name.startswith(f"{common.partition('.')[0]}.") for name in model):
+        for end in accumulate(common.split("."), "{}.{}".format):
+            if {name.removeprefix(f"{end}.") for name in stored} & set(model):
+                return f"{end}."
+    parts, own = ({part for name in names for part in name.split(".")[:-1]} for names in (stored, model))
+    inside = [part for part in _WRAPPERS if part in parts - own]
+    first = common.partition(".")[0]
+    return f"{inside[0]}." if inside else f"{first}." if first and first not in own else ""
+
+
+def _common_path(names: Sequence[str]) -> str:
+    """The modules that all tensors lie in, dotted; empty where there is none."""
+    first, last = min(names).split(".")[:-1], max(names).split(".")[:-1]
+    shared = takewhile(lambda pair: pair[0] == pair[1], zip(first, last, strict=False))
+    return ".".join(part for part, _ in shared)
 
 
 def _refuse(source: str, what: str, names: list[str]) -> None:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.models.bounds import check_deviations
+from probe_kit.models.statistics_choice import chosen_name
 
 DEFAULT_ROBOT = "bridge_delta"
 STATISTICS_FILE = "preprocessor_config.json"
@@ -46,10 +47,11 @@ class ActionUnits:
 
 
 def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
-    """Statistics of one robot from `preprocessor_config.json`; without a name, of bridge_delta or the only one.
+    """Statistics of one robot from `preprocessor_config.json`; without a name, of the only one.
 
     robot: a name of the file, or the beginning of just one. numbers: per action, as config.json has it.
-    Raises CheckpointError where there are none or they do not fit, UsageError for an unknown robot.
+    Raises CheckpointError where there are none or they do not fit, UsageError for an unknown robot, and for
+    several without a choice.
     """
     file = folder / STATISTICS_FILE
     known: Mapping[str, Any] = (json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}).get(
@@ -60,7 +62,7 @@ def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
             f"{file} has no action_config: the actions have no physical unit and no length. "
             "Take the file that the checkpoint was released with"
         )
-    name = _choose(robot, known)
+    name = _choose(robot, known, str(file))
     mean, deviation = (np.asarray(known[name].get(part, []), np.float64) for part in ("mean", "std"))
     mean, deviation = (part[0] if part.ndim == 3 and len(part) == 1 else part for part in (mean, deviation))
     if mean.ndim != 2 or mean.shape != deviation.shape or mean.shape[1] != numbers:
@@ -73,16 +75,9 @@ def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
     return ActionUnits(name, mean, deviation)
 
 
-def _choose(robot: str | None, known: Mapping[str, Any]) -> str:
-    if robot in known:
-        return str(robot)
-    wanted = robot or (DEFAULT_ROBOT if DEFAULT_ROBOT in known or len(known) > 1 else next(iter(known)))
-    fitting = [name for name in known if name.startswith(wanted)]
-    if len(fitting) != 1:
-        raise UsageError(
-            f"no robot {wanted!r} in this checkpoint; choose -M robot among {', '.join(sorted(known))}"
-        )
-    return fitting[0]
+def _choose(robot: str | None, known: Mapping[str, Any], place: str) -> str:
+    beginning = [] if robot is None else [name for name in known if name.startswith(robot)]
+    return chosen_name(known, beginning[0] if len(beginning) == 1 else robot, "robot", place)
 
 
 @dataclass(frozen=True)

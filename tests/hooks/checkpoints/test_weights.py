@@ -159,3 +159,47 @@ def test_a_pickled_state_dict_is_read_without_running_code(checkpoint: Path, tmp
     torch.save({"trap": Path(tmp_path)}, checkpoint / "model.pt")
     with pytest.raises(WeightsError, match="plain tensors"):
         load_pi0(str(checkpoint))
+
+
+@pytest.mark.parametrize(
+    ("before", "told"),
+    [
+        ("_orig_mod.", "_orig_mod."),
+        ("module.", "module."),
+        ("module._orig_mod.", "module._orig_mod."),
+        ("policy.", "policy."),
+        ("agent.policy.", "agent.policy."),
+    ],
+)
+def test_a_name_in_front_of_all_tensors_is_told(checkpoint: Path, before: str, told: str) -> None:
+    tensors = {before + name: tensor for name, tensor in load_file(checkpoint / SINGLE_FILE).items()}
+    save_file(tensors, checkpoint / SINGLE_FILE)
+    with pytest.raises(WeightsError, match=f"names hold '{told}'.*save its tensors again without") as caught:
+        load_pi0(str(checkpoint))
+    assert "missing" not in str(caught.value)
+
+
+def test_a_wrapper_inside_the_names_is_told(checkpoint: Path) -> None:
+    tensors = {name.replace("layers.0.", "layers.0._checkpoint_wrapped_module."): tensor
+               for name, tensor in load_file(checkpoint / SINGLE_FILE).items()}  # fmt: skip
+    save_file(tensors, checkpoint / SINGLE_FILE)
+    with pytest.raises(WeightsError, match="_checkpoint_wrapped_module"):
+        load_pi0(str(checkpoint))
+
+
+def write_index(checkpoint: Path, shard: str) -> None:
+    names = dict.fromkeys(load_file(checkpoint / SINGLE_FILE), shard)
+    (checkpoint / INDEX_FILE).write_text(json.dumps({"weight_map": names}), encoding="utf-8")
+
+
+def test_two_sets_of_weights_are_refused_because_nothing_says_which_is_meant(checkpoint: Path) -> None:
+    write_index(checkpoint, "model-00001-of-00001.safetensors")
+    shutil.copy(checkpoint / SINGLE_FILE, checkpoint / "model-00001-of-00001.safetensors")
+    for load in (read_weights, lambda folder: load_pi0(str(folder))):
+        with pytest.raises(WeightsError, match="two sets of weights"):
+            load(checkpoint)
+
+
+def test_an_index_that_lists_the_one_file_is_no_second_set(checkpoint: Path) -> None:
+    write_index(checkpoint, SINGLE_FILE)
+    assert read_weights(checkpoint).tensors

@@ -37,6 +37,8 @@ FAMILIES = (
         verifier="probe_kit.hooks.families.internvla.verify:verify_internvla",
         source="qwen2.5-vl",
         source_weights=SourceWeights("Qwen/Qwen2.5-VL-3B-Instruct", parameters=3_754_622_976),
+        units="probe_kit.hooks.families.internvla.adapter:internvla_units",
+        of_default={"unnorm_key": "bridge_dataset"},
         declared={
             "": (
                 backbone(37, 2048, 130),
@@ -51,7 +53,7 @@ FAMILIES = (
             ("Qwen/Qwen2.5-VL-3B-Instruct", "tokenizer.json"),
         ),
         options=(
-            Option("unnorm_key", str, "Data set whose units the actions get.", "bridge_dataset"),
+            Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
             Option("steps", int, "DDIM steps; as many as divide the training's evenly.", "10"),
             Option("guidance", float, "Scale of guidance; 1 or less runs the condition alone.", "1.5"),
             Option(

@@ -39,6 +39,7 @@ from probe_kit.models.internvla import (
     prompt,
 )
 from probe_kit.models.qwen import QwenInputs
+from probe_kit.models.statistics_choice import STATISTICS_FILE
 
 DEFAULT_CHECKPOINT = "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge"
 STEPS, GUIDANCE = 10, 1.5
@@ -154,7 +155,8 @@ class InternVLA(QwenVLA):
     @cached_property
     def units(self) -> ActionUnits:
         """What gives actions their units. Raises CheckpointError, UsageError."""
-        return ActionUnits.choose(self.parts.statistics(), self._unnorm_key)
+        place = str(self.parts.place / STATISTICS_FILE)
+        return ActionUnits.choose(self.parts.statistics(), self._unnorm_key, place)
 
     def text(self, instruction: str) -> str:
         """Qwen's chat around the prompt the run was trained with."""
@@ -265,6 +267,15 @@ class InternVLA(QwenVLA):
         return Tap(block.attn if site.quantity == "attention" else block.mlp, steps, "output", rows=rows)
 
 
+def internvla_units(checkpoint: str, *, unnorm_key: str | None = None, vlm: str | None = None, **_: Any) -> str:
+    """See `Family.units`; a checkpoint without statistics says so, since it can be captured."""
+    parts = find_parts(checkpoint, vlm, unread=True)
+    if not (known := parts.statistics()):
+        return f"none: {parts.place} has no {STATISTICS_FILE}"
+    place = str(parts.place / STATISTICS_FILE)
+    return f"{ActionUnits.choose(known, unnorm_key, place).key}, from {place}"
+
+
 def load_internvla(
     checkpoint: str | None = None,
     device: str = "cpu",
@@ -281,7 +292,7 @@ def load_internvla(
 ) -> InternVLA:
     """Load InternVLA-M1 from a run's folder, one of its weight files, a converted folder, or a hub id.
 
-    unnorm_key: data set whose units the actions get; default the WidowX arm's or the only one. steps: of DDIM.
+    unnorm_key: data set whose units the actions get; default the only one. steps: of DDIM.
     guidance: its scale; 1 or less runs the condition alone. vlm: folder or hub id of Qwen2.5-VL's configuration,
     tokenizer and processor. tokenizer: folder of another one. weights: name of the file of a step, see
     `find_parts`; the card names the one that was read.

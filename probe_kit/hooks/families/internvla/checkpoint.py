@@ -12,11 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import CheckpointError
+from probe_kit.hooks.checkpoints.adapter_files import adapter_in
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, checkpoint_folder, hub_files
-from probe_kit.hooks.checkpoints.weights import INDEX_FILE, SINGLE_FILE, Weights, read_pickle, read_weights
+from probe_kit.hooks.checkpoints.weights import (
+    INDEX_FILE,
+    SINGLE_FILE,
+    Weights,
+    read_pickle,
+    read_weights,
+    with_adapter,
+)
 from probe_kit.models.internvla import InternVLAConfig, find_config
+from probe_kit.models.statistics_choice import stored_statistics
 
-STATISTICS_FILE = "dataset_statistics.json"
 WEIGHTS_FOLDER = "checkpoints"
 RELEASED_STEP = "steps_50000_pytorch_model.pt"
 """The file that Act2Answer's evaluation loads, and the one that is read where there are several."""
@@ -40,13 +48,27 @@ class Parts:
     vlm: Path
 
     def read(self) -> Weights:
-        """The tensors. Raises WeightsError."""
-        return read_pickle(self.weights) if self.weights.is_file() else read_weights(self.weights)
+        """The tensors. Raises WeightsError, and CheckpointError for an adapter beside a `.pt` file."""
+        adapter = adapter_in(self.place)
+        if adapter is None:
+            return _read(self.weights)
+        if self.weights.is_file():
+            raise CheckpointError(
+                f"{self.place} holds a LoRA adapter beside {self.weights.name}: nothing says whether that file is "
+                "merged. Merge the adapter with peft and pass the merged folder, or remove the adapter's files"
+            )
+        base = adapter.base_folder()
+        return (
+            read_weights(base) if base == self.place else with_adapter(_read(_weights(base, None, None)), adapter)
+        )
 
     def statistics(self) -> Mapping[str, Any]:
         """Per data set, what un-normalises its actions; empty without the file."""
-        file = self.place / STATISTICS_FILE
-        return dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
+        return stored_statistics((self.place,), {}, str(self.place))[0]
+
+
+def _read(place: Path) -> Weights:
+    return read_pickle(place) if place.is_file() else read_weights(place)
 
 
 def find_parts(checkpoint: str, vlm: str | None, weights: str | None = None, unread: bool = False) -> Parts:
@@ -70,6 +92,8 @@ def find_parts(checkpoint: str, vlm: str | None, weights: str | None = None, unr
 
 def _weights(folder: Path, chosen: str | None, hub: str | None) -> Path:
     """Safetensors beside the configuration, or a .pt file there or in `checkpoints/`; of `hub` if it is given."""
+    if chosen is None and hub is None and adapter_in(folder) is not None and not any(folder.glob("**/*.pt")):
+        return folder
     for place in (folder, folder / WEIGHTS_FOLDER):
         if chosen is None and ((place / SINGLE_FILE).is_file() or (place / INDEX_FILE).is_file()):
             return place

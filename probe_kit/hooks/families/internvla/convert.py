@@ -16,8 +16,9 @@ from probe_kit._system.drafts import draft_of
 from probe_kit.errors import CheckpointError, ProbeKitError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import side_files
 from probe_kit.hooks.checkpoints.weights import SINGLE_FILE, Weights, read_weights
-from probe_kit.hooks.families.internvla.checkpoint import STATISTICS_FILE, Parts, find_parts
+from probe_kit.hooks.families.internvla.checkpoint import Parts, find_parts
 from probe_kit.models.internvla.config import DIMS_FILE, RUN_FILE
+from probe_kit.models.statistics_choice import STATISTICS_FILE
 
 PROVENANCE = "converted.json"
 _RUN_FILES = (RUN_FILE, DIMS_FILE, STATISTICS_FILE)

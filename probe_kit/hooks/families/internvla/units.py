@@ -2,18 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.errors import CheckpointError
 from probe_kit.hashing import sha256_json
 from probe_kit.models.bounds import check_bounds
+from probe_kit.models.statistics_choice import chosen_name
 
-DEFAULTS = ("bridge_dataset", "oxe_bridge")
-"""The data set of the WidowX arm that Act2Answer imitates, as releases call it."""
 _GRIPPER, _OPEN = 6, 0.5
 
 
@@ -30,8 +28,10 @@ class ActionUnits:
     mask: NDArray[np.bool_]
 
     @classmethod
-    def choose(cls, statistics: Mapping[str, Any], key: str | None) -> "ActionUnits":
-        """Those of data set `key`; without one, of the WidowX arm's, or of the only data set there is.
+    def choose(
+        cls, statistics: Mapping[str, Any], key: str | None, place: str = "the checkpoint"
+    ) -> "ActionUnits":
+        """Those of data set `key`; without one, of the only data set there is. place: what holds them.
 
         Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
         """
@@ -40,14 +40,7 @@ class ActionUnits:
                 "the checkpoint has no dataset_statistics.json: its actions have no physical unit. "
                 "Take the file that the run was released with"
             )
-        known = [name for name in DEFAULTS if name in statistics]
-        only = next(iter(statistics)) if len(statistics) == 1 else DEFAULTS[0]
-        chosen = key or (known[0] if known else only)
-        if chosen not in statistics:
-            near = get_close_matches(chosen, statistics, n=1)
-            hint = f" Did you mean {near[0]}?" if near else ""
-            names = ", ".join(sorted(statistics))
-            raise UsageError(f"no action statistics of {chosen!r}; choose -M unnorm_key among {names}.{hint}")
+        chosen = chosen_name(statistics, key, "unnorm_key", place)
         return cls.of(chosen, statistics[chosen].get("action") or {})
 
     @classmethod

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.internvla.adapter import InternVLA, load_internvla
+from probe_kit.hooks.families.internvla.checkpoint import find_parts
 from probe_kit.hooks.families.internvla.units import ActionUnits
 from probe_kit.hooks.families.shared.module_outputs import numpy_of, outputs_of, stacked
 from probe_kit.hooks.verification.verify import Comparison, Produce, compare
@@ -36,7 +37,9 @@ def verify_internvla(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
     """
     steps = len(recorded["ddim_timestep_map"]) if "ddim_timestep_map" in recorded else 10
     guidance = float(recorded["cfg_scale"]) if "cfg_scale" in recorded else 1.5
-    policy = load_internvla(str(folder / "checkpoint"), dtype="float32", steps=steps, guidance=guidance)
+    place = str(folder / "checkpoint")
+    units = next(iter(find_parts(place, None, unread=True).statistics()), None)  # nothing compared depends on them
+    policy = load_internvla(place, dtype="float32", steps=steps, guidance=guidance, unnorm_key=units)
     inputs, pixels = _inputs(policy, recorded), _pixels(policy, recorded)
     network = policy.network
     modules = {

@@ -18,11 +18,13 @@ FAMILIES = (
         notes="MIT, Llama 3 licence; extra magma; about 18 GB in bfloat16",
         verifier="probe_kit.hooks.families.magma.verify:verify_magma",
         words="probe_kit.hooks.families.magma.adapter:check_magma_words",
+        units="probe_kit.hooks.families.magma.adapter:magma_units",
+        of_default={"unnorm_key": "bridge_orig"},
         declared={"": (backbone(33, 4096, 320, "separator"), chosen_tokens("action", 33, 4096, 7))},
         full_size="probe_kit.models.magma:full_size_magma",
         options=(
-            Option("unnorm_key", str, "Data set whose units the actions get.", "bridge_orig"),
-            Option("statistics", str, "File with action statistics, above ours and the checkpoint's.", "none"),
+            Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
+            Option("statistics", str, "File with action statistics, instead of the checkpoint's.", "none"),
             Option("shrink", int, "Side to which pictures are shrunk first; 0: whole, at any resolution.", "256"),
             Option(
                 "prompt",

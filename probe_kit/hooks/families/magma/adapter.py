@@ -5,7 +5,7 @@ assistant's turn. Seven tokens follow, one per dimension, then the end of the tu
 `action` is the position that chooses the k-th. Asked a question, the same seven steps begin the answer.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +26,12 @@ from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.magma.answer import Answer
-from probe_kit.hooks.families.magma.checkpoint import LoadedMagma, load_checkpoint
+from probe_kit.hooks.families.magma.checkpoint import (
+    LoadedMagma,
+    load_checkpoint,
+    magma_key,
+    magma_statistics,
+)
 from probe_kit.hooks.families.magma.text import ChatText, TokenPrompt
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
@@ -66,7 +71,7 @@ class Magma(Policy, AnswerModel):
     def __init__(
         self,
         loaded: LoadedMagma,
-        statistics: ActionStatistics,
+        statistics: ActionStatistics | str,
         *,
         shrink: int = _SHRINK,
         prompt: str = "magma",
@@ -74,8 +79,9 @@ class Magma(Policy, AnswerModel):
         tokenizer: str | None = None,
         steps: int = STEPS,
     ) -> None:
+        """statistics: of the data set whose units the actions get, or why there are none: it answers without."""
         self.loaded, self.network, self.config = loaded, loaded.network, loaded.config
-        self.statistics, self.shrink, self.order, self.temperature = statistics, shrink, prompt, temperature
+        self._units, self.shrink, self.order, self.temperature = statistics, shrink, prompt, temperature
         self.steps = steps
         self.top = top_of(CHECKPOINT, (loaded.folder,)) if temperature else TOP
         self._text_folder = loaded.folder if tokenizer is None else Path(tokenizer).expanduser()
@@ -98,7 +104,12 @@ class Magma(Policy, AnswerModel):
         self.card = self._card({"tokenizer": tokenizer or "the checkpoint's", "layer_scale": loaded.layer_scale})
 
     def _card(self, options: dict[str, str]) -> ModelCard:
-        loaded, statistics = self.loaded, self.statistics
+        loaded, units = self.loaded, self._units
+        if isinstance(units, str):
+            key, numbers, note, whose = "none", "none", f"cannot act: {units}", ""
+        else:
+            key, numbers, whose = units.key, units.sha256, f", units of {units.key}"
+            note = f"actions in the units and at the rate of {key}"
         files = side_files(loaded.folder)
         if self._text_folder != loaded.folder and self._text_folder.is_dir():
             files |= side_files(self._text_folder, "tokenizer/")
@@ -113,20 +124,20 @@ class Magma(Policy, AnswerModel):
             parameters=loaded.audit.parameters,
             dtype=loaded.dtype,
             device=loaded.device,
-            embodiment=f"7-DoF end-effector delta, one third-person camera, units of {statistics.key}",
+            embodiment=f"7-DoF end-effector delta, one third-person camera{whose}",
             cameras=(CAMERA,),
             chunk=1,
             execute=1,
             notes=(
                 *loaded.notes,
-                f"actions in the units and at the rate of {statistics.key}",
+                note,
                 f"pictures: {side}; tokens: {how}",
             ),
             audit=loaded.audit.to_json(),
             settings={
                 **content_hashes(files),
-                "unnorm_key": statistics.key,
-                "action_statistics": statistics.sha256,
+                "unnorm_key": key,
+                "action_statistics": numbers,
                 "prompt": self.order,
                 "question": ACTION_QUESTION,
                 "shrink": str(self.shrink),
@@ -196,8 +207,17 @@ class Magma(Policy, AnswerModel):
             actions[row] = [0] * (STEPS - 1) + [seen[row].state[-1] > _GRIPPER_OPEN]
         return actions[:, None].astype(np.float32)
 
+    @property
+    def statistics(self) -> ActionStatistics:
+        """What gives actions their units. Raises UsageError where none were chosen."""
+        if isinstance(self._units, str):
+            raise UsageError(self._units)
+        return self._units
+
     def embodiment_mismatch(self) -> str | None:
-        """Other actions than an end-effector delta."""
+        """No chosen units, or other actions than an end-effector delta."""
+        if isinstance(self._units, str):
+            return self._units
         if len(self.statistics.low) == self.steps == STEPS:
             return None
         return (
@@ -361,6 +381,22 @@ def check_magma_words(
         text.prompt(ACTION_QUESTION.format(instruction=instruction))
 
 
+def magma_units(checkpoint: str, *, unnorm_key: str | None = None, statistics: str | None = None, **_: Any) -> str:
+    """See `Family.units`; without a choice, why there are none: a Magma may be asked, and not act."""
+    known, place = magma_statistics(checkpoint_folder(checkpoint, SMALL_FILES), statistics)
+    units = _units(known, place, unnorm_key)
+    return f"none: {units}" if isinstance(units, str) else f"{units.key}, from {place}"
+
+
+def _units(statistics: Mapping[str, Any], place: str, key: str | None) -> ActionStatistics | str:
+    try:
+        return ActionStatistics.choose(statistics, magma_key(statistics, place, key), place)
+    except UsageError as error:
+        if key is not None:
+            raise
+        return str(error)
+
+
 def load_magma(
     checkpoint: str | None = None,
     device: str = "cpu",
@@ -379,8 +415,9 @@ def load_magma(
 ) -> Magma:
     """Load Magma or one of its fine-tunes, from a folder or hub id.
 
-    unnorm_key: data set whose units the actions get; default bridge_orig. statistics: file with action
-    statistics. shrink: side to which pictures are shrunk first, 0 for whole pictures. prompt: `magma`, or
+    unnorm_key: data set whose units the actions get; default the only one of the checkpoint's file, without which
+    it answers and does not act. statistics: file with action statistics. shrink: side to which pictures are shrunk
+    first, 0 for whole pictures. prompt: `magma`, or
     `act2answer` for the order of turns of that release. temperature: 0 for the likeliest token. tokenizer: folder
     of another tokenizer. layer_scale: see `load_checkpoint`. steps: tokens per
     inference, for comparisons with other than seven; only seven are an action.
@@ -406,7 +443,7 @@ def load_magma(
     )
     return Magma(
         loaded,
-        ActionStatistics.choose(loaded.statistics, unnorm_key),
+        _units(loaded.statistics, loaded.statistics_place, unnorm_key),
         shrink=shrink,
         prompt=prompt,
         temperature=temperature,

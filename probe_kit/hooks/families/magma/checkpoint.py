@@ -1,6 +1,5 @@
 """Loading of Magma checkpoints, with every layer scale from the file, and of random weights."""
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,13 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from probe_kit.errors import CheckpointError, WeightsError
+from probe_kit.errors import UsageError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.magma import UNUSED_WEIGHTS, MagmaConfig, MagmaNetwork, build_magma, shipped_statistics
+from probe_kit.models.statistics_choice import STATISTICS_FILE, chosen_name, read_statistics, stored_statistics
 
-STATISTICS_FILE = "dataset_statistics.json"
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _BLOCK = re.compile(r"(?P<block>vision_tower\..*\.blocks\.\d+)\.(?P<name>gamma|weight)")
 
@@ -26,7 +25,8 @@ class LoadedMagma:
     """A loaded network and what belongs to it.
 
     checkpoint: as asked for. folder: where its other files lie. statistics: per data set, what un-normalises its
-    actions. dtype: of the weights, as the card says it. weights_seed: of a random twin. layer_scale: under which
+    actions. statistics_place: what holds them.
+    dtype: of the weights, as the card says it. weights_seed: of a random twin. layer_scale: under which
     name the file holds the layer scales, `gamma` or `weight`.
     """
 
@@ -35,6 +35,7 @@ class LoadedMagma:
     config: MagmaConfig
     folder: Path
     statistics: Mapping[str, Any]
+    statistics_place: str
     audit: WeightsAudit
     dtype: str
     device: str
@@ -56,7 +57,7 @@ def load_checkpoint(
     """Load a folder or hub id.
 
     dtype: float32 or bfloat16; default what the checkpoint says. statistics: a file with action statistics,
-    above the checkpoint's own and ours. layer_scale: `gamma` refuses a file that names them otherwise; None and
+    instead of the checkpoint's own. layer_scale: `gamma` refuses a file that names them otherwise; None and
     `weight` accept both names.
     Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
     """
@@ -70,12 +71,14 @@ def load_checkpoint(
     else:
         network, audit, notes, named = _stored(config, folder, _DTYPES[name], layer_scale)
     network.requires_grad_(False)
+    known, place = magma_statistics(folder, statistics)
     return LoadedMagma(
         checkpoint=checkpoint,
         network=network.to(device),
         config=config,
         folder=folder,
-        statistics=_statistics(folder, statistics),
+        statistics=known,
+        statistics_place=place,
         audit=audit,
         dtype=name,
         device=device,
@@ -156,20 +159,28 @@ def _check_trained(tensors: Mapping[str, Tensor], source: str) -> None:
         )
 
 
-def _statistics(folder: Path, chosen: str | None) -> dict[str, Any]:
-    """Ours, above them those beside the weights, above them those of the file that was asked for."""
-    found = shipped_statistics()
-    if (folder / STATISTICS_FILE).is_file():
-        found |= _read_statistics(folder / STATISTICS_FILE)
+PACKAGED = "the package (its statistics.json says whence)"
+
+
+def magma_statistics(folder: Path, chosen: str | None) -> tuple[Mapping[str, Any], str]:
+    """Those of the file that was asked for, of the checkpoint, or of the package, and what holds them.
+
+    The released checkpoint has none: the evaluation client holds them. Raises CheckpointError for a bad file.
+    """
     if chosen is not None:
-        found |= _read_statistics(Path(chosen).expanduser())
-    return found
+        return read_statistics(Path(chosen).expanduser()), chosen
+    return stored_statistics((folder,), shipped_statistics(), PACKAGED)
 
 
-def _read_statistics(file: Path) -> dict[str, Any]:
-    """Per data set `{"action": {"q01": …, "q99": …, "mask": …}}`; `action` may be left out."""
-    if not file.is_file():
-        raise CheckpointError(f"the file of action statistics {file} does not exist")
-    values = json.loads(file.read_text(encoding="utf-8"))
-    entries = values.get("norm_stats", values)
-    return {key: entry if "action" in entry else {"action": entry} for key, entry in entries.items()}
+def magma_key(statistics: Mapping[str, Any], place: str, key: str | None) -> str:
+    """The data set whose units the actions get. Raises UsageError where it has to be chosen.
+
+    The packaged statistics are of one data set, with which a checkpoint without a file may have nothing to do.
+    """
+    if key is None and place == PACKAGED:
+        raise UsageError(
+            f"the checkpoint has no {STATISTICS_FILE}: nothing says whose units its actions get. Put that file "
+            f"into its folder, name one with -M statistics=FILE, or choose -M unnorm_key={', '.join(statistics)} "
+            "of the package"
+        )
+    return chosen_name(statistics, key, "unnorm_key", place)

@@ -32,6 +32,7 @@ from probe_kit.hooks.families.molmoact2.packing import PackedRow, Packing, padde
 from probe_kit.hooks.families.molmoact2.steps import STEPS, in_packed_order, read_steps
 from probe_kit.hooks.families.molmoact2.units import SteppedUnits
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights, shares
+from probe_kit.hooks.families.shared.lerobot.config_fields import Inert
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
@@ -39,6 +40,8 @@ from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, LerobotPolicy
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.prompt_kv import kv_tap
 from probe_kit.models.lerobot.molmoact2 import build_molmoact2, flow_actions, network_config, uses_cuda_graphs
+
+_PRECISION = "dtype"
 
 
 class ExpertStack(Stack):
@@ -69,6 +72,10 @@ class MolmoAct2(LerobotPolicy):
 
     family = "molmoact2"
     config_type = "molmoact2"
+    newer_fields: ClassVar[Inert] = {
+        "norm_stats_path": (None,),
+        **dict.fromkeys(("train_mode_vlm", "compile_model", "llm_residual_dropout")),
+    }
     known_steps = STEPS
     interventions = LAYERWISE
     draws_noise = True
@@ -87,14 +94,26 @@ class MolmoAct2(LerobotPolicy):
     # -- loading -----------------------------------------------------------------------------------------
 
     @classmethod
+    def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
+        """A newer lerobot calls the precision of the weights `dtype`. Raises CheckpointError for two of them."""
+        found = {name: value for name, value in values.items() if name != _PRECISION}
+        if (newer := values.get(_PRECISION)) is None:
+            return found
+        if found.setdefault("model_dtype", newer) != newer:
+            raise CheckpointError(
+                f"{path} says model_dtype: {found['model_dtype']!r} and dtype: {newer!r}. Keep the one that its "
+                "weights were trained in"
+            )
+        return found
+
+    @classmethod
     def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
         """lerobot's configuration, with what the processor files say: lerobot packs as they do."""
         config = super().parse_config(folder, evaluation)
-        if config.type == cls.config_type:
-            config.steps = read_steps(folder, config)
-            for name, value in config.steps.packing.items():
-                setattr(config, name, value)
-            config.input_features = in_packed_order(config, folder)
+        config.steps = read_steps(folder, config)
+        for name, value in config.steps.packing.items():
+            setattr(config, name, value)
+        config.input_features = in_packed_order(config, folder)
         return config
 
     @classmethod

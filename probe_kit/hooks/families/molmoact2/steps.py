@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.families.molmoact2.units import SAME_FRAME, JointFrame
-from probe_kit.hooks.families.shared.lerobot.pipelines import every_step
+from probe_kit.hooks.families.shared.lerobot.pipelines import MASKED, every_step
 from probe_kit.hooks.families.shared.lerobot.policy import STATE
 
-MASKED = ("molmoact2_masked_normalizer", "molmoact2_masked_unnormalizer")
 _PACK, _CLAMP_STATE, _CLAMP_ACTION = (
     "molmoact2_pack_inputs",
     "molmoact2_clamp_normalized",
@@ -26,6 +25,12 @@ _PACKED = (
     "num_state_tokens", "max_sequence_length",
 )  # fmt: skip
 """Fields of the configuration that the packing step has too."""
+_SAME = {
+    "checkpoint_path": "checkpoint_path",
+    "chunk_size": "chunk_size",
+    "max_action_dim": "expected_max_action_dim",
+}
+"""Fields of the packing step that are read from the configuration, under its name."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +52,23 @@ class MolmoAct2Steps:
 def read_steps(folder: Path, config: Any) -> MolmoAct2Steps:
     """The saved steps; without a packing step, those that lerobot makes of the configuration.
 
-    Raises CheckpointError for frames that are none.
+    Raises CheckpointError for frames that are none, and for a packing step of another configuration.
     """
     saved = {step.name: step.config for step in every_step(folder)}
     if _PACK not in saved:
         own = _frame(vars(config), folder)
         return MolmoAct2Steps({}, own, own, clamps_state=True, clamps_action=True, unclamped=None)
+    own_fields = saved[_PACK]
+    wrong = [
+        f"{name}: {own_fields[name]!r} ({theirs}: {getattr(config, theirs)!r})"
+        for name, theirs in _SAME.items()
+        if own_fields.get(name) not in (None, getattr(config, theirs))
+    ]
+    if wrong:
+        raise CheckpointError(
+            f"{folder} packs with {', '.join(wrong)}: in brackets what config.json says. Save the two files "
+            "together"
+        )
     state_frame, action_frame = (_frame(saved.get(name, {}), folder) for name in _FRAMES)
     scaled = (saved.get(_CLAMP_STATE, {}).get("normalization_masks") or {}).get(STATE, [])
     return MolmoAct2Steps(

@@ -39,10 +39,12 @@ FAMILIES = (
         config_types=("openvla", "prismatic"),
         source="prismatic",
         words="probe_kit.hooks.families.openvla.adapter:check_openvla_words",
+        units="probe_kit.hooks.families.openvla.adapter:openvla_units",
+        of_default={"unnorm_key": BRIDGE},
         declared={"": (backbone(33, 4096, 275), chosen_tokens("action", 33, 4096, 7))},
         full_size="probe_kit.models.prismatic:full_size_openvla",
         options=(
-            Option("unnorm_key", str, "Data set whose units the actions get.", "bridge_orig, or the only one"),
+            Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
             Option(
                 "prompt",
                 str,

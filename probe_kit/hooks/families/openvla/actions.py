@@ -2,16 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.errors import CheckpointError
 from probe_kit.hashing import sha256_json
-from probe_kit.hooks.families.openvla import BRIDGE
 from probe_kit.models.bounds import check_bounds
+from probe_kit.models.statistics_choice import chosen_name
 
 
 @dataclass(frozen=True)
@@ -54,8 +53,10 @@ class ActionStatistics:
     sha256: str
 
     @classmethod
-    def choose(cls, statistics: Mapping[str, Any], key: str | None) -> "ActionStatistics":
-        """Those of data set `key`; without one, of bridge_orig, or of the only data set there is.
+    def choose(
+        cls, statistics: Mapping[str, Any], key: str | None, place: str = "the checkpoint"
+    ) -> "ActionStatistics":
+        """Those of data set `key`; without one, of the only data set there is. place: what holds them.
 
         Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
         """
@@ -64,13 +65,7 @@ class ActionStatistics:
                 "the checkpoint has no norm_stats in its config.json and no dataset_statistics.json: its actions "
                 "have no physical unit. Take the statistics of the data set it was trained on"
             )
-        only = next(iter(statistics)) if len(statistics) == 1 else BRIDGE
-        chosen = key or (BRIDGE if BRIDGE in statistics else only)
-        if chosen not in statistics:
-            near = get_close_matches(chosen, statistics, n=1)
-            hint = f" Did you mean {near[0]}?" if near else ""
-            known = ", ".join(sorted(statistics))
-            raise UsageError(f"no action statistics of {chosen!r}; choose -M unnorm_key among {known}.{hint}")
+        chosen = chosen_name(statistics, key, "unnorm_key", place)
         return cls._read(chosen, statistics[chosen])
 
     @classmethod

@@ -21,7 +21,12 @@ from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
 from probe_kit.hooks.families.prismatic.adapter import PrismaticModel
-from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, checkpoint_folders, load_checkpoint
+from probe_kit.hooks.families.prismatic.checkpoint import (
+    LoadedPrismatic,
+    checkpoint_folders,
+    load_checkpoint,
+    prismatic_statistics,
+)
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES, find_tokenizer
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import TOKENS
@@ -198,7 +203,7 @@ def load_openvla(
 ) -> OpenVLA:
     """Load OpenVLA, one of its fine-tunes, or a LoRA adapter that names its base, from a folder or hub id.
 
-    unnorm_key: data set whose units the actions get; default bridge_orig, or the only one there is.
+    unnorm_key: data set whose units the actions get; default the only one there is.
     prompt: `openvla`, `openvla-v01` or a template with {instruction}; default the one of the checkpoint's
     generation. centre_crop: show the middle 0.9 of the picture's area, as fine-tunes with augmentation expect.
     tokenizer: folder of another tokenizer, or `bytes`. bits: 8 or 4 for a quantised language model.
@@ -210,10 +215,17 @@ def load_openvla(
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
     if loaded.config.model_type != "openvla":
         raise CheckpointError(f"{checkpoint} is a Prismatic model without actions; pass --model prismatic")
-    statistics = ActionStatistics.choose(loaded.statistics, unnorm_key)
+    statistics = ActionStatistics.choose(loaded.statistics, unnorm_key, loaded.statistics_place)
     template = _template(prompt, loaded.config)
     top = top_of(top_k, loaded.folders)
     return OpenVLA(loaded, statistics, template, centre_crop, tokenizer, temperature, resize, top)
+
+
+def openvla_units(checkpoint: str, *, unnorm_key: str | None = None, **_: Any) -> str:
+    """See `Family.units`."""
+    folders = checkpoint_folders(checkpoint, SMALL_FILES)
+    known, place = prismatic_statistics(PrismaticConfig.from_folder(folders[-1]), folders)
+    return f"{ActionStatistics.choose(known, unnorm_key, place).key}, from {place}"
 
 
 def check_openvla_words(

@@ -20,7 +20,7 @@ def verify_openvla(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
     checkpoint = folder / "checkpoint"
     known = PrismaticConfig.from_folder(checkpoint).statistics
     keys = [key for key in known if _ACTION + key in recorded]
-    policy = load_openvla(str(checkpoint), unnorm_key=next(iter(keys), None))
+    policy = load_openvla(str(checkpoint), unnorm_key=next(iter(keys or known), None))
     reference = Reference(policy, recorded, _prompt(policy, recorded))
     inputs = INPUTS if _WITHOUT_EMPTY in recorded else {*INPUTS, "input_ids"}
     return compare_outputs(policy, recorded, reference.produced() | _actions(policy, reference, keys), inputs)

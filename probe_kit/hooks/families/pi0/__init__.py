@@ -76,7 +76,7 @@ FAMILIES = (
         full_size="probe_kit.models.lerobot.pi0:full_size_pi0",
         options=(
             *EVALUATION_OPTIONS,
-            Option("unread", str, "Settings of an old config.json that change nothing, comma-separated.", "none"),
+            Option("unread", str, "Settings of config.json that change nothing, comma-separated.", "none"),
         ),
         protocols={
             ACT2ANSWER: ProtocolRow(

@@ -30,6 +30,7 @@ class Pi0(PaliGemmaPolicy, EvaluatedPi0):
 
     family = "pi0"
     config_type = "pi0"
+    takes_unread = True
     known_steps: ClassVar[tuple[str, ...]] = (CROP, "pi0_new_line_processor")
     unread = tuple(f"model.paligemma_with_expert.{part}.lm_head.weight" for part in ("paligemma", "gemma_expert"))
 

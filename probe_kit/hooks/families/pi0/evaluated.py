@@ -1,15 +1,12 @@
 """pi0's evaluation: settings of older files, units, pictures and states that no checkpoint file contains."""
 
 import json
-import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from lerobot.policies.pi0.configuration_pi0 import PI0Config
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -17,7 +14,7 @@ from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS, laid_out
 from probe_kit.hooks.families.pi0.old_layout import current_config, is_old_layout
-from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
+from probe_kit.hooks.families.shared.lerobot.evaluation import Picture
 from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser, Units
 from probe_kit.hooks.families.shared.lerobot.policy import STATE
@@ -32,16 +29,9 @@ class EvaluatedPi0(LerobotFlow):
     """What `Evaluation` decides of a pi0, and what follows where it decides nothing."""
 
     @classmethod
-    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+    def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
         """Also of lerobot's older layout."""
-        values = json.loads((folder / CONFIG_FILE).read_text(encoding="utf-8"))
-        if not is_old_layout(values):
-            return super().parse_config(folder, evaluation)
-        known = [field.name for field in fields(PI0Config)]
-        current = current_config(values, known, str(folder / CONFIG_FILE), evaluation.unread)
-        with tempfile.TemporaryDirectory() as place:
-            (Path(place) / CONFIG_FILE).write_text(json.dumps(current), encoding="utf-8")
-            return super().parse_config(Path(place), evaluation)
+        return current_config(values, str(path)) if is_old_layout(values) else values
 
     def further_settings(self) -> dict[str, str]:
         """What the evaluation decides, as far as it decides anything."""

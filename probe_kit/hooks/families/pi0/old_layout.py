@@ -4,7 +4,7 @@ That lerobot kept statistics among the weights or left them to the evaluation; i
 top.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from probe_kit.errors import CheckpointError
@@ -23,15 +23,10 @@ def is_old_layout(config: Mapping[str, Any]) -> bool:
     return any(name in config for name in _MARKS)
 
 
-def current_config(
-    config: Mapping[str, Any], known: Sequence[str], source: str, unread: Sequence[str] = ()
-) -> dict[str, Any]:
-    """The same settings under today's names.
+def current_config(config: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """The same settings under today's names. source: where the config lies, for messages.
 
-    known: fields that lerobot reads today. source: where the config lies, for messages. unread: fields that are
-    left out because the caller says that they change nothing.
-    Raises CheckpointError for a setting that is no longer supported, and for an unknown field: it may
-    change the numbers.
+    Raises CheckpointError for a setting that is no longer supported.
     """
     wrong = {name: config[name] for name, value in _FIXED.items() if config.get(name, value) != value}
     if wrong:
@@ -39,13 +34,8 @@ def current_config(
             f"{source} asks for {', '.join(f'{name}={value}' for name, value in wrong.items())}, which changes "
             "states and actions and is not supported; use a checkpoint without it"
         )
-    dropped = {*_WITHOUT_EFFECT, *_FIXED, *unread}
+    dropped = {*_WITHOUT_EFFECT, *_FIXED}
     found = {_RENAMED.get(name, name): value for name, value in config.items() if name not in dropped}
     if found.get("image_resolution", True) is None:
         del found["image_resolution"]  # pictures as they are given; they are given at today's default
-    if unknown := sorted(set(found) - {*known, "type"}):
-        raise CheckpointError(
-            f"{source} has unknown settings: {', '.join(unknown)}. If they change nothing that a "
-            f"picture, a state or an action depends on, accept them with -M unread={','.join(unknown)}"
-        )
     return found

@@ -7,13 +7,14 @@ Source: arXiv 2504.16054, through lerobot's `PI05Policy`.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor, nn
 
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.hooks.families.shared.lerobot.config_fields import Inert
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
@@ -38,6 +39,13 @@ class Pi05(StatePrompt, Pi0):
 
     family = "pi05"
     config_type = "pi05"
+    takes_unread = False
+    newer_fields: ClassVar[Inert] = {
+        "use_visual_memory": (False,),
+        "use_proprioceptive_memory": (False,),
+        "rtc_training_max_delay": (0,),
+        **dict.fromkeys(("memory_frames", "memory_stride", "memory_temporal_attention_every")),
+    }
     known_steps = (
         CROP,
         "pi05_prepare_state_tokenizer_processor_step",

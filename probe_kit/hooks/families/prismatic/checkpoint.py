@@ -1,6 +1,5 @@
 """Loading of Prismatic and OpenVLA checkpoints: plain folders, LoRA adapters, random weights."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,15 +9,15 @@ import torch
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, WeightsError
+from probe_kit.hooks.checkpoints.adapter_files import AdapterFiles, adapter_in
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, checkpoint_folder, chosen_dtype
-from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
-from probe_kit.hooks.families.prismatic.lora import ADAPTER_CONFIG, Adapter, merge_adapter
+from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights, with_adapter
 from probe_kit.hooks.families.prismatic.quantised import check_quantisation, quantise
 from probe_kit.hooks.families.prismatic.release import read_release
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.prismatic import PrismaticConfig, PrismaticNetwork, build_prismatic
+from probe_kit.models.statistics_choice import stored_statistics
 
-STATISTICS_FILE = "dataset_statistics.json"
 FILES = (*PATTERNS, RUN_WEIGHTS)
 """What is needed of a hub repository, or of the folder of one model of it."""
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -31,7 +30,8 @@ class LoadedPrismatic:
     """A loaded network and what belongs to it.
 
     checkpoint: as asked for. folders: where its other files may lie, an adapter's own before that of its base.
-    statistics: per data set, what un-normalises its actions. dtype: of the weights, as the card says it. text: the
+    statistics: per data set, what un-normalises its actions. statistics_place: what holds them.
+    dtype: of the weights, as the card says it. text: the
     folder of a tokenizer that does not come with the checkpoint.
     """
 
@@ -40,6 +40,7 @@ class LoadedPrismatic:
     config: PrismaticConfig
     folders: tuple[Path, ...]
     statistics: Mapping[str, Any]
+    statistics_place: str
     audit: WeightsAudit
     dtype: str
     device: str
@@ -57,9 +58,8 @@ class LoadedPrismatic:
 def checkpoint_folders(checkpoint: str, files: Sequence[str] = FILES) -> tuple[Path, ...]:
     """Where the files of a checkpoint may lie: an adapter's own folder before that of its base."""
     folder = checkpoint_folder(checkpoint, files)
-    if not (folder / ADAPTER_CONFIG).is_file():
-        return (folder,)
-    return folder, Adapter.read(folder).base_folder()
+    adapter = adapter_in(folder)
+    return (folder,) if adapter is None else tuple(dict.fromkeys((folder, adapter.base_folder())))
 
 
 def load_checkpoint(
@@ -78,7 +78,7 @@ def load_checkpoint(
     if bits is not None:
         check_quantisation(bits, device)
     folder = checkpoint_folder(checkpoint, FILES)
-    adapter = Adapter.read(folder) if (folder / ADAPTER_CONFIG).is_file() else None
+    adapter = adapter_in(folder)
     base = folder if adapter is None else adapter.base_folder()
     _check_other_heads((folder, base))
     config = PrismaticConfig.from_folder(base)
@@ -88,17 +88,19 @@ def load_checkpoint(
     else:
         network, audit = _stored(config, base, _DTYPES[name], adapter)
     network.requires_grad_(False)
-    notes: tuple[str, ...] = () if adapter is None else (f"LoRA adapter merged into {base}",)
+    notes: tuple[str, ...] = (audit.adapter,) if audit.adapter else ()
     if bits is not None:
         quantise(network, bits)
         notes += (f"not exact: language model in {bits} bits",)
     folders = tuple(dict.fromkeys((folder, base)))
+    statistics, place = prismatic_statistics(config, folders)
     return LoadedPrismatic(
         checkpoint=checkpoint,
         network=network.to(device),
         config=config,
         folders=folders,
-        statistics=_statistics(config, folders),
+        statistics=statistics,
+        statistics_place=place,
         audit=audit,
         dtype=name if bits is None else f"{name}, {bits}-bit",
         device=device,
@@ -128,22 +130,19 @@ def _random(
 
 
 def _stored(
-    config: PrismaticConfig, folder: Path, dtype: torch.dtype, adapter: Adapter | None
+    config: PrismaticConfig, folder: Path, dtype: torch.dtype, adapter: AdapterFiles | None
 ) -> tuple[PrismaticNetwork, WeightsAudit]:
     released = folder / RUN_WEIGHTS
     weights = read_release(released, config) if released.is_file() else read_weights(folder)
+    if adapter is not None and weights.adapter is None:
+        weights = with_adapter(weights, adapter)
     network = build_prismatic(config, dtype)
     tied = {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else set()
-    named = weights if adapter is None else Weights(
-        {**weights.tensors, **adapter.tensors}, f"{folder} and {adapter.folder}", weights.random
-    )  # fmt: skip
-    audit = load_weights(network, named, _as_dtype(weights.tensors, dtype), tied, assign=True)
+    audit = load_weights(network, weights, _as_dtype(weights.tensors, dtype), tied, assign=True)
     if tied:
         network.language_model.tie_weights()
     if empty := [name for name, tensor in network.state_dict().items() if tensor.is_meta]:
         raise WeightsError(f"weights in {folder}: {len(empty)} tensors were never filled: {', '.join(empty[:8])}")
-    if adapter is not None:
-        merge_adapter(network, adapter)
     return network, audit
 
 
@@ -151,10 +150,6 @@ def _as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Te
     return {name: t.to(dtype) if t.is_floating_point() else t for name, t in tensors.items()}
 
 
-def _statistics(config: PrismaticConfig, folders: tuple[Path, ...]) -> dict[str, Any]:
-    """Those of the config, and above them what fine-tuning wrote beside the weights."""
-    found = dict(config.statistics)
-    for folder in reversed(folders):
-        if (folder / STATISTICS_FILE).is_file():
-            found |= json.loads((folder / STATISTICS_FILE).read_text(encoding="utf-8"))
-    return found
+def prismatic_statistics(config: PrismaticConfig, folders: tuple[Path, ...]) -> tuple[Mapping[str, Any], str]:
+    """What fine-tuning wrote beside the weights, or else those of the base's config; see `stored_statistics`."""
+    return stored_statistics(folders, config.statistics, f"config.json in {folders[-1]}")

@@ -46,7 +46,7 @@ def fill[Network: nn.Module](
     }
     if len(tensors) < len(weights.tensors):
         raise WeightsError(f"{weights.source}: two tensors have the same name here; nothing was run")
-    audit = load_weights(network, weights, tensors, tied(network), assign=True)
+    audit = load_weights(network, weights, tensors, tied(network), assign=True, named=named)
     tie: Any = getattr(network, "vlm", network)
     tie.tie_weights()
     for double in set(tied(network)) & set(tensors):

@@ -18,12 +18,12 @@ FAMILIES = (
         notes="MIT, Gemma licence; weights 8.1 GB in bfloat16; also …-mix-224-pt, …-sft-bridge, …-sft-fractal",
         verifier="probe_kit.hooks.families.spatialvla.verify:verify_spatialvla",
         words="probe_kit.hooks.families.spatialvla.adapter:check_spatialvla_words",
+        units="probe_kit.hooks.families.spatialvla.adapter:spatialvla_units",
+        of_default={"unnorm_key": "bridge_orig/1.0.0"},
         declared={"": (backbone(27, 2304, 269), chosen_tokens("action", 27, 2304, 3))},
         full_size="probe_kit.models.spatialvla:full_size_spatialvla",
         options=(
-            Option(
-                "unnorm_key", str, "Data set whose units the actions get.", "bridge_orig/1.0.0, or the only one"
-            ),
+            Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
             Option("prompt", str, "bare, question or a template with {instruction}.", "bare"),
             Option("lowercase", bool, "Instruction in lower case, as in training.", "true"),
             Option("camera", str, "scene, or a data set of the checkpoint whose camera is taken for it.", "scene"),

@@ -6,7 +6,7 @@ action token: the new line, then every token fed back but the last. Three tokens
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
@@ -32,7 +32,12 @@ from probe_kit.hooks.families.prismatic.tokenizer import BYTES
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import TOKENS
 from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, kv_tap
-from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
+from probe_kit.hooks.families.spatialvla.checkpoint import (
+    PROCESSOR_FILE,
+    LoadedSpatialVLA,
+    load_checkpoint,
+    read_processor,
+)
 from probe_kit.hooks.families.spatialvla.speech import Speech
 from probe_kit.models.packing import Packed
 from probe_kit.models.spatialvla import (
@@ -45,10 +50,10 @@ from probe_kit.models.spatialvla import (
     known_cameras,
     prepare_picture,
 )
+from probe_kit.models.statistics_choice import stored_statistics
 
 CAMERA = "primary"
 DEFAULT_CHECKPOINT = "IPEC-COMMUNITY/spatialvla-4b-224-pt"
-BRIDGE = "bridge_orig/1.0.0"
 """The data set of the WidowX arm that Act2Answer imitates."""
 SCENE = "scene"
 """Asks for the camera of the observation."""
@@ -367,7 +372,7 @@ def load_spatialvla(
 ) -> SpatialVLA:
     """Load SpatialVLA or one of its fine-tunes from a folder or hub id.
 
-    unnorm_key: data set whose units the actions get; default bridge_orig/1.0.0, or the only one there is. prompt:
+    unnorm_key: data set whose units the actions get; default the only one there is. prompt:
     `bare`, `question` or a template with {instruction}. lowercase: the instruction as in training. camera: `scene`
     for the observation's intrinsics, or a data set of the checkpoint whose camera is taken for the scene's.
     iterations: capture the tokens of the first `step` or of the whole `chunk`. constrained: choose every token
@@ -391,21 +396,35 @@ def load_spatialvla(
     )
 
 
+def spatialvla_units(checkpoint: str, *, unnorm_key: str | None = None, **_: Any) -> str:
+    """See `Family.units`."""
+    folder = checkpoint_folder(checkpoint, SMALL_FILES)
+    known, place = _statistics(folder, read_processor(folder))
+    return f"{ActionStatistics.choose(known, unnorm_key, place).key}, from {place}"
+
+
 def choose_statistics(loaded: LoadedSpatialVLA, key: str | None) -> ActionStatistics:
-    """Those of data set `key`; without one, of bridge_orig/1.0.0, or of the only data set there is.
+    """Those of data set `key`; without one, of the only data set there is.
 
     Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
     """
-    known = loaded.processor.get("statistics") or {}
-    if not known:
-        raise CheckpointError(
-            f"{loaded.processor_file} has no statistics: its actions have no physical unit. Copy the file from "
-            "the model's page, or take the one that fine-tuning wrote"
-        )
-    statistics = ActionStatistics.choose(known, key or (BRIDGE if BRIDGE in known else None))
+    known, place = _statistics(loaded.folder, loaded.processor)
+    statistics = ActionStatistics.choose(known, key, place)
     if len(statistics.low) != 7:
         raise CheckpointError(
             f"{statistics.key} has actions of {len(statistics.low)} dimensions; SpatialVLA's tokens name 7. "
             "Choose another -M unnorm_key"
         )
     return statistics
+
+
+def _statistics(folder: Path, processor: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
+    """Per data set, what un-normalises its actions, and what holds it. Raises CheckpointError for none."""
+    file = str(folder / PROCESSOR_FILE)
+    known, place = stored_statistics((folder,), processor.get("statistics") or {}, file)
+    if not known:
+        raise CheckpointError(
+            f"{file} has no statistics: its actions have no physical unit. Copy the file from the model's page, "
+            "or take the one that fine-tuning wrote"
+        )
+    return known, place

@@ -15,7 +15,6 @@ from probe_kit.models.initialisation import initialise
 from probe_kit.models.spatialvla import SpatialVLAConfig, SpatialVLANetwork, build_spatialvla
 
 PROCESSOR_FILE = "processor_config.json"
-_ADAPTER_FILE = "adapter_config.json"
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -64,13 +63,9 @@ def load_checkpoint(
     for another dtype.
     """
     folder = checkpoint_folder(checkpoint)
-    if (folder / _ADAPTER_FILE).is_file():
-        raise CheckpointError(
-            f"{folder} holds a LoRA adapter, not a SpatialVLA; merge it into its base with peft first"
-        )
     config = SpatialVLAConfig.from_folder(folder)
     name = chosen_dtype(dtype, config.dtype, _DTYPES)
-    processor = _processor(folder)
+    processor = read_processor(folder)
     if random_weights:
         network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)
     else:
@@ -89,7 +84,8 @@ def load_checkpoint(
     )
 
 
-def _processor(folder: Path) -> dict[str, Any]:
+def read_processor(folder: Path) -> dict[str, Any]:
+    """The content of `processor_config.json`. Raises CheckpointError if it is missing."""
     file = folder / PROCESSOR_FILE
     if not file.is_file():
         raise CheckpointError(

@@ -32,6 +32,8 @@ FAMILIES = (
         verifier="probe_kit.hooks.families.xiaomi.verify:verify_xiaomi",
         source="qwen3-vl",
         source_weights=SourceWeights("Qwen/Qwen3-VL-4B-Instruct", parameters=4_437_815_808),
+        units="probe_kit.hooks.families.xiaomi.adapter:xiaomi_units",
+        of_default={"robot": "bridge_delta"},
         declared={
             "": (
                 backbone(37, 2560, 125, sums=False),
@@ -40,7 +42,7 @@ FAMILIES = (
         },
         full_size="probe_kit.models.xiaomi:full_size_xiaomi",
         options=(
-            Option("robot", str, "Robot whose statistics, picture and state are used.", "bridge_delta"),
+            Option("robot", str, "Robot whose statistics, picture and state are used.", "the only one"),
             Option("steps", int, "Euler steps of the flow.", "5"),
             Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),
             Option("openness", str, "release: as Act2Answer's evaluation has it.", "measured", OPENNESS),

@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import (
+    SMALL_FILES,
+    checkpoint_folder,
+    chosen_dtype,
+    content_hashes,
+    side_files,
+)
 from probe_kit.hooks.checkpoints.weights import read_weights
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Tap
@@ -45,7 +51,7 @@ from probe_kit.models.xiaomi import (
     robot_of,
 )
 from probe_kit.models.xiaomi.network import STEPS
-from probe_kit.models.xiaomi.robots import DEFAULT_ROBOT
+from probe_kit.models.xiaomi.robots import DEFAULT_ROBOT, STATISTICS_FILE
 
 DEFAULT_CHECKPOINT = "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX"
 EXECUTE = 4
@@ -254,6 +260,16 @@ class Xiaomi(QwenVLA):
         return Tap(parts[site.quantity], self.steps, "output")
 
 
+def xiaomi_units(checkpoint: str, *, robot: str | None = None, **_: Any) -> str:
+    """See `Family.units`; a checkpoint without statistics says so, since it can be captured."""
+    folder = checkpoint_folder(checkpoint, SMALL_FILES)
+    try:
+        units = read_units(folder, robot, XiaomiConfig.from_folder(folder).action_dim)
+    except CheckpointError as error:
+        return f"none: {error}"
+    return f"{units.robot}, from {folder / STATISTICS_FILE}"
+
+
 def load_xiaomi(
     checkpoint: str | None = None,
     device: str = "cpu",
@@ -268,7 +284,7 @@ def load_xiaomi(
 ) -> Xiaomi:
     """Load Xiaomi-Robotics-R0 from a folder or hub id.
 
-    robot: of preprocessor_config.json, or how just one of its names begins; default bridge_delta or the only one.
+    robot: of preprocessor_config.json, or how just one of its names begins; default the only one.
     steps: Euler steps. tokenizer: folder of another one. openness: the state's last number, see `state_layout`.
     Raises CheckpointError, WeightsError, and UsageError for a robot or a number of steps that cannot be.
     """

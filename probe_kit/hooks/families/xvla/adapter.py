@@ -104,9 +104,9 @@ class Xvla(LerobotPolicy):
     def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
         """lerobot's configuration, with what the processor files say."""
         config = super().parse_config(folder, evaluation)
-        if config.type == cls.config_type:
-            config.steps = read_steps(folder, evaluation.domain if isinstance(evaluation, XvlaChoice) else None)
-            config.tokenizer_max_length = config.steps.length or config.tokenizer_max_length
+        domain = evaluation.domain if isinstance(evaluation, XvlaChoice) else None
+        config.steps = read_steps(folder, domain, tuple(config.image_features))
+        config.tokenizer_max_length = config.steps.length or config.tokenizer_max_length
         return config
 
     @classmethod
@@ -148,7 +148,7 @@ class Xvla(LerobotPolicy):
     @property
     def _tokenizer_folder(self) -> Path:
         named = self.steps.tokenizer or self.config.tokenizer_name
-        inside = (self.folder / "tokenizer.json").is_file()
+        inside = (self.folder / "tokenizer.json").is_file() and not Path(named).is_dir()
         return self.folder if inside else checkpoint_folder(named, SMALL_FILES)
 
     @cached_property

@@ -1,6 +1,6 @@
 """What lerobot's processor files of X-VLA say besides units: robot, tokenizer, ImageNet's mean."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
     check_steps,
     every_step,
     text_length,
+    tokenizer_folder,
 )
 
 _MEAN, _DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
@@ -33,8 +34,8 @@ class XvlaSteps:
     length: int | None
 
 
-def read_steps(folder: Path, domain: int | None) -> XvlaSteps:
-    """From the processor files; `domain` counts over theirs. Raises CheckpointError.
+def read_steps(folder: Path, domain: int | None, pictures: Sequence[str] = ()) -> XvlaSteps:
+    """From the processor files; `domain` counts over theirs. pictures: keys of all. Raises CheckpointError.
 
     lerobot takes robot 0 where nothing names one: here it is an error, and so is a step that changes numbers in
     another way.
@@ -42,10 +43,18 @@ def read_steps(folder: Path, domain: int | None) -> XvlaSteps:
     check_pipelines(folder)
     check_steps(folder, POSTPROCESSOR, (*NORMALISERS, *STEPS))
     found: dict[str, Mapping[str, Any]] = {step.name: step.config for step in every_step(folder)}
+    for name in STEPS:
+        keys = found.get(name, {}).get("image_keys")
+        if keys is not None and (others := sorted(set(pictures) - set(keys))):
+            raise CheckpointError(
+                f"{folder}: the step {name!r} leaves out {', '.join(others)} (image_keys); every picture is "
+                "treated alike here. Take a checkpoint whose image_keys are null or name all"
+            )
     if domain is None and _DOMAIN not in found:
         raise CheckpointError(f"{folder} names no robot; say whose soft prompts are read with -M domain=N")
     text, length = found.get(TOKENIZER, {}), text_length(folder)
     if text.get("padding", "max_length") != "max_length":
         raise CheckpointError(f"{folder} pads its text in another way than behind its end up to a fixed length")
+    named = str(saved) if (saved := tokenizer_folder(folder)) is not None else text.get("tokenizer_name")
     own = found.get(_DOMAIN, {}).get("domain_id", 0) if domain is None else domain
-    return XvlaSteps(int(own), _MEAN in found, text.get("tokenizer_name"), length)
+    return XvlaSteps(int(own), _MEAN in found, named, length)

@@ -28,11 +28,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def loaded(run: Path) -> InternVLA:
-    return load_internvla(str(run), steps=5)
+    return load_internvla(str(run), steps=5, unnorm_key="bridge_dataset")
 
 
 class TestInternVLA(AdapterContract):
     family = "internvla-m1"
+    options = {"unnorm_key": "bridge_dataset"}
     configuration = "config.yaml"
 
     @pytest.fixture(scope="class")
@@ -55,7 +56,7 @@ class TestConvertedInternVLA(AdapterContract):
     """One folder of safetensors, whose tensors can be damaged one by one."""
 
     family = "internvla-m1"
-    options = {"steps": 2}
+    options = {"steps": 2, "unnorm_key": "bridge_dataset"}
     unloadable_options = frozenset({"weights"})  # it has one file, and no steps
 
     @pytest.fixture(scope="class")
@@ -74,7 +75,7 @@ class TestConvertedInternVLA(AdapterContract):
 class TestInternVLAWithoutGuidance(AdapterContract):
     @pytest.fixture
     def policy(self, run: Path) -> InternVLA:
-        return load_internvla(str(run), steps=4, guidance=1.0)
+        return load_internvla(str(run), steps=4, guidance=1.0, unnorm_key="bridge_dataset")
 
 
 def test_all_that_acts_passes_through_the_end_of_the_bridge(loaded: InternVLA, observation: Observation) -> None:
@@ -156,7 +157,7 @@ def test_the_half_without_condition_is_no_default_of_anything(loaded: InternVLA)
 
 
 def test_without_guidance_there_is_no_such_half(run: Path) -> None:
-    policy = load_internvla(str(run), guidance=1.0)
+    policy = load_internvla(str(run), guidance=1.0, unnorm_key="bridge_dataset")
     assert list(policy.streams) == ["backbone", "bridge", "expert"]
 
 
@@ -200,7 +201,7 @@ def test_roles_follow_the_picture_and_the_chat(loaded: InternVLA, observation: O
 def test_a_picture_that_is_no_whole_patches_is_resized_with_pil_for_qwen_and_not_for_dino(
     tmp_path: Path, observation: Observation
 ) -> None:
-    policy = load_internvla(str(write_checkpoint(tmp_path, side=200)))
+    policy = load_internvla(str(write_checkpoint(tmp_path, side=200)), unnorm_key="bridge_dataset")
     picture = policy.look(observation)
     assert picture.shape == (200, 200, 3)
     by_hand = np.array(Image.fromarray(picture).resize((196, 196), Image.Resampling.BICUBIC))
@@ -241,7 +242,7 @@ def test_options_are_part_of_the_identity(run: Path, loaded: InternVLA) -> None:
     with pytest.raises(UsageError, match="bridge_dataset, fractal20220817_data"):
         load_internvla(str(run), unnorm_key="franka")
     with pytest.raises(UsageError, match="60 DDIM steps"):
-        load_internvla(str(run), steps=60)
+        load_internvla(str(run), steps=60, unnorm_key="bridge_dataset")
 
 
 def test_without_statistics_it_says_so_and_refuses_to_act(
@@ -249,7 +250,7 @@ def test_without_statistics_it_says_so_and_refuses_to_act(
 ) -> None:
     copy = Path(shutil.copytree(run, tmp_path / "copy"))
     (copy / "dataset_statistics.json").unlink()
-    policy = load_internvla(str(copy))
+    policy = load_internvla(str(copy), unnorm_key="bridge_dataset")
     assert "cannot act" in policy.card.notes[0]
     with pytest.raises(CheckpointError, match=r"dataset_statistics\.json"):
         policy.act([observation], [0])

@@ -60,7 +60,7 @@ def test_a_runs_configuration_may_be_json(run: Path, tmp_path: Path, observation
         find_parts(str(copy), None)
     (copy / "aside").rename(copy / "dims.json")
     (copy / "config.json").write_text(json.dumps(values), encoding="utf-8")
-    one, other = (load_internvla(str(folder), steps=5) for folder in (run, copy))
+    one, other = (load_internvla(str(folder), steps=5, unnorm_key="bridge_dataset") for folder in (run, copy))
     np.testing.assert_array_equal(one.act([observation], [3]), other.act([observation], [3]))
     assert f"weights of {NAME}" in other.card.notes
 
@@ -118,10 +118,10 @@ def test_a_file_that_would_run_code_runs_none(run: Path, tmp_path: Path) -> None
     trace = tmp_path / "trace"
     torch.save({"weight": _Harm(trace)}, copy / "checkpoints" / NAME)
     with pytest.raises(WeightsError, match="unsafe"):
-        load_internvla(str(copy))
+        load_internvla(str(copy), unnorm_key="bridge_dataset")
     (copy / "checkpoints" / NAME).write_bytes(pickle.dumps(_Harm(trace), protocol=2))
     with pytest.raises(WeightsError, match="unsafe"):
-        load_internvla(str(copy))
+        load_internvla(str(copy), unnorm_key="bridge_dataset")
     assert not trace.exists()
 
 
@@ -132,24 +132,24 @@ def test_missing_and_extra_tensors_are_named(run: Path, tmp_path: Path) -> None:
     state["dino_pro.other"] = state.pop("dino_pro.bias")
     torch.save(state, file)
     with pytest.raises(WeightsError, match=r"missing.*dino_pro\.bias"):
-        load_internvla(str(copy))
+        load_internvla(str(copy), unnorm_key="bridge_dataset")
 
 
 def test_the_stored_precision_is_kept(run: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(run, tmp_path / "run"))
     file = copy / "checkpoints" / NAME
     torch.save({name: t.to(torch.bfloat16) for name, t in torch.load(file, weights_only=True).items()}, file)
-    assert load_internvla(str(run)).card.dtype == "float32"
-    assert load_internvla(str(copy)).card.dtype == "bfloat16"
-    assert load_internvla(str(copy), dtype="float32").card.dtype == "float32"
+    assert load_internvla(str(run), unnorm_key="bridge_dataset").card.dtype == "float32"
+    assert load_internvla(str(copy), unnorm_key="bridge_dataset").card.dtype == "bfloat16"
+    assert load_internvla(str(copy), dtype="float32", unnorm_key="bridge_dataset").card.dtype == "float32"
 
 
 def test_a_converted_folder_is_whole_and_has_the_same_hash_and_actions(
     run: Path, tmp_path: Path, observation: Observation
 ) -> None:
-    original = load_internvla(str(run), steps=5)
+    original = load_internvla(str(run), steps=5, unnorm_key="bridge_dataset")
     assert convert(str(run), tmp_path / "out") == original.card.weights_sha256
-    copy = load_internvla(str(tmp_path / "out"), steps=5)
+    copy = load_internvla(str(tmp_path / "out"), steps=5, unnorm_key="bridge_dataset")
     assert copy.parts.vlm == copy.parts.place == tmp_path / "out"
     assert copy.card.weights_sha256 == original.card.weights_sha256
     np.testing.assert_array_equal(copy.act([observation], [3]), original.act([observation], [3]))

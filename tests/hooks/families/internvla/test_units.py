@@ -21,12 +21,9 @@ def test_a_masked_in_gripper_is_stretched_after_it_was_cut() -> None:
     assert units.restore(np.full((1, 7), 0.7, np.float32))[0, 6] == 1.0
 
 
-def test_the_widowx_arm_is_the_default_and_the_only_set_needs_no_name() -> None:
-    assert ActionUnits.choose(statistics(), None).key == "bridge_dataset"
-    assert (
-        ActionUnits.choose({"oxe_bridge": statistics()["bridge_dataset"]} | statistics(), None).key
-        == "bridge_dataset"
-    )
+def test_the_only_set_needs_no_name_and_several_have_to_be_chosen_from() -> None:
+    with pytest.raises(UsageError, match="with -M unnorm_key=NAME: bridge_dataset, fractal"):
+        ActionUnits.choose(statistics(), None)
     assert ActionUnits.choose({"franka": statistics()["bridge_dataset"]}, None).key == "franka"
     two = {"franka": {}, "google": {}}
     with pytest.raises(UsageError, match="franka, google"):

@@ -23,16 +23,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def loaded(folder: Path) -> Magma:
-    return load_magma(str(folder))
+    return load_magma(str(folder), unnorm_key="bridge_orig")
 
 
 @pytest.fixture(scope="module")
 def unsteered(tmp_path_factory: pytest.TempPathFactory) -> Magma:
-    return load_magma(str(write_checkpoint(tmp_path_factory.mktemp("random"), steered=False)))
+    return load_magma(
+        str(write_checkpoint(tmp_path_factory.mktemp("random"), steered=False)), unnorm_key="bridge_orig"
+    )
 
 
 class TestMagma(AdapterContract):
     family = "magma"
+    options = {"unnorm_key": "bridge_orig"}
     # They need files of their own: test_every_option_reaches_the_card below and test_checkpoint.py.
     unloadable_options = frozenset({"unnorm_key", "statistics", "layer_scale"})
 
@@ -60,7 +63,7 @@ class TestMagmaWithWholePictures(AdapterContract):
 
     @pytest.fixture
     def policy(self, folder: Path) -> Magma:
-        return load_magma(str(folder), shrink=0)
+        return load_magma(str(folder), shrink=0, unnorm_key="bridge_orig")
 
     @pytest.fixture
     def observations(self) -> list[Observation]:
@@ -72,7 +75,7 @@ class TestMagmaWithWholePictures(AdapterContract):
 class TestMagmaDrawn(AdapterContract):
     @pytest.fixture
     def policy(self, folder: Path) -> Magma:
-        return load_magma(str(folder), temperature=0.7)
+        return load_magma(str(folder), temperature=0.7, unnorm_key="bridge_orig")
 
 
 class TestMagmaAsked(AnswerModelContract):
@@ -132,7 +135,7 @@ def test_seven_action_tokens_that_the_turn_does_not_end_behind_are_flagged(tmp_p
     end = network.language_model.lm_head.weight[IDS["<|eot_id|>"]].clone()
     network.language_model.lm_head.weight[IDS["<|eot_id|>"], 7] = -16
     network.language_model.lm_head.weight[300] = end
-    policy = load_magma(str(write_checkpoint(tmp_path, tensors=weights(network))))
+    policy = load_magma(str(write_checkpoint(tmp_path, tensors=weights(network))), unnorm_key="bridge_orig")
     seen = example_observations(INSTRUCTIONS)
     assert np.abs(policy.act(seen, [0, 1])[:, 0, :6]).max() == 0
     assert policy.flagged.all()
@@ -163,7 +166,10 @@ def test_what_is_generated_behind_the_action_fires_no_tap(loaded: Magma) -> None
 
 
 def test_temperature_changes_actions_by_seed_alone(folder: Path) -> None:
-    policy, seen = load_magma(str(folder), temperature=5.0), example_observations(INSTRUCTIONS[:1])
+    policy, seen = (
+        load_magma(str(folder), temperature=5.0, unnorm_key="bridge_orig"),
+        example_observations(INSTRUCTIONS[:1]),
+    )
     drawn = {policy.act(seen, [seed]).tobytes() for seed in range(6)}
     assert len(drawn) > 1
     assert policy.act(seen, [3]).tobytes() == policy.act(seen, [3]).tobytes()
@@ -185,7 +191,7 @@ def test_the_token_count_comes_from_the_pictures_size(folder: Path) -> None:
     wide = Observation(np.tile(seen.image, (1, 3, 1)), seen.state, seen.instruction)
     counts = {}
     for shrink in (0, 64):
-        policy = load_magma(str(folder), shrink=shrink)
+        policy = load_magma(str(folder), shrink=shrink, unnorm_key="bridge_orig")
         for name, one in (("small", seen), ("wide", wide)):
             with capture(policy, [Site("backbone", 0)]) as tape:
                 policy.act([one], [0])
@@ -225,7 +231,7 @@ def test_what_does_not_fit_is_refused_whole(loaded: Magma) -> None:
 )
 def test_an_option_that_means_nothing_is_refused(folder: Path, option: str, value: object) -> None:
     with pytest.raises(UsageError, match=option):
-        load_magma(str(folder), **{option: value})
+        load_magma(str(folder), **{option: value}, unnorm_key="bridge_orig")
 
 
 # -- capture ---------------------------------------------------------------------------------------------
@@ -313,7 +319,7 @@ def test_a_reading_of_another_model_is_refused(unsteered: Magma) -> None:
 def test_every_option_reaches_the_card(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "more.json"
     file.write_text('{"mine": {"q01": [0, 0, 0, 0, 0, 0, 0], "q99": [1, 1, 1, 1, 1, 1, 1]}}', encoding="utf-8")
-    base = load_magma(str(folder)).card.settings
+    base = load_magma(str(folder), unnorm_key="bridge_orig").card.settings
     for options in (
         {"statistics": str(file), "unnorm_key": "mine"},
         {"shrink": 0},
@@ -322,4 +328,4 @@ def test_every_option_reaches_the_card(folder: Path, tmp_path: Path) -> None:
         {"tokenizer": str(folder)},
         {"layer_scale": "weight"},
     ):
-        assert load_magma(str(folder), **options).card.settings != base, options
+        assert load_magma(str(folder), **{"unnorm_key": "bridge_orig", **options}).card.settings != base, options

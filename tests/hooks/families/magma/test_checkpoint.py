@@ -21,7 +21,7 @@ def renamed(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize("shards", [1, 3])
 def test_every_weight_comes_from_the_file(tmp_path: Path, shards: int) -> None:
-    loaded = load_magma(str(write_checkpoint(tmp_path, shards=shards))).loaded
+    loaded = load_magma(str(write_checkpoint(tmp_path, shards=shards)), unnorm_key="bridge_orig").loaded
     expected = small_network(steered=True).state_dict()
     ours = loaded.network.state_dict()
     assert ours.keys() == expected.keys()
@@ -32,11 +32,13 @@ def test_every_weight_comes_from_the_file(tmp_path: Path, shards: int) -> None:
 
 def test_the_unread_head_may_be_missing_and_nothing_else(tmp_path: Path) -> None:
     tensors = weights(small_network(), head=False)
-    assert not load_magma(str(write_checkpoint(tmp_path / "without", tensors=tensors))).loaded.notes
+    assert not load_magma(
+        str(write_checkpoint(tmp_path / "without", tensors=tensors)), unnorm_key="bridge_orig"
+    ).loaded.notes
     for name in ("multi_modal_projector.row_seperator", "language_model.lm_head.weight", LAYER_SCALE):
         lacking = {other: tensor for other, tensor in tensors.items() if other != name}
         with pytest.raises(WeightsError, match=name):
-            load_magma(str(write_checkpoint(tmp_path / name, tensors=lacking)))
+            load_magma(str(write_checkpoint(tmp_path / name, tensors=lacking)), unnorm_key="bridge_orig")
 
 
 def test_the_index_may_leave_the_unread_head_out_and_nothing_else(tmp_path: Path) -> None:
@@ -45,22 +47,22 @@ def test_the_index_may_leave_the_unread_head_out_and_nothing_else(tmp_path: Path
     listed = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
     pruned = {name: file for name, file in listed.items() if name not in UNUSED_WEIGHTS}
     index.write_text(json.dumps({"weight_map": pruned}), encoding="utf-8")
-    load_magma(str(folder))
+    load_magma(str(folder), unnorm_key="bridge_orig")
     index.write_text(
         json.dumps({"weight_map": {n: f for n, f in pruned.items() if n != LAYER_SCALE}}), encoding="utf-8"
     )
     with pytest.raises(WeightsError, match=LAYER_SCALE):
-        load_magma(str(folder))
+        load_magma(str(folder), unnorm_key="bridge_orig")
 
 
 def test_layer_scales_named_weight_are_the_released_files_and_the_card_says_so(tmp_path: Path) -> None:
     folder = write_checkpoint(tmp_path, tensors=renamed(weights(small_network())))
-    loaded = load_magma(str(folder))
+    loaded = load_magma(str(folder), unnorm_key="bridge_orig")
     assert torch.equal(loaded.network.state_dict()[LAYER_SCALE], small_network().state_dict()[LAYER_SCALE])
     assert "5 layer scales taken from tensors stored as .weight" in loaded.card.notes
     assert loaded.card.settings["layer_scale"] == "weight"
     with pytest.raises(WeightsError, match=r"5 layer scales .* as \.weight instead of .*layer_scale=gamma"):
-        load_magma(str(folder), layer_scale="gamma")
+        load_magma(str(folder), layer_scale="gamma", unnorm_key="bridge_orig")
 
 
 def test_the_actions_of_a_file_do_not_depend_on_how_it_names_its_layer_scales(
@@ -73,7 +75,8 @@ def test_the_actions_of_a_file_do_not_depend_on_how_it_names_its_layer_scales(
     ]
     seen = [observation] * 2
     one, other = (
-        load_magma(str(folder), prompt="act2answer", temperature=0.7).act(seen, [1, 2]) for folder in folders
+        load_magma(str(folder), prompt="act2answer", temperature=0.7, unnorm_key="bridge_orig").act(seen, [1, 2])
+        for folder in folders
     )
     np.testing.assert_array_equal(one, other)
 
@@ -82,7 +85,7 @@ def test_a_layer_scale_under_both_names_is_damage(tmp_path: Path) -> None:
     tensors = weights(small_network())
     tensors[LAYER_SCALE.replace(".gamma", ".weight")] = tensors[LAYER_SCALE] * 2
     with pytest.raises(WeightsError, match="1 layer scales twice"):
-        load_magma(str(write_checkpoint(tmp_path, tensors=tensors)))
+        load_magma(str(write_checkpoint(tmp_path, tensors=tensors)), unnorm_key="bridge_orig")
 
 
 @pytest.mark.parametrize("rename", [dict, renamed])
@@ -92,7 +95,7 @@ def test_one_constant_layer_scale_is_damage_under_either_name(
     tensors = weights(small_network())
     tensors[LAYER_SCALE] = torch.full_like(tensors[LAYER_SCALE], 1e-6)
     with pytest.raises(WeightsError, match=r"damaged checkpoint: .* 1 layer scales .*stages\.2\.blocks\.1"):
-        load_magma(str(write_checkpoint(tmp_path, tensors=rename(tensors))))
+        load_magma(str(write_checkpoint(tmp_path, tensors=rename(tensors))), unnorm_key="bridge_orig")
 
 
 def test_layer_scales_left_at_their_initial_value_are_damage(tmp_path: Path) -> None:
@@ -100,12 +103,14 @@ def test_layer_scales_left_at_their_initial_value_are_damage(tmp_path: Path) -> 
     tensors = weights(small_network())
     initial = {n: torch.full_like(t, 1e-6) if n.endswith(".gamma") else t for n, t in tensors.items()}
     with pytest.raises(WeightsError, match=r"damaged checkpoint: .* 5 layer scales .* 1e-06 in every feature"):
-        load_magma(str(write_checkpoint(tmp_path, tensors=initial)))
+        load_magma(str(write_checkpoint(tmp_path, tensors=initial)), unnorm_key="bridge_orig")
 
 
 def test_a_random_twin_differs_by_its_seed_and_its_trunk_does_something(tmp_path: Path) -> None:
     folder = str(write_checkpoint(tmp_path))
-    first, again, other = (load_magma(folder, random_weights=True, weights_seed=seed) for seed in (0, 0, 1))
+    first, again, other = (
+        load_magma(folder, random_weights=True, weights_seed=seed, unnorm_key="bridge_orig") for seed in (0, 0, 1)
+    )
     assert first.card.weights_sha256 == again.card.weights_sha256 != other.card.weights_sha256
     assert (first.card.random_weights, first.card.weights_seed, other.card.weights_seed) == (True, 0, 1)
     assert float(first.network.state_dict()[LAYER_SCALE].min()) == 1
@@ -113,11 +118,11 @@ def test_a_random_twin_differs_by_its_seed_and_its_trunk_does_something(tmp_path
 
 def test_weights_are_as_the_file_says_or_as_asked(tmp_path: Path) -> None:
     folder = write_checkpoint(tmp_path, torch_dtype="bfloat16")
-    assert load_magma(str(folder)).card.dtype == "bfloat16"
-    wide = load_magma(str(folder), dtype="float32")
+    assert load_magma(str(folder), unnorm_key="bridge_orig").card.dtype == "bfloat16"
+    wide = load_magma(str(folder), dtype="float32", unnorm_key="bridge_orig")
     assert {parameter.dtype for parameter in wide.network.parameters()} == {torch.float32}
     with pytest.raises(UsageError, match="float16"):
-        load_magma(str(folder), dtype="float16")
+        load_magma(str(folder), dtype="float16", unnorm_key="bridge_orig")
 
 
 def test_damaged_numbers_are_refused_by_name(tmp_path: Path) -> None:
@@ -126,27 +131,29 @@ def test_damaged_numbers_are_refused_by_name(tmp_path: Path) -> None:
     tensors[LAYER_SCALE][0] = float("nan")
     save_file(tensors, folder / "model.safetensors")
     with pytest.raises(WeightsError, match=LAYER_SCALE):
-        load_magma(str(folder))
+        load_magma(str(folder), unnorm_key="bridge_orig")
 
 
 def entry(scale: float) -> dict[str, list[float]]:
     return {"q01": [-scale] * 7, "q99": [scale] * 7, "mask": [True] * 6 + [False]}
 
 
-def test_statistics_come_from_us_the_checkpoint_or_a_file_the_later_the_stronger(tmp_path: Path) -> None:
+def test_statistics_come_from_the_package_the_checkpoint_or_a_file_and_the_last_alone_counts(
+    tmp_path: Path,
+) -> None:
     folder = write_checkpoint(tmp_path / "model")
-    ours = load_magma(str(folder)).statistics
+    ours = load_magma(str(folder), unnorm_key="bridge_orig").statistics
     assert ours.low.tolist() == shipped_statistics()["bridge_orig"]["action"]["q01"]
     (folder / "dataset_statistics.json").write_text(
         json.dumps({"bridge_orig": {"action": entry(2)}}), encoding="utf-8"
     )
-    assert load_magma(str(folder)).statistics.high[0] == 2
+    assert load_magma(str(folder), unnorm_key="bridge_orig").statistics.high[0] == 2
     file = tmp_path / "mine.json"
     file.write_text(json.dumps({"norm_stats": {"bridge_orig": entry(3), "mine": entry(4)}}), encoding="utf-8")
-    assert load_magma(str(folder), statistics=str(file)).statistics.high[0] == 3
+    assert load_magma(str(folder), statistics=str(file), unnorm_key="bridge_orig").statistics.high[0] == 3
     mine = load_magma(str(folder), statistics=str(file), unnorm_key="mine")
     assert (mine.statistics.key, mine.statistics.high[0]) == ("mine", 4)
-    with pytest.raises(UsageError, match="choose"):
+    with pytest.raises(UsageError, match="Choose"):
         load_magma(str(folder), unnorm_key="fractal")
-    with pytest.raises(CheckpointError, match="does not exist"):
-        load_magma(str(folder), statistics=str(tmp_path / "nowhere.json"))
+    with pytest.raises(CheckpointError, match="is missing"):
+        load_magma(str(folder), statistics=str(tmp_path / "nowhere.json"), unnorm_key="bridge_orig")

@@ -37,12 +37,11 @@ def test_masked_dimensions_stay_as_decoded_and_others_span_their_quantiles() -> 
     )
 
 
-def test_bridge_is_the_default_and_several_others_have_to_be_chosen_from() -> None:
+def test_the_only_data_set_needs_no_name_and_several_have_to_be_chosen_from() -> None:
     known = {"bridge_orig": entry(), "other": entry()}
-    assert ActionStatistics.choose(known, None).key == "bridge_orig"
     assert ActionStatistics.choose(known, "other").key == "other"
-    with pytest.raises(UsageError, match="choose -M unnorm_key among a, b"):
-        ActionStatistics.choose({"a": entry(), "b": entry()}, None)
+    with pytest.raises(UsageError, match="with -M unnorm_key=NAME: bridge_orig, other"):
+        ActionStatistics.choose(known, None)
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ import torch
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.families.openvla.adapter import PROMPTS, OpenVLA, load_openvla
-from probe_kit.hooks.families.prismatic.checkpoint import STATISTICS_FILE
 from probe_kit.hooks.testing import AdapterContract
 from probe_kit.hooks.verification.verify import verify_keys, verify_reference
+from probe_kit.models.statistics_choice import STATISTICS_FILE
 from tests.support.prismatic_checkpoints import SINGLE, config_values, write_checkpoint, write_tokenizer
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
@@ -29,24 +29,24 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def fused(folder: Path) -> OpenVLA:
-    return load_openvla(str(folder), tokenizer="bytes")
+    return load_openvla(str(folder), tokenizer="bytes", unnorm_key="bridge_orig")
 
 
 @pytest.fixture(scope="module")
 def mistral(tmp_path_factory: pytest.TempPathFactory) -> OpenVLA:
     where = tmp_path_factory.mktemp("mistral")
     write_checkpoint(where, vision=SINGLE, language="mistral-v0.1-7b-pure", image_resize_strategy="letterbox")
-    return load_openvla(str(write_tokenizer(where)))
+    return load_openvla(str(write_tokenizer(where)), unnorm_key="bridge_orig")
 
 
 @pytest.fixture(scope="module")
 def golden(golden_openvla: Path) -> OpenVLA:
-    return load_openvla(str(golden_openvla / "checkpoint"), tokenizer="bytes")
+    return load_openvla(str(golden_openvla / "checkpoint"), tokenizer="bytes", unnorm_key="bridge_orig")
 
 
 class TestFusedLlama(AdapterContract):
     family = "openvla"
-    options = {"tokenizer": "bytes"}
+    options = {"tokenizer": "bytes", "unnorm_key": "bridge_orig"}
     unloadable_options = frozenset({"bits"})
 
     @pytest.fixture(scope="class")
@@ -136,22 +136,25 @@ def test_a_word_the_tokenizer_does_not_know_is_an_error(mistral: OpenVLA, observ
 
 def test_the_first_release_gets_vicunas_prompt(tmp_path: Path) -> None:
     folder = write_checkpoint(tmp_path, vision=SINGLE, language="vicuna-v15-7b")
-    assert load_openvla(str(folder)).template == PROMPTS["openvla-v01"]
-    assert load_openvla(str(folder), prompt="do {instruction} now").template == "do {instruction} now"
+    assert load_openvla(str(folder), unnorm_key="bridge_orig").template == PROMPTS["openvla-v01"]
+    assert (
+        load_openvla(str(folder), prompt="do {instruction} now", unnorm_key="bridge_orig").template
+        == "do {instruction} now"
+    )
     with pytest.raises(UsageError, match="instruction"):
-        load_openvla(str(folder), prompt="do something")
+        load_openvla(str(folder), prompt="do something", unnorm_key="bridge_orig")
 
 
 def test_another_split_of_the_prompt_than_llamas_is_refused_at_full_vocabulary(tmp_path: Path) -> None:
     text = config_values()["text_config"] | {"vocab_size": 32064, "pad_token_id": 32000}
     folder = write_checkpoint(tmp_path, vision=SINGLE, text_config=text)
-    policy = load_openvla(str(folder), tokenizer="bytes")
+    policy = load_openvla(str(folder), tokenizer="bytes", unnorm_key="bridge_orig")
     with pytest.raises(CheckpointError, match="512, 29901, 1724"):
         policy.prompt("put the cube on the star")
 
 
 def test_without_a_tokenizer_the_missing_files_are_named(folder: Path, observation: Observation) -> None:
-    policy = load_openvla(str(folder))
+    policy = load_openvla(str(folder), unnorm_key="bridge_orig")
     with pytest.raises(CheckpointError, match=r"tokenizer\.json and tokenizer_config\.json are missing") as caught:
         policy.act([observation], [0])
     assert str(folder) in str(caught.value)
@@ -182,7 +185,9 @@ def test_the_gripper_is_open_or_closed_and_the_rest_in_units_of_the_data(
 
 def test_other_statistics_give_other_units_for_the_same_tokens(golden_openvla: Path) -> None:
     checkpoint = str(golden_openvla / "checkpoint")
-    policies = [load_openvla(checkpoint, unnorm_key=key, tokenizer="bytes") for key in (None, "other_set")]
+    policies = [
+        load_openvla(checkpoint, unnorm_key=key, tokenizer="bytes") for key in ("bridge_orig", "other_set")
+    ]
     assert [policy.card.settings["unnorm_key"] for policy in policies] == ["bridge_orig", "other_set"]
     assert policies[0].card.settings["action_statistics"] != policies[1].card.settings["action_statistics"]
 
@@ -191,8 +196,10 @@ def test_statistics_that_fine_tuning_wrote_are_found_beside_the_weights(folder: 
     copy = Path(shutil.copytree(folder, tmp_path / "tuned"))
     mine = {"my_arm": {"action": {"q01": [-1.0] * 7, "q99": [1.0] * 7}}}
     (copy / STATISTICS_FILE).write_text(json.dumps(mine), encoding="utf-8")
-    assert load_openvla(str(copy)).statistics.key == "bridge_orig"
+    assert load_openvla(str(copy)).statistics.key == "my_arm"
     assert load_openvla(str(copy), unnorm_key="my_arm").statistics.mask.all()
+    with pytest.raises(UsageError, match="no action statistics of 'bridge_orig'"):
+        load_openvla(str(copy), unnorm_key="bridge_orig")
     with pytest.raises(UsageError, match="Did you mean my_arm"):
         load_openvla(str(copy), unnorm_key="my_arms")
 
@@ -221,7 +228,10 @@ def test_tokens_that_name_no_action_are_said(fused: OpenVLA, observation: Observ
 def test_the_centre_crop_changes_what_the_model_sees_and_is_written_down(
     folder: Path, observation: Observation
 ) -> None:
-    whole, middle = (load_openvla(str(folder), centre_crop=crop, tokenizer="bytes") for crop in (False, True))
+    whole, middle = (
+        load_openvla(str(folder), centre_crop=crop, tokenizer="bytes", unnorm_key="bridge_orig")
+        for crop in (False, True)
+    )
     edge = observation.image.copy()
     edge[:2] = 255 - edge[:2]
     seen = [middle.pixel_values([middle._look(image)]) for image in (observation.image, edge)]
@@ -236,19 +246,19 @@ def test_the_centre_crop_changes_what_the_model_sees_and_is_written_down(
 def test_a_prismatic_model_without_actions_is_refused(tmp_path: Path) -> None:
     folder = write_checkpoint(tmp_path, model_type="prismatic")
     with pytest.raises(CheckpointError, match="--model prismatic"):
-        load_openvla(str(folder))
+        load_openvla(str(folder), unnorm_key="bridge_orig")
 
 
 def test_bfloat16_is_exactly_the_files_weights_rounded(folder: Path, observation: Observation) -> None:
-    policy = load_openvla(str(folder), dtype="bfloat16", tokenizer="bytes")
-    exact = load_openvla(str(folder))
+    policy = load_openvla(str(folder), dtype="bfloat16", tokenizer="bytes", unnorm_key="bridge_orig")
+    exact = load_openvla(str(folder), unnorm_key="bridge_orig")
     assert policy.card.dtype == "bfloat16"
     assert policy.card.exact
     for name, tensor in exact.network.state_dict().items():
         assert torch.equal(policy.network.state_dict()[name], tensor.to(torch.bfloat16))
     assert np.isfinite(policy.act([observation], [0])).all()
     with pytest.raises(UsageError, match="float16"):
-        load_openvla(str(folder), dtype="float16")
+        load_openvla(str(folder), dtype="float16", unnorm_key="bridge_orig")
 
 
 def test_an_option_of_another_family_is_refused() -> None:
@@ -258,7 +268,7 @@ def test_an_option_of_another_family_is_refused() -> None:
 
 def test_drawn_actions_repeat_by_their_seed_and_name_actions_only(folder: Path, observation: Observation) -> None:
     """At a temperature random weights, which put out any token when greedy, choose among the 256 of actions."""
-    policy = load_openvla(str(folder), tokenizer="bytes", temperature=0.6)
+    policy = load_openvla(str(folder), tokenizer="bytes", temperature=0.6, unnorm_key="bridge_orig")
     chunks = [policy.act([observation], [seed]) for seed in (1, 1, 2)]
     np.testing.assert_array_equal(chunks[0], chunks[1])
     assert np.abs(chunks[0] - chunks[2]).max() > 0
@@ -268,19 +278,21 @@ def test_drawn_actions_repeat_by_their_seed_and_name_actions_only(folder: Path, 
     both = policy.act([other, observation], [5, 1])
     np.testing.assert_array_equal(both[1], chunks[0][0])
     with pytest.raises(UsageError, match="temperature"):
-        load_openvla(str(folder), tokenizer="bytes", temperature=-1.0)
+        load_openvla(str(folder), tokenizer="bytes", temperature=-1.0, unnorm_key="bridge_orig")
 
 
 def test_draws_as_the_release_does_are_of_the_50_likeliest_tokens_of_actions(
     folder: Path, observation: Observation
 ) -> None:
     """At a temperature that makes all kept tokens alike: the first of the seven tokens has 50 values, not 256."""
-    policy = load_openvla(str(folder), tokenizer="bytes", temperature=1e6, top_k="checkpoint")
+    policy = load_openvla(
+        str(folder), tokenizer="bytes", temperature=1e6, top_k="checkpoint", unnorm_key="bridge_orig"
+    )
     assert policy.card.settings["top_k"] == "50"
     seen = [observation] * 300
     found = policy.infer_without_acting(seen, range(300))[:, 0, 0]
     assert 40 < len(set(found.tolist())) <= 51  # two tokens name the last bin's neighbour alike
-    everything = load_openvla(str(folder), tokenizer="bytes", temperature=1e6)
+    everything = load_openvla(str(folder), tokenizer="bytes", temperature=1e6, unnorm_key="bridge_orig")
     assert "top_k" not in everything.card.settings
     assert len(set(everything.infer_without_acting(seen, range(300))[:, 0, 0].tolist())) > 100
 
@@ -290,7 +302,10 @@ def test_pictures_resized_as_tensors_are_near_those_of_pil_and_not_the_same(
 ) -> None:
     """bfloat16 keeps eight bits; the filter is the same."""
     smooth = np.linspace(0, 255, 48 * 64 * 3).reshape(48, 64, 3).astype(np.uint8)
-    pil, tensor = (load_openvla(str(folder), tokenizer="bytes", resize=way) for way in ("pil", "tensor"))
+    pil, tensor = (
+        load_openvla(str(folder), tokenizer="bytes", resize=way, unnorm_key="bridge_orig")
+        for way in ("pil", "tensor")
+    )
     ours, theirs = (policy.pixel_values([smooth]).numpy() for policy in (pil, tensor))
     assert ours.shape == theirs.shape
     difference = np.abs(ours - theirs).max()

@@ -109,7 +109,7 @@ def test_a_setting_that_nobody_knows_is_an_error_until_it_is_accepted(golden: Pa
 def test_settings_that_changed_states_and_actions_are_refused() -> None:
     for name in ("adapt_to_pi_aloha", "use_delta_joint_actions_aloha"):
         with pytest.raises(CheckpointError, match=f"{name}=True"):
-            current_config({"type": "pi0", name: True}, ["chunk_size"], "config.json")
+            current_config({"type": "pi0", name: True}, "config.json")
 
 
 def old_copy(golden: Path, target: Path) -> Path:

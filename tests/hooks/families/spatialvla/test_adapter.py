@@ -36,18 +36,26 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def plain(folder: Path) -> SpatialVLA:
-    return load_spatialvla(str(folder))
+    return load_spatialvla(str(folder), unnorm_key="bridge_orig/1.0.0")
 
 
 @pytest.fixture(scope="module")
 def chunked(folder: Path) -> SpatialVLA:
-    return load_spatialvla(str(folder), iterations="chunk", constrained=True, camera="bridge_orig/1.0.0")
+    return load_spatialvla(
+        str(folder),
+        iterations="chunk",
+        constrained=True,
+        camera="bridge_orig/1.0.0",
+        unnorm_key="bridge_orig/1.0.0",
+    )
 
 
 @pytest.fixture(scope="module")
 def flat(tmp_path_factory: pytest.TempPathFactory) -> SpatialVLA:
     where = tmp_path_factory.mktemp("flat")
-    return load_spatialvla(str(write_checkpoint(where, use_vision_zoe=False, vision_zoe_config=None)))
+    return load_spatialvla(
+        str(write_checkpoint(where, use_vision_zoe=False, vision_zoe_config=None)), unnorm_key="bridge_orig/1.0.0"
+    )
 
 
 @pytest.fixture
@@ -122,7 +130,7 @@ def test_what_a_block_adds_is_what_the_residual_stream_gains(plain: SpatialVLA, 
 def test_the_first_step_of_a_chunk_is_the_same_whether_the_rest_is_captured(
     folder: Path, plain: SpatialVLA, seen: list[Observation]
 ) -> None:
-    whole = load_spatialvla(str(folder), iterations="chunk")
+    whole = load_spatialvla(str(folder), iterations="chunk", unnorm_key="bridge_orig/1.0.0")
     assert (plain.streams["action"].iterations, whole.streams["action"].iterations) == (3, 12)
     tapes = []
     for policy in (plain, whole):
@@ -185,7 +193,7 @@ def test_the_camera_of_the_scene_reaches_the_network_scaled_to_the_models_pictur
 def test_the_training_camera_may_stand_in_for_the_scenes(
     folder: Path, plain: SpatialVLA, seen: list[Observation]
 ) -> None:
-    preset = load_spatialvla(str(folder), camera="default")
+    preset = load_spatialvla(str(folder), camera="default", unnorm_key="bridge_orig/1.0.0")
     assert preset.card.needs == frozenset()
     assert preset.card.settings["camera"] == "default"
     camera = processor_values()["intrinsic_config"]["default"]
@@ -197,7 +205,7 @@ def test_the_training_camera_may_stand_in_for_the_scenes(
     with pytest.raises(
         UsageError, match=r"neither scene nor one of the checkpoint's: bridge_orig/1\.0\.0, default"
     ):
-        load_spatialvla(str(folder), camera="wrist")
+        load_spatialvla(str(folder), camera="wrist", unnorm_key="bridge_orig/1.0.0")
 
 
 def test_a_model_without_depth_needs_no_camera(flat: SpatialVLA) -> None:
@@ -257,7 +265,11 @@ def variants(tmp_path: Path) -> dict[str, SpatialVLA]:
         "sft-fractal": {"bin_policy": even, "statistics": {FRACTAL: {"action": wide}}},
     }
     return {
-        name: load_spatialvla(str(write_checkpoint(tmp_path / name, processor=change)), constrained=True)
+        name: load_spatialvla(
+            str(write_checkpoint(tmp_path / name, processor=change)),
+            constrained=True,
+            unnorm_key=FRACTAL if name == "sft-fractal" else "bridge_orig/1.0.0",
+        )
         for name, change in changes.items()
     }
 
@@ -287,7 +299,7 @@ def test_the_statistics_key_is_an_option_with_a_suggestion(tmp_path: Path) -> No
     assert load_spatialvla(checkpoint, unnorm_key=FRACTAL).statistics.key == FRACTAL
     with pytest.raises(UsageError, match="Did you mean my_arm"):
         load_spatialvla(checkpoint, unnorm_key="my_arms")
-    with pytest.raises(UsageError, match="choose"):
+    with pytest.raises(UsageError, match="with -M unnorm_key=NAME: fractal"):
         load_spatialvla(checkpoint)
 
 
@@ -302,11 +314,14 @@ def test_statistics_that_cannot_be_used_are_refused(tmp_path: Path, statistics: 
 
 def test_a_longer_chunk_has_more_tokens(tmp_path: Path, seen: list[Observation]) -> None:
     checkpoint = str(write_checkpoint(tmp_path, processor={"action_chunk_size": 2}))
-    policy = load_spatialvla(checkpoint, iterations="chunk")
+    policy = load_spatialvla(checkpoint, iterations="chunk", unnorm_key="bridge_orig/1.0.0")
     assert (policy.steps, policy.streams["action"].iterations) == (6, 6)
     assert policy.act(seen, [0, 1]).shape == (2, 2, 7)
     with pytest.raises(CheckpointError, match="action_chunk_size is 0"):
-        load_spatialvla(str(write_checkpoint(tmp_path / "none", processor={"action_chunk_size": 0})))
+        load_spatialvla(
+            str(write_checkpoint(tmp_path / "none", processor={"action_chunk_size": 0})),
+            unnorm_key="bridge_orig/1.0.0",
+        )
 
 
 def test_a_prompt_longer_than_the_model_is_refused(plain: SpatialVLA, seen: list[Observation]) -> None:
@@ -315,11 +330,12 @@ def test_a_prompt_longer_than_the_model_is_refused(plain: SpatialVLA, seen: list
 
 
 def test_options_are_declared_and_checked(folder: Path) -> None:
-    policy = load_policy("spatialvla", str(folder), lowercase="false", iterations="chunk")
+    units = {"unnorm_key": "bridge_orig/1.0.0"}
+    policy = load_policy("spatialvla", str(folder), lowercase="false", iterations="chunk", **units)
     assert policy.card.settings["lowercase"] == "False"
     for wrong in ({"iterations": "all"}, {"lowercase": "perhaps"}, {"lower_case": "true"}):
         with pytest.raises(UsageError):
-            load_policy("spatialvla", str(folder), **wrong)
+            load_policy("spatialvla", str(folder), **units, **wrong)
 
 
 def test_every_choice_is_part_of_the_identity(folder: Path, plain: SpatialVLA) -> None:
@@ -328,6 +344,9 @@ def test_every_choice_is_part_of_the_identity(folder: Path, plain: SpatialVLA) -
         {"ensemble": True}, {"iterations": "chunk"}, {"tokenizer": "bytes"},
     ]  # fmt: skip
     for choice in choices:
-        assert load_spatialvla(str(folder), **choice).card.settings != plain.card.settings
+        assert (
+            load_spatialvla(str(folder), **choice, unnorm_key="bridge_orig/1.0.0").card.settings
+            != plain.card.settings
+        )
     assert {"file config.json", "file tokenizer.json"} <= set(plain.card.settings)
     assert BINS["total"] == plain.config.actions

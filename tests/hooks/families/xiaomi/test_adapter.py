@@ -25,11 +25,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def loaded(folder: Path) -> Xiaomi:
-    return load_xiaomi(str(folder))
+    return load_xiaomi(str(folder), robot="bridge_delta")
 
 
 class TestXiaomi(AdapterContract):
     family = "xiaomi-r0"
+    options = {"robot": "bridge_delta"}
 
     @pytest.fixture(scope="class")
     def checkpoint(self, folder: Path) -> Path:
@@ -200,10 +201,10 @@ def test_without_its_processor_files_the_missing_ones_are_named(
 ) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
     (copy / "tokenizer.json").unlink()
-    policy = load_xiaomi(str(copy))
+    policy = load_xiaomi(str(copy), robot="bridge_delta")
     with pytest.raises(CheckpointError, match=r"tokenizer\.json is missing"):
         policy.act([observation], [0])
-    elsewhere = load_xiaomi(str(copy), tokenizer=str(folder))
+    elsewhere = load_xiaomi(str(copy), tokenizer=str(folder), robot="bridge_delta")
     assert np.isfinite(elsewhere.act([observation], [0])).all()
     assert "file tokenizer/tokenizer.json" in elsewhere.card.settings
 
@@ -211,7 +212,7 @@ def test_without_its_processor_files_the_missing_ones_are_named(
 def test_a_tokenizer_of_another_checkpoint_is_refused(tmp_path: Path, observation: Observation) -> None:
     vlm = config_values()["vlm_config"]
     vlm["text_config"]["vocab_size"] = ID["<|im_start|>"]
-    policy = load_xiaomi(str(write_checkpoint(tmp_path, vlm_config=vlm)))
+    policy = load_xiaomi(str(write_checkpoint(tmp_path, vlm_config=vlm)), robot="bridge_delta")
     with pytest.raises(CheckpointError, match="another checkpoint"):
         policy.act([observation], [0])
 
@@ -225,34 +226,42 @@ def test_a_prompt_longer_than_the_model_reads_is_an_error(loaded: Xiaomi, observ
 
 
 def test_a_missing_tensor_is_refused_and_a_tied_one_may_be_left_out(folder: Path, tmp_path: Path) -> None:
-    assert list(load_xiaomi(str(folder)).card.audit["allowed_missing"]) == ["vlm.lm_head.weight"]
+    assert list(load_xiaomi(str(folder), robot="bridge_delta").card.audit["allowed_missing"]) == [
+        "vlm.lm_head.weight"
+    ]
     values = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     values["dit_config"]["num_hidden_layers"] = 3
     copy = Path(shutil.copytree(folder, tmp_path / "copy"))
     (copy / "config.json").write_text(json.dumps(values), encoding="utf-8")
     with pytest.raises(WeightsError, match=r"missing.*dit\.layers\.2"):
-        load_xiaomi(str(copy))
+        load_xiaomi(str(copy), robot="bridge_delta")
 
 
 def test_a_random_twin_has_its_seed(folder: Path) -> None:
-    first, second, again = (load_xiaomi(str(folder), random_weights=True, weights_seed=seed) for seed in (0, 1, 0))
+    first, second, again = (
+        load_xiaomi(str(folder), random_weights=True, weights_seed=seed, robot="bridge_delta")
+        for seed in (0, 1, 0)
+    )
     assert first.card.weights_sha256 == again.card.weights_sha256 != second.card.weights_sha256
     assert second.card.weights_seed == 1
 
 
 def test_bfloat16_is_the_files_weights_rounded_and_acts(folder: Path, observation: Observation) -> None:
-    policy = load_xiaomi(str(folder), dtype="bfloat16")
+    policy = load_xiaomi(str(folder), dtype="bfloat16", robot="bridge_delta")
     assert policy.card.dtype == "bfloat16"
     assert np.isfinite(policy.act([observation], [0])).all()
 
 
 def test_no_step_is_refused(folder: Path) -> None:
     with pytest.raises(UsageError, match="0 Euler steps"):
-        load_xiaomi(str(folder), steps=0)
+        load_xiaomi(str(folder), steps=0, robot="bridge_delta")
 
 
 def test_the_releases_openness_is_one_minus_the_fingers_in_metres(folder: Path, observation: Observation) -> None:
-    loaded, released = load_xiaomi(str(folder)), load_xiaomi(str(folder), openness="release")
+    loaded, released = (
+        load_xiaomi(str(folder), robot="bridge_delta"),
+        load_xiaomi(str(folder), openness="release", robot="bridge_delta"),
+    )
     measured, said = (policy.state([observation])[0, 0].numpy() for policy in (loaded, released))
     assert measured[7] == 1.0
     assert said[7] == pytest.approx(1 - 0.037)

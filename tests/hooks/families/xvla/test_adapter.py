@@ -242,7 +242,7 @@ def test_the_robot_is_read_from_the_files_and_may_be_chosen(
     ("file", "old", "new", "message"),
     [
         ("policy_postprocessor.json", '"device_processor"', '"xvla_rotation_6d_to_axis_angle"', "rotation_6d"),
-        ("policy_preprocessor.json", '"right"', '"left"', "pads its text"),
+        ("policy_preprocessor.json", '"right"', '"left"', "padding_side"),
         ("config.json", '"max_state_dim": 10', '"max_state_dim": 5', "leaves out"),
     ],
 )

@@ -12,7 +12,12 @@ from safetensors.numpy import load_file
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
-from probe_kit.hooks.families.shared.lerobot.pipelines import NORMALISERS, reads_state_as_it_is, saved_steps
+from probe_kit.hooks.families.shared.lerobot.pipelines import (
+    MASKED,
+    NORMALISERS,
+    reads_state_as_it_is,
+    saved_steps,
+)
 from probe_kit.models.bounds import check_bounds, check_deviations
 from probe_kit.models.lerobot.pi0_keys import STATISTICS
 
@@ -21,11 +26,7 @@ USUAL_DEVIATIONS = 5.0
 """From the mean; values further away are unusual."""
 _ROUNDING = 1e-3
 """Share of the range by which a value may lie outside of its bounds."""
-_STEPS = (
-    *NORMALISERS,
-    "molmoact2_masked_normalizer",
-    "molmoact2_masked_unnormalizer",
-)
+_STEPS = (*NORMALISERS, *MASKED)
 # The two statistics each mode needs, as (offset-like, scale-like).
 _NEEDED = {
     "MEAN_STD": ("mean", "std"),

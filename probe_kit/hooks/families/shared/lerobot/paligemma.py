@@ -13,6 +13,7 @@ from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import side_files
 from probe_kit.hooks.checkpoints.hub import unreachable
 from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.lerobot.pipelines import tokenizer_folder
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
 
 _TOKENIZER = "google/paligemma-3b-pt-224"
@@ -58,6 +59,8 @@ class PaliGemmaPolicy(LerobotPolicy):
             ) from error
 
     def _tokenizer_folder(self) -> Path | None:
+        if (saved := tokenizer_folder(self.folder)) is not None:
+            return saved
         places = (self.folder, self.folder.parent / "tokenizer")
         return next((place for place in places if (place / "tokenizer.json").is_file()), None)
 

@@ -20,6 +20,49 @@ _HARMLESS = (
 RELATIVE = ("relative_actions_processor", "absolute_actions_processor")
 NORMALISERS = ("normalizer_processor", "unnormalizer_processor")
 TOKENIZER, CROP = "tokenizer_processor", "image_crop_resize_processor"
+MASKED = ("molmoact2_masked_normalizer", "molmoact2_masked_unnormalizer")
+_ANY = None
+"""Values that are all honoured, or that change no number here."""
+_NORMALISED = dict.fromkeys(("eps", "features", "norm_map", "normalize_observation_keys"), _ANY)
+_FRAME = dict.fromkeys(("joint_signs", "joint_offsets"), _ANY)
+_TASK = ("task",)
+"""Where lerobot puts the instruction."""
+_FIELDS: Mapping[str, Mapping[str, tuple[Any, ...] | None]] = {
+    "rename_observations_processor": {"rename_map": _ANY},
+    "device_processor": {"device": _ANY, "float_dtype": (None, "float32")},
+    **dict.fromkeys((*NORMALISERS, *MASKED), _NORMALISED),
+    RELATIVE[0]: dict.fromkeys(("enabled", "exclude_joints", "action_names"), _ANY),
+    RELATIVE[1]: {"enabled": _ANY},
+    # What is padded is masked, and no text is ever cut here.
+    TOKENIZER: {
+        "tokenizer_name": _ANY, "max_length": _ANY, "truncation": _ANY, "task_key": _TASK,
+        "padding": ("max_length", "longest"), "padding_side": ("right",),
+    },
+    CROP: dict.fromkeys(("crop_params_dict", "resize_size"), _ANY),
+    "pi05_prepare_state_tokenizer_processor_step": {
+        "max_state_dim": _ANY, "task_key": _TASK, "include_state_in_prompt": (True,),
+    },
+    "pi0_fast_prepare_state_tokenizer_processor_step": {"max_state_dim": _ANY, "task_key": _TASK},
+    # The actions of training; those of inference are decoded as the configuration says.
+    "action_tokenizer_processor": dict.fromkeys(
+        ("action_tokenizer_name", "trust_remote_code", "max_action_tokens", "fast_skip_tokens",
+         "paligemma_tokenizer_name", "allow_truncation"), _ANY,
+    ),
+    "molmoact2_clamp_normalized": {"normalization_masks": _ANY},
+    "molmoact2_state_frame_transform": _FRAME,
+    "molmoact2_action_frame_transform": _FRAME,
+    "molmoact2_pack_inputs": dict.fromkeys(
+        ("checkpoint_path", "checkpoint_revision", "checkpoint_force_download", "action_mode",
+         "discrete_action_tokenizer", "image_keys", "allow_image_key_fallback", "setup_type", "control_mode",
+         "normalize_language", "add_setup_tokens", "add_control_tokens", "num_state_tokens",
+         "max_sequence_length", "chunk_size", "max_action_dim", "env_action_dim"), _ANY,
+    ),
+    "xvla_image_to_float": {"image_keys": _ANY, "validate_range": _ANY},
+    "xvla_imagenet_normalize": {"image_keys": _ANY},
+    "xvla_add_domain_id": {"domain_id": _ANY},
+}  # fmt: skip
+"""The fields of every step that is known to a family, with the values that are; other steps have none."""
+_ENTRY = ("registry_name", "class", "config", "state_file", "artifacts")
 _AGAIN = "Download the checkpoint again"
 
 
@@ -40,6 +83,13 @@ def saved_steps(folder: Path, pipeline: str) -> tuple[SavedStep, ...]:
     entries = read_json_object(path, CheckpointError, _AGAIN).get("steps")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise CheckpointError(f"{path} has no list of steps. {_AGAIN}")
+    for entry in entries:
+        if (strange := sorted(set(entry) - set(_ENTRY))) or not isinstance(entry.get("config") or {}, dict):
+            raise CheckpointError(
+                f"{path} has the step {entry.get('registry_name')!r} with "
+                f"{', '.join(strange) or 'a config without fields'}; expected {', '.join(_ENTRY)}. Save it with "
+                "lerobot's own pipeline"
+            )
     return tuple(
         SavedStep(str(entry.get("registry_name", entry.get("class"))), entry.get("config") or {}, state)
         for entry in entries
@@ -60,21 +110,60 @@ def check_pipelines(folder: Path) -> None:
 
 
 def check_steps(folder: Path, pipeline: str, known: Collection[str]) -> None:
-    """Raise CheckpointError for a step whose effect is unknown here, and for pictures that are normalised.
+    """Raise CheckpointError for a step or a field whose effect is unknown here, and for normalised pictures.
 
     known: names of steps besides the harmless ones.
     """
-    for step in saved_steps(folder, pipeline):
+    steps = saved_steps(folder, pipeline)
+    names = [step.name for step in steps]
+    for step in steps:
         if step.name not in _HARMLESS and step.name not in known:
             raise CheckpointError(
                 f"{folder} has the processor step {step.name!r}, which changes numbers in a way probe_kit does "
                 f"not know. Known are {', '.join((*_HARMLESS, *known))}"
             )
+        if step.name not in _HARMLESS and names.count(step.name) > 1:
+            raise CheckpointError(
+                f"{folder / pipeline}.json has the step {step.name!r} twice; probe_kit takes one of each. Save "
+                "the pipeline that the policy was trained with"
+            )
+        check_fields(step, f"{folder / pipeline}.json")
         if pictures := _normalised_pictures(folder, step):
             raise CheckpointError(
                 f"{folder} normalises {', '.join(pictures)} by statistics ({step.name}), which probe_kit does "
                 "not. Take a checkpoint whose norm_map has VISUAL: IDENTITY"
             )
+
+
+def check_fields(step: SavedStep, source: str) -> None:
+    """Raise CheckpointError for a field of a known step that probe_kit does not honour with its value.
+
+    source: the file, for messages.
+    """
+    known = _FIELDS.get(step.name, {})
+    for name, value in step.config.items():
+        if name not in known:
+            fields = ", ".join(known) or "none"
+            raise CheckpointError(
+                f"{source}: the step {step.name!r} has the field {name}: {value!r}, which may change numbers in "
+                f"a way probe_kit does not know. Known are {fields}. If it changes nothing, remove it from a copy "
+                "of the file"
+            )
+        plain = known[name]
+        if plain is not None and not any(value == one and type(value) is type(one) for one in plain):
+            raise CheckpointError(
+                f"{source}: the step {step.name!r} says {name}: {value!r}, which probe_kit does not repeat. "
+                f"Supported is {' or '.join(map(repr, plain))}: take a checkpoint that was trained so"
+            )
+
+
+def tokenizer_folder(folder: Path) -> Path | None:
+    """The folder of the tokenizer that lerobot saved into the checkpoint; None where the step names none there."""
+    step = next((step for step in saved_steps(folder, PREPROCESSOR) if step.name == TOKENIZER), None)
+    named = None if step is None else step.config.get("tokenizer_name")
+    if not isinstance(named, str) or not named or Path(named).is_absolute() or ".." in Path(named).parts:
+        return None
+    return folder / named if (folder / named / "tokenizer.json").is_file() else None
 
 
 def _normalised_pictures(folder: Path, step: SavedStep) -> list[str]:
@@ -96,14 +185,10 @@ def adds_state(folder: Path) -> bool:
 
 
 def text_length(folder: Path) -> int | None:
-    """Positions that the text is padded to; None where no step says. Raises CheckpointError for other padding."""
+    """Positions that the text is padded to; None where no step says."""
     step = next((step for step in saved_steps(folder, PREPROCESSOR) if step.name == TOKENIZER), None)
     if step is None:
         return None
-    if step.config.get("padding_side", "right") != "right":
-        raise CheckpointError(
-            f"{folder} pads its text in front; probe_kit pads behind it. Save it with lerobot's own"
-        )
     length = step.config.get("max_length")
     return None if length is None else int(length)
 

@@ -3,10 +3,12 @@
 Never lerobot's own `from_pretrained`: it returns partly or fully random models without an error.
 """
 
+import json
+import tempfile
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -17,8 +19,9 @@ from lerobot.configs.policies import PreTrainedConfig
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, checkpoint_folder, content_hashes, side_files
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Policy
@@ -26,6 +29,7 @@ from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
 from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.lerobot.config_fields import Inert, check_one_frame, known_values
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.normaliser import (
     Normaliser,
@@ -67,6 +71,10 @@ class LerobotPolicy(Policy):
     config_type: ClassVar[str]
     unread: ClassVar[tuple[str, ...]] = ()
     """Parameters that inference never reads and a file may lack."""
+    newer_fields: ClassVar[Inert] = {}
+    """Fields of its configuration in a newer lerobot than the installed one."""
+    takes_unread: ClassVar[bool] = False
+    """Whether users can say with -M unread which fields change nothing."""
     known_steps: ClassVar[tuple[str, ...] | None] = (CROP,)
     """Steps of lerobot's processors that only this family has; None where it reads the pipelines itself."""
     other_roles: ClassVar[tuple[str, ...]]
@@ -123,6 +131,11 @@ class LerobotPolicy(Policy):
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """A file's tensors under the names the network has."""
 
+    @classmethod
+    def _current_key(cls, name: str) -> str:
+        """The network's name of one tensor of a file."""
+        return next(iter(cls.current_keys({name: torch.empty(0)})), name)
+
     @abstractmethod
     def _stacks(self) -> dict[str, Stack]:
         """The stacks `backbone`, `vision` and the acting one."""
@@ -178,7 +191,8 @@ class LerobotPolicy(Policy):
             weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
         else:
             weights = read_weights(folder)
-        audit = load_weights(network, weights, cls.current_keys(weights.tensors), cls.unread)
+        tensors = cls.current_keys(weights.tensors)
+        audit = load_weights(network, weights, tensors, cls.unread, named=cls._current_key)
         config.device = device
         policy = cls(network.to(device), folder)
         policy.prepare(checkpoint, evaluation)
@@ -210,11 +224,7 @@ class LerobotPolicy(Policy):
             raise CheckpointError(
                 f"{folder} holds a {config.type!r} policy; expected {cls.config_type}. Pass the right --model"
             )
-        if (frames := int(getattr(config, "n_obs_steps", 1))) != 1:
-            raise CheckpointError(
-                f"{folder} reads the last {frames} observations (n_obs_steps); every inference here is given one. "
-                "Take a checkpoint with n_obs_steps 1"
-            )
+        check_one_frame(config, folder)
         cls._check_steps(folder, PREPROCESSOR)
         if hasattr(config, "tokenizer_max_length"):
             # lerobot tokenises as the saved step says, whatever the configuration has.
@@ -224,9 +234,7 @@ class LerobotPolicy(Policy):
                     f"{folder} reads {length} tokens of text (tokenizer_max_length); expected 1 to {MOST_TOKENS}. "
                     "Take the original configuration"
                 )
-        # Compiled graphs drop hooks, and real-time chunking mixes in actions of the chunk before.
-        config.compile_model = False
-        config.rtc_config = None
+        config.compile_model = False  # compiled graphs drop hooks
         return config
 
     @classmethod
@@ -236,9 +244,31 @@ class LerobotPolicy(Policy):
 
     @classmethod
     def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
-        """lerobot's configuration object of the folder's `config.json`."""
-        del evaluation
-        return PreTrainedConfig.from_pretrained(folder)
+        """lerobot's configuration object of the folder's `config.json`, also of one that a newer lerobot wrote.
+
+        Raises CheckpointError for a policy of another kind, and for a field that may change inference.
+        """
+        path = folder / CONFIG_FILE
+        values = cls.current_values(read_json_object(path, CheckpointError, "Take the original file"), path)
+        if (kind := values.get("type")) != cls.config_type:
+            raise CheckpointError(
+                f"{folder} holds a {kind!r} policy; expected {cls.config_type}. Pass the right --model"
+            )
+        known = {field.name for field in fields(PreTrainedConfig.get_choice_class(cls.config_type))}
+        values = known_values(
+            values, {*known, "type"}, cls.newer_fields, evaluation.unread, path, cls.takes_unread
+        )
+        if "rtc_config" in values:
+            values["rtc_config"] = None  # real-time chunking mixes in actions of the chunk before
+        with tempfile.TemporaryDirectory() as place:
+            (Path(place) / CONFIG_FILE).write_text(json.dumps(values), encoding="utf-8")
+            return PreTrainedConfig.from_pretrained(place)
+
+    @classmethod
+    def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
+        """The fields of `config.json` under the names that the installed lerobot has. Raises CheckpointError."""
+        del path
+        return values
 
     def prepare(self, checkpoint: str, evaluation: Evaluation) -> None:
         """What is looked at once, before the card is written. checkpoint: the name it was asked for by."""

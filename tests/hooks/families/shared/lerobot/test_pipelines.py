@@ -133,7 +133,7 @@ def _of_a_class(steps: list[dict[str, Any]]) -> None:
     [
         (_inserted, "vla_jepa_binarize_gripper"),
         (_of_a_class, r"somewhere\.Step"),
-        (changed("tokenizer_processor", padding_side="left"), "pads its text in front"),
+        (changed("tokenizer_processor", padding_side="left"), "padding_side: 'left'"),
     ],
 )
 def test_a_step_that_would_change_numbers_unread_is_refused_by_name(

@@ -1,0 +1,143 @@
+"""The files of a LoRA adapter: what of them can be merged, and on which base. Imports no torch."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from probe_kit._system.bounded_json import read_json_object
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.checkpoints.checkpoint import (
+    ADAPTER_FILE,
+    CONFIG_FILE,
+    checkpoint_folder,
+    missing_weights,
+)
+
+ADAPTER_WEIGHTS = ("adapter_model.safetensors", "adapter_model.bin")
+SCALING = ("r", "lora_alpha", "rank_pattern", "alpha_pattern", "use_rslora", "use_dora", "lora_bias")
+"""Fields that decide how much the factors add to a weight."""
+_COPIES = ("bias", "modules_to_save")
+_NAMING = ("peft_type", "base_model_name_or_path")
+_WITHOUT_EFFECT = (
+    "task_type", "auto_mapping", "peft_version", "inference_mode", "target_modules", "exclude_modules",
+    "lora_dropout", "layers_to_transform", "layers_pattern", "megatron_core", "qalora_group_size",
+    "runtime_config", "eva_config", "loftq_config", "velora_config",
+)  # fmt: skip
+"""Training, speed, and rules for choosing modules: the tensors themselves say which modules they change."""
+_INERT: Mapping[str, tuple[Any, ...]] = {
+    "init_lora_weights": (True, False, None, "gaussian", "eva", "orthogonal"),
+    "revision": (None, "", "main"),
+}
+"""Fields with the values under which a merge is exact. Other initialisations change the base's weights."""
+_NOTHING: tuple[Any, ...] = (None, False, "", [], {})
+"""What switches every other field off."""
+
+
+@dataclass(frozen=True)
+class AdapterFiles:
+    """A LoRA adapter. settings: of its `adapter_config.json`. weights: the file of its tensors."""
+
+    folder: Path
+    settings: Mapping[str, Any]
+    weights: Path
+
+    @property
+    def base(self) -> str:
+        """Folder or hub id of the checkpoint that it was trained on, as the file names it."""
+        return str(self.settings["base_model_name_or_path"])
+
+    def base_folder(self) -> Path:
+        """The folder of the base's checkpoint; a relative path may start at the adapter.
+
+        Raises CheckpointError if it is not there, or is an adapter itself.
+        """
+        beside = self.folder / self.base
+        try:
+            place = beside.resolve() if beside.is_dir() else checkpoint_folder(self.base)
+        except CheckpointError as error:
+            raise CheckpointError(
+                f"the LoRA adapter in {self.folder} was trained on {self.base!r}: {error}. "
+                f"Correct base_model_name_or_path in its {ADAPTER_FILE}"
+            ) from error
+        if place.resolve() == self.folder.resolve():
+            return self.folder
+        if (place / ADAPTER_FILE).is_file():
+            raise CheckpointError(
+                f"the base {place} of the LoRA adapter in {self.folder} is an adapter itself. Merge the base with "
+                "peft first, and name the merged folder as base_model_name_or_path"
+            )
+        return place
+
+
+def adapter_in(folder: Path) -> AdapterFiles | None:
+    """The LoRA adapter in a checkpoint's folder; None where there is none.
+
+    Raises CheckpointError for an adapter that cannot be merged exactly, for one of which a file is missing, and
+    for weights beside it of which no file says whether they are the base's or merged.
+    """
+    file = folder / ADAPTER_FILE
+    found = next((folder / name for name in ADAPTER_WEIGHTS if (folder / name).is_file()), None)
+    if not file.is_file():
+        _check_no_traces(folder, found)
+        return None
+    settings = read_json_object(file, CheckpointError, "Download the adapter again")
+    _check_settings(file, settings)
+    if found is None:
+        raise CheckpointError(
+            f"{folder} has {ADAPTER_FILE}, but neither {' nor '.join(ADAPTER_WEIGHTS)}. Download the adapter again"
+        )
+    adapter = AdapterFiles(folder, settings, found)
+    if not missing_weights(folder):
+        _check_own_base(adapter)
+    return adapter
+
+
+def _check_no_traces(folder: Path, weights: Path | None) -> None:
+    """Raise CheckpointError for a folder that was an adapter's, without the file that says how it is merged."""
+    if weights is not None:
+        raise CheckpointError(
+            f"{folder} has {weights.name}, but no {ADAPTER_FILE}, which says how it changes the weights. Put the "
+            f"adapter's {ADAPTER_FILE} there, or remove {weights.name} if the weights are merged"
+        )
+    config = folder / CONFIG_FILE
+    if not config.is_file():
+        return
+    values = read_json_object(config, CheckpointError, "Download the checkpoint again")
+    if values.get("use_peft"):
+        raise CheckpointError(
+            f"{config} says use_peft: true, and {folder} has no {ADAPTER_FILE}: its weights alone may be those "
+            f"of the base. Put {ADAPTER_FILE} and {ADAPTER_WEIGHTS[0]} there, or set use_peft to false if the "
+            "weights are merged"
+        )
+
+
+def _check_settings(file: Path, settings: Mapping[str, Any]) -> None:
+    """Raise CheckpointError for an adapter that adds something else to weights than its scaled factors."""
+    if (kind := settings.get("peft_type")) != "LORA":
+        raise CheckpointError(
+            f"{file.parent} holds a {kind} adapter; only LORA can be merged. Merge it with peft, and pass the "
+            "merged folder"
+        )
+    if not settings.get("base_model_name_or_path"):
+        raise CheckpointError(f"{file} does not say its base_model_name_or_path; add it")
+    plain = {*SCALING, *_COPIES, *_NAMING, *_WITHOUT_EFFECT}
+    others = {name: value for name, value in settings.items() if name not in plain}
+    wrong = [f"{name}: {value!r}" for name, value in others.items() if value not in _INERT.get(name, _NOTHING)]
+    if wrong:
+        raise CheckpointError(
+            f"{file} says {', '.join(wrong)}, which a merge of low-rank factors does not repeat exactly. Merge "
+            "the adapter with the tool that made it, and pass the merged folder"
+        )
+
+
+def _check_own_base(adapter: AdapterFiles) -> None:
+    """Raise CheckpointError unless the weights beside the adapter are the base that it names."""
+    beside = adapter.folder / adapter.base
+    if beside.is_dir() and beside.resolve() == adapter.folder.resolve():
+        return
+    raise CheckpointError(
+        f"{adapter.folder} holds weights and a LoRA adapter of {adapter.base!r}: no file says whether these "
+        f"weights are the base's or merged. If they are merged, remove {ADAPTER_FILE} and {adapter.weights.name}. "
+        "If they are the base's, set base_model_name_or_path to '.'. If they are neither, remove them"
+    )

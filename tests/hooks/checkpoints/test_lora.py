@@ -1,0 +1,261 @@
+"""A LoRA fine-tune is its base plus what it learned, in every family; what cannot be merged is refused by name."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from peft import LoraConfig, get_peft_model
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from probe_kit.errors import CheckpointError, WeightsError
+from probe_kit.hooks import load_model
+from probe_kit.hooks.checkpoints.adapter_files import adapter_in
+from probe_kit.models.embedded.folder import embedded_checkpoint
+from tests.support.every_checkpoint import WRITERS
+
+RANK, ALPHA = 2, 6
+PLACE = "model.paligemma_with_expert.gemma_expert.model.layers.0.self_attn.q_proj"
+
+
+def network_of(model: Any) -> nn.Module:
+    """The module whose tensors were audited."""
+    found = getattr(model, "network", None)
+    assert isinstance(found, nn.Module)
+    return found
+
+
+def without_weights(base: Path, folder: Path) -> Path:
+    """A copy of a checkpoint of which an adapter's files are to take the place of the weights."""
+    weights = shutil.ignore_patterns("model*.safetensors", "model.safetensors.index.json", "*.pt")
+    return Path(shutil.copytree(base, folder, ignore=weights))
+
+
+def write_adapter(folder: Path, tensors: dict[str, torch.Tensor], base: str, **fields: Any) -> Path:
+    """Two files as peft saves them."""
+    save_file(tensors, folder / "adapter_model.safetensors")
+    settings = {
+        "peft_type": "LORA", "r": RANK, "lora_alpha": ALPHA, "target_modules": ["q_proj"], "bias": "none",
+        "base_model_name_or_path": base, **fields,
+    }  # fmt: skip
+    (folder / "adapter_config.json").write_text(json.dumps(settings), encoding="utf-8")
+    return folder
+
+
+def factors(module: str, weight: torch.Tensor, seed: int = 0) -> dict[str, torch.Tensor]:
+    """Low-rank factors of a linear layer under peft's names."""
+    generator = torch.Generator().manual_seed(seed)
+    down = torch.randn((RANK, weight.shape[1]), generator=generator)
+    up = torch.randn((weight.shape[0], RANK), generator=generator)
+    name = f"base_model.model.{module}"
+    return {f"{name}.lora_A.weight": down, f"{name}.lora_B.weight": up}
+
+
+def last_linear(network: nn.Module) -> str:
+    """The path of a linear layer whose weight is not tied to another's."""
+    shared = [id(parameter) for _, parameter in network.named_parameters(remove_duplicate=False)]
+    return [
+        name
+        for name, module in network.named_modules()
+        if type(module) is nn.Linear and shared.count(id(module.weight)) == 1
+    ][-1]
+
+
+@pytest.mark.parametrize("family", list(WRITERS))
+def test_an_adapter_is_added_to_the_weights_of_the_base_in_every_family(family: str, tmp_path: Path) -> None:
+    write, options = WRITERS[family]
+    base = write(tmp_path / "base")
+    plain = load_model(family, str(base), **options)
+    before = {name: tensor.clone() for name, tensor in network_of(plain).state_dict().items()}
+    module = last_linear(network_of(plain))
+    own = factors(module, before[f"{module}.weight"])
+    tuned = write_adapter(without_weights(base, tmp_path / "tuned"), own, str(base))
+
+    model = load_model(family, str(tuned), **options)
+
+    down, up = own.values()
+    changed = {
+        name: tensor
+        for name, tensor in network_of(model).state_dict().items()
+        if not torch.equal(tensor, before[name])
+    }
+    assert list(changed) == [f"{module}.weight"]
+    expected = before[f"{module}.weight"].double() + ALPHA / RANK * up.double() @ down.double()
+    torch.testing.assert_close(changed[f"{module}.weight"].double(), expected, atol=1e-4, rtol=1e-2)
+    assert model.card.weights_sha256 != plain.card.weights_sha256
+    assert f"LoRA adapter merged into {base}" in model.card.notes
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[Path, Path]:
+    """A base, and a folder with its files besides the weights."""
+    base = Path(shutil.copytree(embedded_checkpoint("pi0-tiny"), tmp_path / "base"))
+    return base, without_weights(base, tmp_path / "tuned")
+
+
+def weights_of(base: Path) -> dict[str, torch.Tensor]:
+    return load_file(base / "model.safetensors")
+
+
+def test_the_hash_covers_the_base_the_factors_and_how_they_are_scaled(folders: tuple[Path, Path]) -> None:
+    base, tuned = folders
+    own = factors(PLACE, weights_of(base)[f"{PLACE}.weight"])
+    other = factors(PLACE, weights_of(base)[f"{PLACE}.weight"], seed=1)
+    hashes = [
+        load_model("pi0", str(write_adapter(tuned, tensors, "../base", lora_alpha=alpha))).card.weights_sha256
+        for tensors, alpha in ((own, 6), (own, 7), (other, 6), (own, 6))
+    ]
+    assert len(set(hashes)) == 3
+    assert hashes[0] == hashes[3]
+
+
+@pytest.mark.parametrize("fields", [{"use_rslora": True}, {"use_dora": True}, {"alpha_pattern": {"q_proj": 3}}])
+def test_the_other_ways_of_scaling_give_what_peft_computes(
+    folders: tuple[Path, Path], tmp_path: Path, fields: dict[str, Any]
+) -> None:
+    base, tuned = folders
+    network = load_model("pi0", str(base)).network
+    config = LoraConfig(r=RANK, lora_alpha=ALPHA, target_modules=[PLACE], **fields)
+    wrapped = get_peft_model(network, config)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for name, parameter in wrapped.named_parameters():
+            if "lora_" in name:
+                parameter.copy_(torch.rand(parameter.shape, generator=generator))
+    wrapped.save_pretrained(tmp_path / "saved")
+    for file in (tmp_path / "saved").glob("adapter_*"):
+        shutil.copy(file, tuned)
+    settings = json.loads((tuned / "adapter_config.json").read_text(encoding="utf-8"))
+    (tuned / "adapter_config.json").write_text(
+        json.dumps({**settings, "base_model_name_or_path": "../base"}), encoding="utf-8"
+    )
+    expected = wrapped.merge_and_unload().get_submodule(PLACE).weight
+    found = load_model("pi0", str(tuned)).network.get_submodule(PLACE).weight
+    torch.testing.assert_close(found, expected.detach())
+    assert not torch.allclose(found, weights_of(base)[f"{PLACE}.weight"])
+
+
+def test_a_layer_that_was_trained_whole_replaces_the_bases(folders: tuple[Path, Path]) -> None:
+    base, tuned = folders
+    whole = torch.full_like(weights_of(base)["model.state_proj.weight"], 0.25)
+    tensors = {
+        **factors(PLACE, weights_of(base)[f"{PLACE}.weight"]),
+        "base_model.model.model.state_proj.weight": whole,
+        "base_model.model.model.state_proj.bias": weights_of(base)["model.state_proj.bias"],
+    }
+    write_adapter(tuned, tensors, "../base", modules_to_save=["state_proj"])
+    assert torch.equal(load_model("pi0", str(tuned)).network.model.state_proj.weight, whole)
+
+
+def test_an_adapter_of_todays_names_fits_a_base_of_older_ones(folders: tuple[Path, Path]) -> None:
+    base, tuned = folders
+    stored = weights_of(base)
+    older = {name.replace("paligemma.model.language_model.", "paligemma.language_model.model."): t.contiguous()
+             for name, t in stored.items()}  # fmt: skip
+    assert older.keys() != stored.keys()
+    module = "model.paligemma_with_expert.paligemma.model.language_model.layers.0.self_attn.q_proj"
+    own = factors(module, stored[f"{module}.weight"])
+    write_adapter(tuned, own, "../base")
+    first = load_model("pi0", str(tuned)).network.get_submodule(module).weight
+    save_file(older, base / "model.safetensors")
+    assert torch.equal(load_model("pi0", str(tuned)).network.get_submodule(module).weight, first)
+
+
+def change(folder: Path, file: str, **fields: Any) -> None:
+    path = folder / file
+    path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | fields), encoding="utf-8")
+
+
+REFUSED: dict[str, tuple[Callable[[Path, Path], Any], str]] = {
+    "weights beside it": (
+        lambda base, tuned: shutil.copy(base / "model.safetensors", tuned),
+        r"holds weights and a LoRA adapter of '../base'.*base_model_name_or_path to '\.'",
+    ),
+    "use_peft alone": (
+        lambda _, tuned: (
+            [file.unlink() for file in tuned.glob("adapter_*")] and change(tuned, "config.json", use_peft=True)
+        ),
+        "says use_peft: true",
+    ),
+    "no settings": (lambda _, tuned: (tuned / "adapter_config.json").unlink(), "no adapter_config.json"),
+    "no tensors": (lambda _, tuned: (tuned / "adapter_model.safetensors").unlink(), "but neither adapter_model"),
+    "another kind": (lambda _, tuned: change(tuned, "adapter_config.json", peft_type="IA3"), "only LORA"),
+    "another start": (
+        lambda _, tuned: change(tuned, "adapter_config.json", init_lora_weights="pissa"),
+        "init_lora_weights: 'pissa'",
+    ),
+    "copied layers": (
+        lambda _, tuned: change(tuned, "adapter_config.json", layer_replication=[[0, 2]]),
+        "layer_replication",
+    ),
+    "a revision": (lambda _, tuned: change(tuned, "adapter_config.json", revision="1a2b3c"), "revision: '1a2b3c'"),
+    "a newer field": (
+        lambda _, tuned: change(tuned, "adapter_config.json", new_in_peft=0.5),
+        "new_in_peft: 0.5",
+    ),
+    "an adapter as its base": (
+        lambda base, tuned: shutil.copy(tuned / "adapter_config.json", base),
+        "is an adapter itself",
+    ),
+    "no base": (
+        lambda _, tuned: change(tuned, "adapter_config.json", base_model_name_or_path="/nowhere"),
+        "base_model_name_or_path in its adapter_config.json",
+    ),
+    "a lost layer": (
+        lambda _, tuned: change(tuned, "adapter_config.json", modules_to_save=["state_proj"]),
+        "has no tensors of state_proj",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", list(REFUSED))
+def test_what_cannot_be_merged_exactly_is_refused_by_name(folders: tuple[Path, Path], kind: str) -> None:
+    base, tuned = folders
+    write_adapter(tuned, factors(PLACE, weights_of(base)[f"{PLACE}.weight"]), "../base")
+    damage, message = REFUSED[kind]
+    damage(base, tuned)
+    with pytest.raises((CheckpointError, WeightsError), match=message):
+        load_model("pi0", str(tuned))
+
+
+def test_weights_that_the_adapter_names_as_its_base_are_merged(folders: tuple[Path, Path]) -> None:
+    base, _ = folders
+    before = weights_of(base)[f"{PLACE}.weight"]
+    write_adapter(base, factors(PLACE, before), ".")
+    assert not torch.allclose(load_model("pi0", str(base)).network.get_submodule(PLACE).weight, before)
+
+
+def test_factors_of_another_model_are_refused(folders: tuple[Path, Path]) -> None:
+    base, tuned = folders
+    other = PLACE.replace("layers.0", "layers.99")
+    write_adapter(tuned, factors(other, weights_of(base)[f"{PLACE}.weight"]), "../base")
+    with pytest.raises(WeightsError, match=r"layers\.99.*belongs to another model"):
+        load_model("pi0", str(tuned))
+
+
+def test_factors_among_the_weights_are_named(folders: tuple[Path, Path]) -> None:
+    base, _ = folders
+    tensors = weights_of(base)
+    weight = tensors.pop(f"{PLACE}.weight")
+    save_file(
+        {**tensors, f"{PLACE}.base_layer.weight": weight, f"{PLACE}.lora_A.default.weight": weight[:2].clone()},
+        base / "model.safetensors",
+    )
+    with pytest.raises(WeightsError, match="1 low-rank factors that were not merged"):
+        load_model("pi0", str(base))
+
+
+def test_an_adapter_in_a_folder_below_is_pointed_to(folders: tuple[Path, Path]) -> None:
+    base, tuned = folders
+    (tuned / "adapter").mkdir()
+    write_adapter(tuned / "adapter", factors(PLACE, weights_of(base)[f"{PLACE}.weight"]), "../../base")
+    with pytest.raises(WeightsError, match=r"tuned/adapter, which holds an adapter"):
+        load_model("pi0", str(tuned))
+
+
+def test_a_folder_without_an_adapter_has_none(folders: tuple[Path, Path]) -> None:
+    assert adapter_in(folders[0]) is None
