@@ -8,7 +8,9 @@ from typing import Any, Self
 
 from probe_kit.errors import RecordingError
 from probe_kit.extract.plan import RowPlan
-from probe_kit.extract.recordings.lerobot_folder import IMAGE, MOST_FRAMES, LeRobotFolder, LeRobotFrames
+from probe_kit.extract.recordings.lerobot_folder import MOST_FRAMES, LeRobotFolder
+from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
+from probe_kit.extract.recordings.lerobot_meta import IMAGE
 from probe_kit.extract.recordings.lerobot_source import ACTION, IMAGES, STATE, LeRobotSource, Pairs
 from probe_kit.extract.run_layout import OTHER_ACTIONS
 from probe_kit.hashing import derive_seed
@@ -147,7 +149,7 @@ class Recording:
     def of(cls, folder: LeRobotFolder, source: LeRobotSource) -> Self:
         """What `source` chooses. Raises RecordingError for an episode that is not there."""
         episodes = tuple(folder.chosen(source.episodes))
-        return cls(folder, source, episodes, LeRobotFrames(folder, episodes))
+        return cls(folder, source, episodes, LeRobotFrames(folder))
 
     @property
     def features(self) -> list[str]:

@@ -70,6 +70,7 @@ def fit(recording: Recording, policy: "Policy") -> Fitted:
     recording = recording.mapped(policy.card.cameras)
     fetched(recording.folder, recording.episodes, recording.features)
     recording.folder.check_files(recording.episodes, recording.features)
+    recording.reader.check(recording.episodes, recording.features)
     try:
         policy = policy.with_cameras([camera for camera, _ in recording.source.cameras])
     except ObservationError as error:
