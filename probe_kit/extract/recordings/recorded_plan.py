@@ -12,7 +12,7 @@ from probe_kit.extract.recordings.lerobot_folder import MOST_FRAMES, LeRobotFold
 from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
 from probe_kit.extract.recordings.lerobot_meta import IMAGE
 from probe_kit.extract.recordings.lerobot_source import ACTION, IMAGES, STATE, LeRobotSource, Pairs
-from probe_kit.extract.run_layout import OTHER_ACTIONS
+from probe_kit.extract.run_layout import OTHER_ACTIONS, RECORDED_EPISODES
 from probe_kit.hashing import derive_seed
 
 CATEGORY = "all"
@@ -96,12 +96,14 @@ class PlannedStretch:
 class RecordedPlan(RowPlan):
     """All stretches of a run. dataset: what its identity says of the data set. name: what tables call it.
 
+    recorded: episodes that the data set has, chosen or not.
     other_actions: why the recorded actions of these episodes are not what the policy predicts; None if they are.
     """
 
     episodes: tuple[PlannedStretch, ...]
     dataset: Mapping[str, Any]
     name: str
+    recorded: int
     other_actions: str | None = None
 
     @property
@@ -118,7 +120,14 @@ class RecordedPlan(RowPlan):
     def selection(self) -> dict[str, Any]:
         """Which episodes were chosen, and whether their actions are those that the policy predicts."""
         chosen = sorted({one.source_episode for one in self.episodes})
-        return {"recording": {"name": self.name, "episodes": chosen, OTHER_ACTIONS: self.other_actions}}
+        return {
+            "recording": {
+                "name": self.name,
+                "episodes": chosen,
+                RECORDED_EPISODES: self.recorded,
+                OTHER_ACTIONS: self.other_actions,
+            }
+        }
 
     @property
     def decoder(self) -> str | None:

@@ -3,6 +3,9 @@
 from collections.abc import Iterable
 from itertools import islice
 
+import numpy as np
+from numpy.typing import NDArray
+
 from probe_kit.env import Act2AnswerEnv, SceneSpec
 from probe_kit.errors import SceneError
 from probe_kit.extract.plan import PlannedEpisode
@@ -34,3 +37,25 @@ def run_preflight(scene: SceneSpec, episodes: Iterable[PlannedEpisode]) -> None:
         env.close()
     if failed is not None:
         raise failed
+
+
+def first_states(scene: SceneSpec, episodes: Iterable[PlannedEpisode]) -> NDArray[np.float32]:
+    """(n, 8) states of the arm at the first inference of some episodes; those that cannot be set up are left out.
+
+    Raises SceneError if none can be set up.
+    """
+    env = Act2AnswerEnv(scene)
+    states, failed = [], None
+    try:
+        for planned in episodes:
+            try:
+                options = {"item": planned.episode.item, "layout": planned.episode.layout}
+                seen, _ = env.reset(seed=planned.scene_seed, options=options)
+                states.append(seen["agent_pos"])
+            except SceneError as error:
+                failed = error
+    finally:
+        env.close()
+    if not states and failed is not None:
+        raise failed
+    return np.stack(states)

@@ -4,7 +4,8 @@ import numpy as np
 
 from probe_kit.extract.recordings.lerobot_source import ACTION, STATE
 from probe_kit.extract.recordings.recorded_plan import Recording
-from probe_kit.extract.rollout.recorded.recorded_controller import MOST_UNUSUAL, Fitted
+from probe_kit.extract.rollout.recorded.recorded_controller import Fitted
+from probe_kit.extract.rollout.units import MOST_UNUSUAL
 
 _LONGEST = 12
 """Tasks and numbers that are listed."""
