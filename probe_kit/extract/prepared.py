@@ -20,7 +20,7 @@ from probe_kit.extract.plan import (
 )
 from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.recordings.lerobot_folder import fetched, open_lerobot
-from probe_kit.extract.recordings.lerobot_source import STATE, LeRobotSource
+from probe_kit.extract.recordings.lerobot_source import LeRobotSource
 from probe_kit.extract.recordings.recorded_plan import RecordedPlan, Recording
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
@@ -32,7 +32,7 @@ from probe_kit.extract.rollout.own_environments.environment_controller import (
     fit_environment,
 )
 from probe_kit.extract.rollout.preflight import first_states, run_preflight
-from probe_kit.extract.rollout.recorded.recorded_controller import fit, recorded_controller
+from probe_kit.extract.rollout.recorded.recorded_controller import check_recorded_units, fit, recorded_controller
 from probe_kit.extract.rollout.recorded.recorded_stage import example_of
 from probe_kit.extract.rollout.settings_checks import check_embodiment, check_meaningless, check_unreachable
 from probe_kit.extract.rollout.units import FIRST_EPISODES, check_units, unusual_shares
@@ -231,9 +231,7 @@ def _prepared_environment(settings: ExtractSettings, opened: OpenedEnvironment, 
 
 def _prepared_recording(settings: ExtractSettings, recording: Recording, policy: "Policy") -> Prepared:
     fitted = fit(recording, policy)
-    folder = fitted.recording.folder
-    names = folder.names(STATE) if fitted.unusual.size else []
-    check_units(fitted.unusual, names, f"{folder.path.name}, {STATE}", fitted.policy, settings.accept_units)
+    check_recorded_units(fitted, settings.accept_units)
     settings = replace(settings, source=fitted.recording.source)
     controller = recorded_controller(fitted, settings)
     check_unfit(fitted.policy.card, settings.batch, example_of(fitted.recording, recording.instructions[0]))

@@ -190,8 +190,8 @@ def checked_step(answer: object, episode: EnvEpisode, where: str) -> Step:
             )
         if name == SUCCESS and value not in (0, 1):
             raise OwnEnvironmentError(
-                f"{where}: the fact {SUCCESS!r} is {value!r}; expected a truth value: True, False, 1 or 0. Give a part "
-                "or a score another name"
+                f"{where}: the fact {SUCCESS!r} is {value!r}; expected a truth value: True, False, 1 or 0. Give "
+                "a part or a score another name"
             )
     return _copied(answer)
 

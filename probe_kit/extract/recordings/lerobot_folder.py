@@ -1,7 +1,7 @@
 """A LeRobotDataset of format 3.0 that lies here: features, files, their hashes, and its download.
 
-Rows and pictures are read from the very files that are hashed, never through a cache that is keyed by path and time,
-and never from a file that meta does not name.
+Rows and pictures are read from the very files that are hashed, without a cache that is keyed by path and time. A
+file that meta does not name is never read.
 """
 
 import glob
@@ -25,7 +25,7 @@ _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 @dataclass(frozen=True)
 class LeRobotFolder:
-    """A data set that lies here. repo, revision: of the hub, None for a folder. opened: its files by their hashes."""
+    """A data set that lies here. opened: its files by their hashes. repo, revision: of the hub, or None."""
 
     path: Path
     meta: LeRobotMeta
@@ -129,7 +129,7 @@ class LeRobotFolder:
         return list(range(count)) if episodes is None else list(episodes)
 
     def check_files(self, episodes: Sequence[int], cameras: Sequence[str]) -> None:
-        """Raise RecordingError if a file of these episodes is missing, or `data` holds one that meta does not name."""
+        """Raise RecordingError for a missing file of these episodes, or one of data that meta does not name."""
         self._check_unnamed()
         for episode in episodes:
             for file in self.files(episode, cameras):

@@ -66,7 +66,7 @@ class LeRobotFrames:
     def check(self, episodes: Sequence[int], cameras: Sequence[str]) -> None:
         """Raise RecordingError for what the numbers or the files of these episodes cannot be shown for.
 
-        Every video must be as long as its episodes say; of the first episode, the first and last picture are decoded.
+        Every video must be as long as its episodes say. Two pictures of the first episode are decoded.
         """
         for episode in episodes:
             self.numbers(episode, ())
@@ -106,16 +106,16 @@ class LeRobotFrames:
         with _parquet(self.folder, path) as parquet:
             if missing := [name for name in (_EPISODE, _INDEX) if name not in parquet.schema_arrow.names]:
                 raise RecordingError(
-                    f"{self._where(path)} has no column {missing[0]!r}; expected the columns of format 3.0. Copy the "
-                    "data set again"
+                    f"{self._where(path)} has no column {missing[0]!r}; expected the columns of format 3.0. Copy "
+                    "the data set again"
                 )
             table = parquet.read([_EPISODE, _INDEX])
         episodes, indices = (np.asarray(table.column(name).to_pylist(), np.float64) for name in (_EPISODE, _INDEX))
         named = {one.number: one for one in self.folder.meta.episodes if self.folder.path / one.file == path}
         if strange := [number for number in dict.fromkeys(episodes.tolist()) if number not in named]:
             raise RecordingError(
-                f"{self._where(path)} holds frames of episode {strange[0]:g}, which meta/episodes does not name in "
-                f"this file; expected {_listed(sorted(named))}. Copy the data set again, or repair its meta"
+                f"{self._where(path)} holds frames of episode {strange[0]:g}, which meta/episodes does not name "
+                f"in this file; expected {_listed(sorted(named))}. Copy the data set again, or repair its meta"
             )
         first = {}
         for number, one in named.items():
@@ -128,9 +128,9 @@ class LeRobotFrames:
             due = np.arange(one.length)
             if off := np.flatnonzero((rows - rows[0] != due) | (indices[rows] != one.start + due)).tolist():
                 raise RecordingError(
-                    f"{self._where(path)}, episode {number}: frame {off[0]} has the index {indices[rows[off[0]]]:g} "
-                    f"in row {rows[off[0]]}; expected the index {one.start + off[0]}, in row {rows[0] + off[0]}. "
-                    "Copy the data set again, or repair its indices"
+                    f"{self._where(path)}, episode {number}: frame {off[0]} has the index "
+                    f"{indices[rows[off[0]]]:g} in row {rows[off[0]]}; expected the index {one.start + off[0]}, "
+                    f"in row {rows[0] + off[0]}. Copy the data set again, or repair its indices"
                 )
             first[number] = int(rows[0])
         return _DataFile(path, first)
@@ -143,15 +143,15 @@ class LeRobotFrames:
         cells = column.to_pylist()
         if sizes := {len(cell) for cell in cells if isinstance(cell, list)} - {width}:
             raise RecordingError(
-                f"{where} has {sizes.pop()} numbers in the data and {width} in meta/info.json; expected the same. Copy "
-                "the data set again, or repair its meta"
+                f"{where} has {sizes.pop()} numbers in the data and {width} in meta/info.json; expected the "
+                "same. Copy the data set again, or repair its meta"
             )
         try:
             found = np.asarray(cells, np.float64).reshape(length, width)
         except (TypeError, ValueError) as error:
             raise RecordingError(
-                f"{where} holds no numbers ({str(error)[:200]}); meta/info.json says {own and own['dtype']}. Copy the "
-                "data set again, or repair its meta"
+                f"{where} holds no numbers ({str(error)[:200]}); meta/info.json says {own and own['dtype']}. "
+                "Copy the data set again, or repair its meta"
             ) from error
         return found.astype(np.float32).astype(np.float64) if own and own["dtype"] == "float32" else found
 
@@ -203,8 +203,9 @@ class LeRobotFrames:
             decoded = decode_video_frames(path, [moment], OFF_GRID_S, "pyav", return_uint8=True)
         except Exception as error:
             raise RecordingError(
-                f"{self.folder.path.name}: {part.file} shows no picture of {camera} at {moment:.4f} s, frame {frame} "
-                f"of episode {episode} ({type(error).__name__}: {str(error)[:300]}). Copy the data set again"
+                f"{self.folder.path.name}: {part.file} shows no picture of {camera} at {moment:.4f} s, frame "
+                f"{frame} of episode {episode} ({type(error).__name__}: {str(error)[:300]}). Copy the data set "
+                "again"
             ) from error
         return np.ascontiguousarray(decoded[0].numpy().transpose(1, 2, 0))
 
@@ -234,7 +235,8 @@ class LeRobotFrames:
                     found = lasts, float(stream.average_rate or 0)
             except (av.error.FFmpegError, IndexError, OSError) as error:
                 raise RecordingError(
-                    f"{self._where(path)} is no video that PyAV opens ({str(error)[:200]}). Copy the data set again"
+                    f"{self._where(path)} is no video that PyAV opens ({str(error)[:200]}). Copy the data set "
+                    "again"
                 ) from error
             self._lengths[path] = found
         return found
@@ -254,8 +256,8 @@ def _parquet(folder: LeRobotFolder, path: Path) -> Iterator[Any]:
             yield parquet
     except (pa.ArrowException, OSError) as error:
         raise RecordingError(
-            f"{folder.path.name}: {path.relative_to(folder.path)} cannot be read: {str(error)[:300]}. Copy the data "
-            "set again"
+            f"{folder.path.name}: {path.relative_to(folder.path)} cannot be read: {str(error)[:300]}. Copy the "
+            "data set again"
         ) from error
 
 

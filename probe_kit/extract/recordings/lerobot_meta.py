@@ -1,4 +1,4 @@
-"""The `meta` of a LeRobotDataset of format 3.0: features, tasks and episodes, and where meta contradicts itself."""
+"""The `meta` of a LeRobotDataset of format 3.0: features, tasks, episodes, and contradictions among them."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -106,17 +106,17 @@ class LeRobotMeta:
         return named if named is not None and (len(named),) == tuple(self.features[feature]["shape"]) else None
 
     def task(self, number: int) -> str:
-        """The text of a task. Raises RecordingError for a number that `meta` does not name once, or for no text."""
+        """The text of a task. Raises RecordingError for a number that is not named once, or that has no text."""
         texts = self._texts.get(number, [])
         if len(texts) != 1:
             raise RecordingError(
-                f"{self.name}: {TASKS} has {len(texts)} tasks of the number {number}, which a frame names; expected "
-                "one. Repair the data set, or give --instruction TEXT"
+                f"{self.name}: {TASKS} has {len(texts)} tasks of the number {number}, which a frame names; "
+                "expected one. Repair the data set, or give --instruction TEXT"
             )
         if not isinstance(texts[0], str) or not texts[0].strip():
             raise RecordingError(
-                f"{self.name}: {TASKS} has {texts[0]!r} as the task {number}, which a frame names; expected a text. "
-                "Repair the data set, or give --instruction TEXT"
+                f"{self.name}: {TASKS} has {texts[0]!r} as the task {number}, which a frame names; expected a "
+                "text. Repair the data set, or give --instruction TEXT"
             )
         return texts[0]
 
@@ -134,22 +134,22 @@ class LeRobotMeta:
         numbers = [one.number for one in self.episodes]
         if twice := [number for number, count in Counter(numbers).items() if count > 1]:
             raise RecordingError(
-                f"{self.name}: {EPISODES} has {numbers.count(twice[0])} lines of episode {twice[0]}; expected one. "
-                f"Remove the file that does not belong to the data set. {_AGAIN}"
+                f"{self.name}: {EPISODES} has {numbers.count(twice[0])} lines of episode {twice[0]}; expected "
+                f"one. Remove the file that does not belong to the data set. {_AGAIN}"
             )
         total = self.info.get("total_episodes", len(numbers))
         if lacking := sorted(set(range(max((total, *numbers)) if numbers else total)) - set(numbers)):
             raise RecordingError(
-                f"{self.name}: {EPISODES} has {len(numbers)} episodes, up to number {max(numbers, default=0)}, and "
-                f"not episode {lacking[0]}; expected all from 0 on. Give the episodes new numbers, or take the data "
-                "set as it was before an episode was removed"
+                f"{self.name}: {EPISODES} has {len(numbers)} episodes, up to number {max(numbers, default=0)}, "
+                f"and not episode {lacking[0]}; expected all from 0 on. Give the episodes new numbers, or take "
+                "the data set as it was before an episode was removed"
             )
         expected = 0
         for one in self.episodes:
             if one.start != expected:
                 raise RecordingError(
-                    f"{self.name}: {EPISODES} says that episode {one.number} begins at index {one.start}; expected "
-                    f"{expected}, where the one before it ends. {_AGAIN}"
+                    f"{self.name}: {EPISODES} says that episode {one.number} begins at index {one.start}; "
+                    f"expected {expected}, where the one before it ends. {_AGAIN}"
                 )
             expected += one.length
         for total_name, count in (
@@ -188,9 +188,9 @@ class LeRobotMeta:
                 part = one.videos[camera]
                 if not abs(part.end - part.begin - one.length / self.fps) <= slack or part.begin < -slack:
                     raise RecordingError(
-                        f"{self.name}: {EPISODES} says that {part.begin:.4f} to {part.end:.4f} s of {part.file} show "
-                        f"episode {one.number}, of {one.length} frames; expected {one.length / self.fps:.4f} s at "
-                        f"{self.fps:g} frames per second. {_AGAIN}"
+                        f"{self.name}: {EPISODES} says that {part.begin:.4f} to {part.end:.4f} s of {part.file} "
+                        f"show episode {one.number}, of {one.length} frames; expected "
+                        f"{one.length / self.fps:.4f} s at {self.fps:g} frames per second. {_AGAIN}"
                     )
                 by_file.setdefault(part.file, []).append((part, one.number))
             for file, parts in by_file.items():
@@ -199,8 +199,8 @@ class LeRobotMeta:
                     if after.begin < before.end - slack:
                         raise RecordingError(
                             f"{self.name}: {EPISODES} says that {file} shows episode {first} until "
-                            f"{before.end:.4f} s and episode {second} from {after.begin:.4f} s on; expected ranges "
-                            f"that do not overlap. {_AGAIN}"
+                            f"{before.end:.4f} s and episode {second} from {after.begin:.4f} s on; expected "
+                            f"ranges that do not overlap. {_AGAIN}"
                         )
 
 
@@ -244,7 +244,8 @@ def _read_info(root: Path, files: HashedFiles) -> Mapping[str, Any]:
         )
     if (stored := info.get("storage_format", PARQUET)) != PARQUET:
         raise RecordingError(
-            f"{root.name} has the storage_format {stored!r}; this version reads {PARQUET!r}. Convert it with lerobot"
+            f"{root.name} has the storage_format {stored!r}; this version reads {PARQUET!r}. Convert it with "
+            "lerobot"
         )
     if missing := [name for name in (TASKS, EPISODES) if not (root / name).exists()]:
         raise RecordingError(f"{root.name} has no {missing[0]}. Copy the data set again")
@@ -302,8 +303,8 @@ def _read_tasks(root: Path, files: HashedFiles) -> tuple[tuple[Any, Any], ...]:
     ]
     if "task_index" not in table.column_names or len(columns) != 1:
         raise RecordingError(
-            f"{root.name}: {TASKS} has the columns {', '.join(table.column_names) or 'none'}; expected task_index, "
-            f"and the texts of the tasks in one column {_TASK!r} or in the index of pandas. {_AGAIN}"
+            f"{root.name}: {TASKS} has the columns {', '.join(table.column_names) or 'none'}; expected "
+            f"task_index, and the texts of the tasks in one column {_TASK!r} or in the index of pandas. {_AGAIN}"
         )
     return tuple(zip(table.column("task_index").to_pylist(), table.column(columns[0]).to_pylist(), strict=True))
 
@@ -355,8 +356,8 @@ def _check_line(line: Mapping[str, Any], where: str) -> None:
             )
     if line[_LENGTH] < 1 or line[_TO] - line[_FROM] != line[_LENGTH]:
         raise RecordingError(
-            f"{where} says that episode {line[_NUMBER]} has {line[_LENGTH]} frames, and the indices {line[_FROM]} to "
-            f"{line[_TO]}; expected at least one frame, and as many indices as frames. {_AGAIN}"
+            f"{where} says that episode {line[_NUMBER]} has {line[_LENGTH]} frames, and the indices "
+            f"{line[_FROM]} to {line[_TO]}; expected at least one frame, and as many indices as frames. {_AGAIN}"
         )
 
 

@@ -181,6 +181,22 @@ class Recording:
             )
         return replace(self, source=replace(self.source, cameras=pairs))
 
+    def check(self) -> None:
+        """Raise RecordingError for files, numbers or pictures of the chosen episodes that cannot be shown.
+
+        Pictures are those of the mapped cameras, or of all where none is mapped. Of a hub data set they are not
+        here before that.
+        """
+        every = [] if self.folder.repo is not None else self.folder.cameras
+        features = self.features or every
+        if strange := [feature for feature in features if feature not in self.folder.cameras]:
+            raise RecordingError(
+                f"{self.folder.path.name} has no picture {strange[0]!r}; it has "
+                f"{', '.join(self.folder.cameras) or 'none'}. Correct --camera"
+            )
+        self.folder.check_files(self.episodes, features)
+        self.reader.check(self.episodes, features)
+
     @property
     def instructions(self) -> tuple[str, ...]:
         """Every instruction once, in the order of their letters."""

@@ -1,4 +1,4 @@
-"""Units of states and order of actions: what a source gives is compared with what a checkpoint says, on every source.
+"""Units of states and order of actions: every source is compared with the checkpoint that reads and acts.
 
 States of the first inferences are compared with the checkpoint's statistics, and names of actions with its names.
 """
@@ -43,8 +43,8 @@ def check_units(
     worst = ", ".join(f"{names[one]} {shares[one]:.0%}" for one in np.flatnonzero(shares > MOST_UNUSUAL))
     raise UnitsError(
         f"{where}: of the states many values lie outside the statistics of {policy.card.checkpoint} ({worst}); "
-        f"expected at most {MOST_UNUSUAL:.0%} of each number. The units or the robot differ: take a checkpoint that "
-        "was trained on such states, or accept it with --accept-units"
+        f"expected at most {MOST_UNUSUAL:.0%} of each number. The units or the robot differ: take a checkpoint "
+        "that was trained on such states, or accept it with --accept-units"
     )
 
 

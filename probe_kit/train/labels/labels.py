@@ -225,7 +225,7 @@ def _shown(run: RunReader, by_frame: bool) -> dict[tuple[str, int], list[tuple[s
 def _check_recorded(
     run: RunReader, table: LabelTable, episodes: Sequence[str], frames: Sequence[int] | None
 ) -> None:
-    """Raise UsageError for an episode that the data set does not have, or a frame that an episode does not have."""
+    """Raise UsageError for an episode that the data set lacks, or a frame that its episode lacks."""
     count: int = run.settings["recording"][RECORDED_EPISODES]  # type: ignore[attr-defined]
     rows = zip(run.episodes[SOURCE].tolist(), run.episodes["recorded_frames"].tolist(), strict=True)
     lengths = {str(source): int(length) for source, length in rows}
@@ -237,9 +237,9 @@ def _check_recorded(
             )
         if frames is not None and frames[row] >= lengths.get(episode, frames[row] + 1):
             raise UsageError(
-                f"{table.where(row, FRAME)} is {frames[row]}; episode {episode} of the data set of {run.location} has "
-                f"{lengths[episode]} frames, counted from 0 in each episode. Correct the table, which may count from "
-                "1, or by the column `index` of the data set"
+                f"{table.where(row, FRAME)} is {frames[row]}; episode {episode} of the data set of "
+                f"{run.location} has {lengths[episode]} frames, counted from 0 in each episode. Correct the "
+                "table, which may count from 1, or by the column `index` of the data set"
             )
 
 

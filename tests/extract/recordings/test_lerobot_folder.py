@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from probe_kit.env import SceneSpec
-from probe_kit.errors import RecordingError, SettingsMismatchError, UsageError
+from probe_kit.errors import RecordingError, SettingsMismatchError, UnitsError, UsageError
 from probe_kit.extract import (
     ExtractSettings,
     LeRobotSource,
@@ -41,7 +41,10 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("_lerobot_cache")]
 
 
 def settings(folder: Path, **source: Any) -> ExtractSettings:
-    return ExtractSettings("pi0-tiny", source=LeRobotSource(str(folder), **source), env_workers=0)
+    accept = source.pop("accept_units", False)
+    return ExtractSettings(
+        "pi0-tiny", source=LeRobotSource(str(folder), **source), env_workers=0, accept_units=accept
+    )
 
 
 def shown(folder: Path, out: Path, policy: Pi0, **source: Any) -> Run:
@@ -359,7 +362,7 @@ def test_states_far_outside_the_checkpoints_statistics_are_refused_unless_accept
     scale = np.array([1000, 1000, 1000, 1, 1, 1, 1, 1], np.float32)
     other = [[replace(one, state=one.state * scale) for one in episode] for episode in observations(1)]
     folder = write_recording(tmp_path / "rec", other)
-    with pytest.raises(RecordingError, match=r"outside the statistics of embedded \(s0 100%.*--accept-units"):
+    with pytest.raises(UnitsError, match=r"outside the statistics of embedded \(s0 100%.*--accept-units"):
         prepare(settings(folder), policy=pi0_tiny)
     assert prepare(settings(folder, accept_units=True), policy=pi0_tiny).plan.episodes
 
@@ -405,7 +408,7 @@ def test_trap_1_videos_are_decoded_without_torchcodec_and_without_a_word(tmp_pat
         "sys.modules['torchcodec'] = None\n"
         "from probe_kit.extract import LeRobotSource\n"
         "from probe_kit.extract.recordings.lerobot_folder import LeRobotFrames, open_lerobot\n"
-        f"frames = LeRobotFrames(open_lerobot(LeRobotSource({str(folder)!r})), [0])\n"
+        f"frames = LeRobotFrames(open_lerobot(LeRobotSource({str(folder)!r})))\n"
         f"seen = frames.pictures(0, 3, [{CAMERA!r}])[{CAMERA!r}]\n"
         "print(seen.shape, abs(int(seen[..., 2].mean()) - 60) < 10)\n"
     )

@@ -211,11 +211,11 @@ def test_pictures_of_other_modes_are_refused(copy: Path, mode: str) -> None:
 
 def test_half_a_picture_is_refused_by_its_frame(copy: Path) -> None:
     change(copy / DATA, CAMERA, lambda rows: [{**row, "bytes": row["bytes"][:400]} for row in rows])
-    with pytest.raises(RecordingError, match="the picture of .* at frame 0 of episode 0 cannot be decoded"):
+    with pytest.raises(RecordingError, match=r"the picture of .* at frame 0 of episode 0 cannot be decoded"):
         shown_states(copy)
 
 
-# -- meta and data contradict each other ---------------------------------------------------------------------------
+# -- meta and data contradict each other --------------------------------------------------------------------------
 
 
 def remove_episode(folder: Path) -> None:
@@ -331,7 +331,7 @@ def test_names_of_numbers_are_a_list_groups_or_places(copy: Path, named: Any, ex
     assert opened(copy).names(STATE) == expected
 
 
-# -- tasks ---------------------------------------------------------------------------------------------------------
+# -- tasks --------------------------------------------------------------------------------------------------------
 
 TEXTS = ["Put the cube on the gray shape", "Put the cube on the red shape"]
 
@@ -387,7 +387,7 @@ def test_tasks_that_are_no_texts_are_refused(
         tasks(copy)
 
 
-# -- videos --------------------------------------------------------------------------------------------------------
+# -- videos -------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -459,3 +459,68 @@ def test_time_ranges_of_videos_that_do_not_fit_are_refused(filmed: Path, tmp_pat
     break_it(folder)
     with pytest.raises(RecordingError, match=message):
         shown_states(folder)
+
+
+# -- what is shown, and against what ------------------------------------------------------------------------------
+
+
+def shown_command(folder: Path, *options: str) -> str:
+    """What `dataset show` prints; the message of its error."""
+    from typer.testing import CliRunner
+
+    from probe_kit.cli import app
+
+    result = CliRunner().invoke(app, ["dataset", "show", str(folder), *options])
+    return str(result.exception) if result.exception else result.output
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda f: next((f / "data").rglob("*.parquet")).unlink(), "file-000.parquet of episode 0 is missing"),
+        (lambda f: change(f / DATA, "timestamp", lambda rows: [*rows[:-1], 9.0]), "line 6 is frame 6 at 9.0000 s"),
+        (
+            lambda f: change(f / DATA, CAMERA, lambda rows: [{"bytes": b"", "path": None} for _ in rows]),
+            "be decoded",
+        ),
+        (lambda f: shutil.copy(f / DATA, f / "data/chunk-000/file-001.parquet"), "meta/episodes names no episode"),
+    ],
+)
+def test_a_data_set_is_not_described_where_extract_would_refuse_it(
+    copy: Path, break_it: Callable[[Path], None], message: str
+) -> None:
+    assert "3 of 3, 5 to 7 frames each" in shown_command(copy)
+    break_it(copy)
+    assert message in shown_command(copy, "--instruction", "Put the cube on the red shape")
+
+
+def test_a_data_set_in_other_units_is_shown_and_then_refused_unless_accepted(copy: Path) -> None:
+    change(copy / DATA, STATE, lambda rows: [[1000 * number for number in row] for row in rows])
+    assert "lie outside the statistics" in shown_command(copy, "--model", "pi0-tiny")
+    assert "outside the checkpoint's statistics: s0 100" in shown_command(
+        copy, "--model", "pi0-tiny", "--accept-units"
+    )
+
+
+@pytest.mark.parametrize(
+    ("recorded", "own", "reason"),
+    [
+        ([*"yxzabcg"], tuple("xyzabcg"), "named in another order: y, x, z"),
+        ([*"xyzabch"], tuple("xyzabcg"), "named otherwise: x, y, z"),
+        ([*"xyzabcg"], tuple("xyzabcg"), "outside the statistics"),
+        (None, tuple("xyzabcg"), "outside the statistics"),
+        ([*"xyzabcg"], None, "outside the statistics"),
+    ],
+)
+def test_actions_are_compared_with_recorded_ones_of_the_same_names_in_the_same_order_only(
+    copy: Path, pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch, recorded: Any, own: Any, reason: str
+) -> None:
+    """The recorded numbers themselves lie outside the statistics."""
+    features = json.loads((copy / "meta/info.json").read_text("utf-8"))["features"]
+    features["action"]["names"] = recorded
+    edit_info(copy, features=features)
+    monkeypatch.setattr(Pi0, "action_names", property(lambda _self: own))
+    prepared = prepare(
+        ExtractSettings("pi0-tiny", source=LeRobotSource(str(copy)), env_workers=0), policy=pi0_tiny
+    )
+    assert reason in prepared.plan.selection["recording"]["other_actions"]

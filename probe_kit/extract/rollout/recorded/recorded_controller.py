@@ -13,7 +13,7 @@ from probe_kit.extract.recordings.lerobot_source import ACTION, STATE
 from probe_kit.extract.recordings.recorded_plan import Recording
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
 from probe_kit.extract.rollout.recorded.recorded_stage import example_of
-from probe_kit.extract.rollout.units import MOST_UNUSUAL, other_order, unusual_shares
+from probe_kit.extract.rollout.units import MOST_UNUSUAL, check_units, other_order, unusual_shares
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
@@ -67,8 +67,7 @@ def fit(recording: Recording, policy: "Policy") -> Fitted:
     """
     recording = recording.mapped(policy.card.cameras)
     fetched(recording.folder, recording.episodes, recording.features)
-    recording.folder.check_files(recording.episodes, recording.features)
-    recording.reader.check(recording.episodes, recording.features)
+    recording.check()
     try:
         policy = policy.with_cameras([camera for camera, _ in recording.source.cameras])
     except ObservationError as error:
@@ -143,6 +142,13 @@ def _other_actions(
     names = recording.folder.names(ACTION)
     far = ", ".join(f"{names[one]} {shares[one]:.0%}" for one in np.flatnonzero(shares > MOST_UNUSUAL))
     return f"recorded actions lie outside the statistics of the checkpoint ({far}), so the units differ"
+
+
+def check_recorded_units(fitted: Fitted, accepted: bool) -> None:
+    """Raise UnitsError for recorded states far outside the checkpoint's statistics, unless that is accepted."""
+    folder = fitted.recording.folder
+    names = folder.names(STATE) if fitted.unusual.size else []
+    check_units(fitted.unusual, names, f"{folder.path.name}, {STATE}", fitted.policy, accepted)
 
 
 def check_predictions(chunks: Any, count: int) -> None:

@@ -63,8 +63,9 @@ class RecordedStage(TimedStage):
         now = recording.folder.content_blake2b(planned.source_episode, recording.features)
         if now != planned.content:
             raise RecordingError(
-                f"{recording.folder.path.name}: the files of {planned.item_id} were changed after the run was planned: "
-                f"their hash was {planned.content}, now it is {now}. Leave the data set as it is until the run ends"
+                f"{recording.folder.path.name}: the files of {planned.item_id} were changed after the run was "
+                f"planned: their hash was {planned.content}, now it is {now}. Leave the data set as it is until "
+                "the run ends"
             )
 
     @property
