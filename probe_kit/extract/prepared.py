@@ -143,7 +143,7 @@ def load(
         controller: ActingController | AnswerController = _asking(settings, suite, answer_model)
     else:
         controller = _acting(settings, instructions_of(asked), policy)
-        if isinstance(controller, PolicyController):
+        if isinstance(controller, PolicyController) and isinstance(settings, ExtractSettings):
             _check_scene_units(settings, asked, controller.policy)
     if isinstance(settings, ExtractSettings) and isinstance(controller, PolicyController):
         settings = settings.with_every_call(controller.execute)

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
+from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import RecordingError
 from probe_kit.extract.recordings.lerobot_folder import LeRobotFolder
-from probe_kit.extract.recordings.lerobot_meta import HALF, EpisodeMeta
+from probe_kit.extract.recordings.lerobot_meta import EXTRA, HALF, EpisodeMeta
 
 OFF_GRID_S = 1e-4
 """Seconds by which a timestamp may differ from frame / fps, and a picture of a video from its timestamp."""
@@ -224,22 +225,20 @@ class LeRobotFrames:
         """Seconds and frames per second of a video, by its header."""
         import av
 
-        found = self._lengths.get(path)
-        if found is None:
+        if path not in self._lengths:
             self.folder.opened.check(path)
             try:
                 with av.open(str(path)) as container:
                     stream = container.streams.video[0]
                     base = float(stream.time_base or 0)
                     lasts = stream.duration * base if stream.duration else (container.duration or 0) / 1e6
-                    found = lasts, float(stream.average_rate or 0)
+                    self._lengths[path] = lasts, float(stream.average_rate or 0)
             except (av.error.FFmpegError, IndexError, OSError) as error:
                 raise RecordingError(
                     f"{self._where(path)} is no video that PyAV opens ({str(error)[:200]}). Copy the data set "
                     "again"
                 ) from error
-            self._lengths[path] = found
-        return found
+        return self._lengths[path]
 
     def _where(self, path: Path) -> str:
         return f"{self.folder.path.name}: {path.relative_to(self.folder.path)}"
@@ -248,9 +247,7 @@ class LeRobotFrames:
 @contextmanager
 def _parquet(folder: LeRobotFolder, path: Path) -> Iterator[Any]:
     """A data file, opened as the file that was hashed. Raises RecordingError for one that cannot be read."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
+    pa, pq = require("pyarrow", EXTRA), require("pyarrow.parquet", EXTRA)
     try:
         with folder.opened.open(path) as opened, pq.ParquetFile(opened) as parquet:
             yield parquet

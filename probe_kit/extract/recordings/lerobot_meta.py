@@ -273,9 +273,7 @@ def _is_feature(own: Any) -> bool:
 
 def _read_table(root: Path, files: HashedFiles, path: Path, columns: Sequence[str] | None = None) -> Any:
     """The table of a Parquet file of meta. Raises RecordingError for one that cannot be read or lacks a column."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
+    pa, pq = require("pyarrow", EXTRA), require("pyarrow.parquet", EXTRA)
     name = path.relative_to(root)
     try:
         with files.open(path) as opened, pq.ParquetFile(opened) as parquet:
@@ -288,8 +286,7 @@ def _read_table(root: Path, files: HashedFiles, path: Path, columns: Sequence[st
 
 def _read_tasks(root: Path, files: HashedFiles) -> tuple[tuple[Any, Any], ...]:
     """Number and text of every task. lerobot has the texts in the index of pandas; others in a column `task`."""
-    import pyarrow.types as types
-
+    types = require("pyarrow.types", EXTRA)
     table = _read_table(root, files, root / TASKS)
     index = (table.schema.pandas_metadata or {}).get("index_columns", [])
     candidates = dict.fromkeys([_TASK, *(name for name in index if isinstance(name, str)), _UNNAMED_INDEX])

@@ -16,11 +16,12 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from probe_kit.errors import RecordingError, SettingsMismatchError
+from probe_kit.errors import RecordingError, SettingsMismatchError, UnitsError
 from probe_kit.extract import ExtractSettings, LeRobotSource, prepare
 from probe_kit.extract.recordings.hashed_files import HashedFiles
 from probe_kit.extract.recordings.lerobot_folder import LeRobotFolder, open_lerobot
 from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
+from probe_kit.extract.source_commands.dataset_commands import show_dataset
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from tests.extract.recordings.conftest import observations
 from tests.support.lerobot_recordings import CAMERA, FPS, write_recording
@@ -464,21 +465,14 @@ def test_time_ranges_of_videos_that_do_not_fit_are_refused(filmed: Path, tmp_pat
 # -- what is shown, and against what ------------------------------------------------------------------------------
 
 
-def shown_command(folder: Path, *options: str) -> str:
-    """What `dataset show` prints; the message of its error."""
-    from typer.testing import CliRunner
-
-    from probe_kit.cli import app
-
-    result = CliRunner().invoke(app, ["dataset", "show", str(folder), *options])
-    return str(result.exception) if result.exception else result.output
-
-
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
-        (lambda f: next((f / "data").rglob("*.parquet")).unlink(), "file-000.parquet of episode 0 is missing"),
-        (lambda f: change(f / DATA, "timestamp", lambda rows: [*rows[:-1], 9.0]), "line 6 is frame 6 at 9.0000 s"),
+        (lambda f: next((f / "data").rglob("*.parquet")).unlink(), r"file-000\.parquet of episode 0 is missing"),
+        (
+            lambda f: change(f / DATA, "timestamp", lambda rows: [*rows[:-1], 9.0]),
+            r"line 6 is frame 6 at 9\.0000 s",
+        ),
         (
             lambda f: change(f / DATA, CAMERA, lambda rows: [{"bytes": b"", "path": None} for _ in rows]),
             "be decoded",
@@ -487,19 +481,23 @@ def shown_command(folder: Path, *options: str) -> str:
     ],
 )
 def test_a_data_set_is_not_described_where_extract_would_refuse_it(
-    copy: Path, break_it: Callable[[Path], None], message: str
+    copy: Path, break_it: Callable[[Path], None], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "3 of 3, 5 to 7 frames each" in shown_command(copy)
+    show_dataset(str(copy))
+    assert "3 of 3, 5 to 7 frames each" in capsys.readouterr().out
     break_it(copy)
-    assert message in shown_command(copy, "--instruction", "Put the cube on the red shape")
+    with pytest.raises(RecordingError, match=message):
+        show_dataset(str(copy), instruction="Put the cube on the red shape")
 
 
-def test_a_data_set_in_other_units_is_shown_and_then_refused_unless_accepted(copy: Path) -> None:
+def test_a_data_set_in_other_units_is_shown_and_then_refused_unless_accepted(
+    copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     change(copy / DATA, STATE, lambda rows: [[1000 * number for number in row] for row in rows])
-    assert "lie outside the statistics" in shown_command(copy, "--model", "pi0-tiny")
-    assert "outside the checkpoint's statistics: s0 100" in shown_command(
-        copy, "--model", "pi0-tiny", "--accept-units"
-    )
+    with pytest.raises(UnitsError, match=r"rec, observation\.state: .* lie outside the statistics"):
+        show_dataset(str(copy), model="pi0-tiny")
+    assert "outside the checkpoint's statistics: s0 100" in capsys.readouterr().out
+    show_dataset(str(copy), model="pi0-tiny", accept_units=True)
 
 
 @pytest.mark.parametrize(
