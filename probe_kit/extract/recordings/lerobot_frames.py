@@ -1,5 +1,6 @@
 """Frames and numbers of chosen episodes, read from the files that the data set's meta names for them."""
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -193,15 +194,16 @@ class LeRobotFrames:
         return np.asarray(upright).copy()
 
     def _of_video(self, episode: int, frame: int, camera: str) -> NDArray[np.uint8]:
-        from lerobot.datasets.video_utils import decode_video_frames
-
         own = self.folder.episode(episode)
         part = own.videos[camera]
         path = self.folder.path / part.file
         self.folder.opened.check(path)
         moment = part.begin + float(self.numbers(episode, ())["timestamp"][frame, 0])
         try:
-            decoded = decode_video_frames(path, [moment], OFF_GRID_S, "pyav", return_uint8=True)
+            with _quiet():
+                from lerobot.datasets.video_utils import decode_video_frames
+
+                decoded = decode_video_frames(path, [moment], OFF_GRID_S, "pyav", return_uint8=True)
         except Exception as error:
             raise RecordingError(
                 f"{self.folder.path.name}: {part.file} shows no picture of {camera} at {moment:.4f} s, frame "
@@ -242,6 +244,17 @@ class LeRobotFrames:
 
     def _where(self, path: Path) -> str:
         return f"{self.folder.path.name}: {path.relative_to(self.folder.path)}"
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """No log of lerobot, which warns in each process that it takes the decoder it is told to take."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(level)
 
 
 @contextmanager
