@@ -31,11 +31,16 @@ from probe_kit.extract.rollout.own_environments.environment_controller import (
     environment_plan,
     fit_environment,
 )
-from probe_kit.extract.rollout.preflight import first_states, run_preflight
+from probe_kit.extract.rollout.preflight import (
+    FIRST_EPISODES,
+    check_units,
+    first_states,
+    run_preflight,
+    unusual_shares,
+)
 from probe_kit.extract.rollout.recorded.recorded_controller import check_recorded_units, fit, recorded_controller
 from probe_kit.extract.rollout.recorded.recorded_stage import example_of
 from probe_kit.extract.rollout.settings_checks import check_embodiment, check_meaningless, check_unreachable
-from probe_kit.extract.rollout.units import FIRST_EPISODES, check_units, unusual_shares
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
 from probe_kit.extract.store.locations.location import Location

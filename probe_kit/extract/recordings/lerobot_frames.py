@@ -248,7 +248,7 @@ class LeRobotFrames:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """No log of lerobot, which warns in each process that it takes the decoder it is told to take."""
+    """No log of lerobot, which warns of its other decoder once in each process."""
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

@@ -21,8 +21,8 @@ from probe_kit.extract.own_environments.opening import (
 from probe_kit.extract.recordings.recorded_plan import SIDE
 from probe_kit.extract.rollout.controllers import Turn
 from probe_kit.extract.rollout.own_environments.environment_stage import cameras_of
+from probe_kit.extract.rollout.preflight import FIRST_EPISODES, exchanged_names, unusual_shares
 from probe_kit.extract.rollout.recorded.recorded_controller import RecordedController, check_predictions
-from probe_kit.extract.rollout.units import FIRST_EPISODES, exchanged_names, unusual_shares
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.hooks.checkpoints.containment import copied

@@ -12,8 +12,8 @@ from probe_kit.extract.recordings.lerobot_folder import fetched
 from probe_kit.extract.recordings.lerobot_source import ACTION, STATE
 from probe_kit.extract.recordings.recorded_plan import Recording
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
+from probe_kit.extract.rollout.preflight import MOST_UNUSUAL, check_units, other_order, unusual_shares
 from probe_kit.extract.rollout.recorded.recorded_stage import example_of
-from probe_kit.extract.rollout.units import MOST_UNUSUAL, check_units, other_order, unusual_shares
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
