@@ -1,7 +1,7 @@
 """Checks before the first episode: a test build of the scene, units of its states, and the order of actions.
 
-A source is a scene, a recording or an environment. States of its first inferences are compared with the statistics of
-the checkpoint, and names of actions with the names that the checkpoint has.
+A source is a scene, a recording or an environment. States of its first inferences are compared with the statistics
+of the checkpoint, and names of actions with the names that the checkpoint has.
 """
 
 from collections.abc import Iterable, Sequence
