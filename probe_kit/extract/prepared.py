@@ -245,6 +245,14 @@ def _prepared_recording(settings: ExtractSettings, recording: Recording, policy:
     return Prepared(settings, planned, controller.identity, controller)
 
 
+def check_recording(settings: ExtractSettings, recording: Recording) -> None:
+    """Raise as `load` what a model, its options and its words say of a recording before weights are loaded."""
+    check_model(settings, tuple(SCRIPTED))
+    check_meaningless(settings)
+    check_words(settings, recording.instructions, tuple(SCRIPTED))
+    _check_instructions(settings, recording.instructions, fetch=True)
+
+
 def open_recording(source: LeRobotSource) -> Recording:
     """What `source` chooses, with the numbers of the chosen episodes here. Raises as `open_lerobot`."""
     recording = Recording.of(open_lerobot(source), source)

@@ -91,6 +91,14 @@ class LeRobotFolder:
         """Frames of every episode."""
         return [one.length for one in self.meta.episodes]
 
+    @cached_property
+    def by_file(self) -> Mapping[Path, list[EpisodeMeta]]:
+        """The episodes of every data file."""
+        found: dict[Path, list[EpisodeMeta]] = {}
+        for one in self.meta.episodes:
+            found.setdefault(self.path / one.file, []).append(one)
+        return found
+
     def episode(self, number: int) -> EpisodeMeta:
         """What meta says of an episode."""
         return self.meta.episodes[number]
@@ -141,7 +149,7 @@ class LeRobotFolder:
 
     def _check_unnamed(self) -> None:
         """Raise RecordingError for a Parquet file of data that no episode is in; hidden files are none."""
-        named = {self.path / one.file for one in self.meta.episodes}
+        named = set(self.by_file)
         folders = {self.path / one.file.parts[0] for one in self.meta.episodes if len(one.file.parts) > 1}
         present = {path for folder in folders for path in folder.rglob("*.parquet") if path.name[0] != "."}
         if unnamed := sorted(present - named - set((self.path / "meta").rglob("*.parquet"))):

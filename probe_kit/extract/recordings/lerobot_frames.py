@@ -20,6 +20,8 @@ from probe_kit.extract.recordings.lerobot_meta import EXTRA, HALF, EpisodeMeta
 
 OFF_GRID_S = 1e-4
 """Seconds by which a timestamp may differ from frame / fps, and a picture of a video from its timestamp."""
+MOST_AT_ONCE = 32_000_000
+"""Bytes of columns that are read of a whole file, so that not every episode opens it."""
 OTHER_RATE = 0.05
 """Share by which the frame rate of a video may differ from the data set's."""
 _EPISODE, _INDEX = "episode_index", "index"
@@ -91,7 +93,7 @@ class LeRobotFrames:
         return latest.slice(first - begin, own.length)
 
     def _read(self, path: Path, columns: Sequence[str], first: int, end: int) -> tuple[Any, int]:
-        """The row groups that hold rows `first` to `end`, and the first row of them."""
+        """Row groups that hold rows `first` to `end`, or all where they are small, and the first row of them."""
         with _parquet(self.folder, path) as parquet:
             if missing := [name for name in columns if name not in parquet.schema_arrow.names]:
                 raise RecordingError(
@@ -101,6 +103,8 @@ class LeRobotFrames:
             sizes = [parquet.metadata.row_group(number).num_rows for number in range(parquet.num_row_groups)]
             ends = np.cumsum(sizes)
             groups = np.flatnonzero((ends > first) & (ends - sizes < end))
+            if _size_of(parquet.metadata, columns) <= MOST_AT_ONCE:
+                groups = np.flatnonzero(sizes)
             return parquet.read_row_groups(groups.tolist(), columns=list(columns)), int((ends - sizes)[groups[0]])
 
     def _scanned(self, path: Path) -> _DataFile:
@@ -113,28 +117,30 @@ class LeRobotFrames:
                 )
             table = parquet.read([_EPISODE, _INDEX])
         episodes, indices = (np.asarray(table.column(name).to_pylist(), np.float64) for name in (_EPISODE, _INDEX))
-        named = {one.number: one for one in self.folder.meta.episodes if self.folder.path / one.file == path}
-        if strange := [number for number in dict.fromkeys(episodes.tolist()) if number not in named]:
+        named = {one.number: one for one in self.folder.by_file[path]}
+        begins = dict(zip(*(part.tolist() for part in np.unique(episodes, return_index=True)), strict=True))
+        counts = dict(zip(*(part.tolist() for part in np.unique(episodes, return_counts=True)), strict=True))
+        if strange := [number for number in begins if number not in named]:
             raise RecordingError(
                 f"{self._where(path)} holds frames of episode {strange[0]:g}, which meta/episodes does not name "
                 f"in this file; expected {_listed(sorted(named))}. Copy the data set again, or repair its meta"
             )
         first = {}
         for number, one in named.items():
-            rows = np.flatnonzero(episodes == number)
-            if rows.size != one.length:
+            if (count := counts.get(number, 0)) != one.length:
                 raise RecordingError(
-                    f"{self._where(path)} holds {rows.size} frames of episode {number}; meta/episodes says "
+                    f"{self._where(path)} holds {count} frames of episode {number}; meta/episodes says "
                     f"{one.length}. Copy the data set again, or repair its meta"
                 )
-            due = np.arange(one.length)
-            if off := np.flatnonzero((rows - rows[0] != due) | (indices[rows] != one.start + due)).tolist():
+            begin = begins[number]
+            own, due = slice(begin, begin + one.length), one.start + np.arange(one.length)
+            if off := np.flatnonzero((episodes[own] != number) | (indices[own] != due)).tolist():
                 raise RecordingError(
-                    f"{self._where(path)}, episode {number}: frame {off[0]} has the index "
-                    f"{indices[rows[off[0]]]:g} in row {rows[off[0]]}; expected the index {one.start + off[0]}, "
-                    f"in row {rows[0] + off[0]}. Copy the data set again, or repair its indices"
+                    f"{self._where(path)}: row {begin + off[0]} has the index {indices[own][off[0]]:g} and is of "
+                    f"episode {episodes[own][off[0]]:g}; expected the index {due[off[0]]} of episode {number}. "
+                    "Copy the data set again, or repair its indices"
                 )
-            first[number] = int(rows[0])
+            first[number] = begin
         return _DataFile(path, first)
 
     def _values(self, episode: int, name: str, column: Any) -> NDArray[np.float64]:
@@ -269,6 +275,17 @@ def _parquet(folder: LeRobotFolder, path: Path) -> Iterator[Any]:
             f"{folder.path.name}: {path.relative_to(folder.path)} cannot be read: {str(error)[:300]}. Copy the "
             "data set again"
         ) from error
+
+
+def _size_of(metadata: Any, columns: Sequence[str]) -> int:
+    """Bytes of some columns of a Parquet file, uncompressed."""
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    chunks = (group.column(number) for group in groups for number in range(group.num_columns))
+    return sum(
+        chunk.total_uncompressed_size
+        for chunk in chunks
+        if any(chunk.path_in_schema == name or chunk.path_in_schema.startswith(f"{name}.") for name in columns)
+    )
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -286,24 +286,17 @@ def _read_table(root: Path, files: HashedFiles, path: Path, columns: Sequence[st
 
 def _read_tasks(root: Path, files: HashedFiles) -> tuple[tuple[Any, Any], ...]:
     """Number and text of every task. lerobot has the texts in the index of pandas; others in a column `task`."""
-    types = require("pyarrow.types", EXTRA)
     table = _read_table(root, files, root / TASKS)
     index = (table.schema.pandas_metadata or {}).get("index_columns", [])
     candidates = dict.fromkeys([_TASK, *(name for name in index if isinstance(name, str)), _UNNAMED_INDEX])
-    columns = [
-        name
-        for name in candidates
-        if name in table.column_names
-        and (
-            types.is_string(table.schema.field(name).type) or types.is_large_string(table.schema.field(name).type)
-        )
-    ]
-    if "task_index" not in table.column_names or len(columns) != 1:
+    columns = [tuple(table.column(name).to_pylist()) for name in candidates if name in table.column_names]
+    texts = dict.fromkeys(cells for cells in columns if any(isinstance(cell, str) for cell in cells))
+    if "task_index" not in table.column_names or len(texts) != 1:
         raise RecordingError(
             f"{root.name}: {TASKS} has the columns {', '.join(table.column_names) or 'none'}; expected "
             f"task_index, and the texts of the tasks in one column {_TASK!r} or in the index of pandas. {_AGAIN}"
         )
-    return tuple(zip(table.column("task_index").to_pylist(), table.column(columns[0]).to_pylist(), strict=True))
+    return tuple(zip(table.column("task_index").to_pylist(), next(iter(texts)), strict=True))
 
 
 def _read_episodes(root: Path, files: HashedFiles, info: Mapping[str, Any]) -> Iterator[EpisodeMeta]:

@@ -39,7 +39,7 @@ def show_dataset(
     """
     from rich.table import Table
 
-    from probe_kit.extract.prepared import load_acting_policy, open_recording
+    from probe_kit.extract.prepared import check_recording, load_acting_policy, open_recording
     from probe_kit.extract.recordings.lerobot_source import LeRobotSource
     from probe_kit.extract.rollout.recorded.described import describe_fit, describe_recording
     from probe_kit.extract.rollout.recorded.recorded_controller import check_recorded_units, fit
@@ -57,6 +57,7 @@ def show_dataset(
         facts, fitted = describe_recording(recording), None
     if model is not None:
         with err.status("loading the model"):
+            check_recording(settings, recording)
             fitted = fit(recording, load_acting_policy(settings))
         facts |= describe_fit(fitted)
     table = Table(show_header=False, box=None)

@@ -182,8 +182,13 @@ def test_an_episode_whose_files_change_after_the_plan_is_given_up_by_name(
         prepared.run(tmp_path / "run")
 
 
+@pytest.mark.parametrize("most", [0, 1_000_000])
 @pytest.mark.parametrize("groups", [None, 1, 4])
-def test_rows_are_the_episodes_own_however_a_file_is_divided(copy: Path, groups: int | None) -> None:
+def test_rows_are_the_episodes_own_however_a_file_is_divided(
+    copy: Path, groups: int | None, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """most: bytes that are read at once of a whole file."""
+    monkeypatch.setattr("probe_kit.extract.recordings.lerobot_frames.MOST_AT_ONCE", most)
     pq.write_table(pq.read_table(copy / DATA), copy / DATA, row_group_size=groups)
     np.testing.assert_array_equal(shown_states(copy), WRITTEN)
     frames = LeRobotFrames(opened(copy))
@@ -259,7 +264,7 @@ CONTRADICTIONS: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "doubled index": (
         lambda f: change(f / DATA, "index", lambda rows: [*rows[:-1], rows[-2]]),
-        r"episode 2: frame 6 has the index 16 in row 17; expected the index 17",
+        r"row 17 has the index 16 and is of episode 2; expected the index 17 of episode 2",
     ),
     "a frame too many": (
         lambda f: pq.write_table(
@@ -273,7 +278,7 @@ CONTRADICTIONS: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "frames in another order": (
         lambda f: pq.write_table(pq.read_table(f / DATA).take([1, 0, *range(2, 18)]), f / DATA),
-        "episode 0: frame 0 has the index 1 in row 0; expected the index 0",
+        "row 0 has the index 1 and is of episode 0; expected the index 0",
     ),
     "states of another width": (
         lambda f: change(f / DATA, STATE, lambda rows: [row[:7] for row in rows], kind=pa.list_(pa.float32())),
@@ -361,6 +366,8 @@ def retask(folder: Path, of: Callable[[pd.DataFrame], pd.DataFrame], index: bool
         (lambda table: table.set_index("task").rename_axis(None), True),
         (lambda table: table.set_index("task").rename_axis("text"), True),
         (lambda table: table.iloc[::-1], True),
+        (lambda table: table.set_index("task", drop=False).rename_axis("words"), True),
+        (lambda table: table.assign(task=table["task"].astype("category")), False),
     ],
 )
 def test_texts_of_tasks_are_a_column_or_the_index_of_pandas(
