@@ -85,6 +85,12 @@ class RecordingError(ProbeKitError):
     exit_code = 3
 
 
+class UnitsError(ProbeKitError):
+    """States of a source lie far outside the statistics of the checkpoint that reads them."""
+
+    exit_code = 3
+
+
 class OwnEnvironmentError(ProbeKitError):
     """An environment of the user's own breaks its contract, raised an error, or does not fit the model."""
 

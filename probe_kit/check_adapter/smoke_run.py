@@ -31,6 +31,7 @@ def act_twice(model: str, chosen: Mapping[str, Any], instruction: str, capture_o
         frames="none",
         env_workers=0,
         capture_only=capture_only,
+        accept_units=True,  # a tiny checkpoint may have any statistics
         **chosen,
     )
     settings = replace(settings, scene=replace(settings.scene, max_steps=STEPS))

@@ -150,6 +150,13 @@ CaptureOnly = Annotated[
         "--no-act", help="Capture the first inference of each episode without acting. There is no success rate."
     ),
 ]
+AcceptUnits = Annotated[
+    bool,
+    further_option(
+        "--accept-units",
+        help="Accept states that lie far outside the statistics of the checkpoint, on any source.",
+    ),
+]
 Dtype = Annotated[
     hook_family.Dtype | None,
     further_option("--dtype", help="Data type of the weights. Default: the data type of the checkpoint."),

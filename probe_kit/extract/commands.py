@@ -44,6 +44,7 @@ def extract(
     execute: own.Execute = None,
     rotation: own.RotationOfActions = None,
     capture_only: own.CaptureOnly = False,
+    accept_units: own.AcceptUnits = False,
     label: own.Label = None,
     tokens: own.StoredTokens = "pooled",
     captured_calls: own.CapturedCalls = 1,
@@ -58,7 +59,6 @@ def extract(
     rotations: recorded.Rotations = None,
     instruction: recorded.Instruction = None,
     no_pixels: recorded.NoPixels = False,
-    accept_units: recorded.AcceptUnits = False,
     env: played.Env = None,
     env_options: played.EnvOptions = None,
     max_steps: own.MaxSteps = None,
@@ -291,9 +291,13 @@ def _describe(stored: Any) -> str:
 
 
 def _print_outcomes(run: "Run") -> None:
+    from probe_kit.extract.run_layout import AT_END, ONCE
+
     counts = run.episodes["outcome"].value_counts()
     text = ", ".join(f"{name} {count}" for name, count in counts.items())
     say(f"{len(run.episodes)} episodes: {text}")
+    if ONCE in run.episodes and (lost := int((run.episodes[ONCE] & ~run.episodes[AT_END]).sum())):
+        say(f"{lost} of them had success before their end only; see the columns {ONCE} and {AT_END}")
     step = "retention" if not run.streams else "labels" if run.inputs is not None else "train"
     say(marked("next: [bold]probe-kit {} {}[/]", step, run.location))
     out.print(str(run.location), soft_wrap=True)

@@ -9,7 +9,15 @@ from probe_kit.extract.calibration import Calibration, calibrated
 from probe_kit.extract.early import asked_objects, check_model, check_place, check_words, check_writable
 from probe_kit.extract.needs import declared_streams
 from probe_kit.extract.own_environments.env_source import EnvSource
-from probe_kit.extract.plan import Plan, RowPlan, instructions_of, make_plan, plan_episodes, skipped_items
+from probe_kit.extract.plan import (
+    Plan,
+    PlannedEpisode,
+    RowPlan,
+    instructions_of,
+    make_plan,
+    plan_episodes,
+    skipped_items,
+)
 from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.recordings.lerobot_folder import fetched, open_lerobot
 from probe_kit.extract.recordings.lerobot_source import LeRobotSource
@@ -23,8 +31,14 @@ from probe_kit.extract.rollout.own_environments.environment_controller import (
     environment_plan,
     fit_environment,
 )
-from probe_kit.extract.rollout.preflight import run_preflight
-from probe_kit.extract.rollout.recorded.recorded_controller import check_units, fit, recorded_controller
+from probe_kit.extract.rollout.preflight import (
+    FIRST_EPISODES,
+    check_units,
+    first_states,
+    run_preflight,
+    unusual_shares,
+)
+from probe_kit.extract.rollout.recorded.recorded_controller import check_recorded_units, fit, recorded_controller
 from probe_kit.extract.rollout.recorded.recorded_stage import example_of
 from probe_kit.extract.rollout.settings_checks import check_embodiment, check_meaningless, check_unreachable
 from probe_kit.extract.run_layout import StoredStream
@@ -134,6 +148,8 @@ def load(
         controller: ActingController | AnswerController = _asking(settings, suite, answer_model)
     else:
         controller = _acting(settings, instructions_of(asked), policy)
+        if isinstance(controller, PolicyController) and isinstance(settings, ExtractSettings):
+            _check_scene_units(settings, asked, controller.policy)
     if isinstance(settings, ExtractSettings) and isinstance(controller, PolicyController):
         settings = settings.with_every_call(controller.execute)
     plan = _plan(suite, controller.streams, settings, objects)
@@ -207,6 +223,9 @@ def _load_source(
 
 def _prepared_environment(settings: ExtractSettings, opened: OpenedEnvironment, policy: "Policy") -> Prepared:
     fitted = fit_environment(opened, policy)
+    names = [str(place) for place in range(fitted.example.state.size)]
+    where = f"{opened.source.name}, the state after reset()"
+    check_units(fitted.unusual, names, where, fitted.policy, settings.accept_units)
     controller = environment_controller(fitted, settings)
     settings = settings.with_every_call(controller.execute)
     check_unfit(fitted.policy.card, settings.batch, fitted.example)
@@ -217,13 +236,21 @@ def _prepared_environment(settings: ExtractSettings, opened: OpenedEnvironment, 
 
 def _prepared_recording(settings: ExtractSettings, recording: Recording, policy: "Policy") -> Prepared:
     fitted = fit(recording, policy)
-    check_units(fitted)
+    check_recorded_units(fitted, settings.accept_units)
     settings = replace(settings, source=fitted.recording.source)
     controller = recorded_controller(fitted, settings)
     check_unfit(fitted.policy.card, settings.batch, example_of(fitted.recording, recording.instructions[0]))
     planned = recorded_plan(fitted.recording, controller.streams, settings, fitted.prediction)
     planned = replace(planned, other_actions=fitted.other_actions)
     return Prepared(settings, planned, controller.identity, controller)
+
+
+def check_recording(settings: ExtractSettings, recording: Recording) -> None:
+    """Raise as `load` what a model, its options and its words say of a recording before weights are loaded."""
+    check_model(settings, tuple(SCRIPTED))
+    check_meaningless(settings)
+    check_words(settings, recording.instructions, tuple(SCRIPTED))
+    _check_instructions(settings, recording.instructions, fetch=True)
 
 
 def open_recording(source: LeRobotSource) -> Recording:
@@ -241,7 +268,10 @@ def recorded_plan(
     rows = tuple(recording.stretches(settings.seed))
     per_call = sum(stream.raw_bytes(settings.tokens == "all") for stream in streams)
     size = per_call * settings.stored_calls * len(rows)
-    return RecordedPlan(rows, tuple(streams), size, recording.dataset(prediction), recording.source.name)
+    return RecordedPlan(
+        rows, tuple(streams), size, recording.dataset(prediction), recording.source.name,
+        len(recording.folder.lengths),
+    )  # fmt: skip
 
 
 def check_run(
@@ -346,6 +376,15 @@ def _acting(settings: RunSettings, instructions: Sequence[str], loaded: "Policy 
         settings.inference_limit,
         settings.rotation,
     )
+
+
+def _check_scene_units(settings: ExtractSettings, asked: Sequence[PlannedEpisode], policy: "Policy") -> None:
+    """Raise UnitsError for a scene whose first states lie outside the statistics of a policy that reads them."""
+    if settings.accept_units or policy.state_numbers is None or "state" in policy.zero_filled_inputs():
+        return
+    states = policy.laid_out(first_states(settings.scene, asked[:FIRST_EPISODES]))
+    names = [str(place) for place in range(states.shape[1])]
+    check_units(unusual_shares(policy, states), names, f"the scene {settings.scene.name}", policy, False)
 
 
 def load_acting_policy(settings: ExtractSettings) -> "Policy":

@@ -68,6 +68,8 @@ MOST_FRAMES = FRAME_COLUMNS * 68
 ExportFormat = Literal["h5", "safetensors", "lerobot", "parquet", "sae"]
 SaeDtype = Literal["bfloat16", "float16"]
 """What a memory map to train sparse autoencoders on holds."""
+ONCE, AT_END = "success_once", "success_at_end"
+"""Columns of episodes: whether `success` was true after any action, and after the last one."""
 CAPTURE_ONLY = "capture_only"
 """Outcome of an episode whose model was captured and did not act: there is no success rate."""
 DATASET = "dataset"
@@ -75,6 +77,8 @@ DATASET = "dataset"
 
 ENVIRONMENT = "environment"
 """The same of a run in an environment of the user's own."""
+RECORDED_EPISODES = "recorded_episodes"
+"""How many episodes the data set of a run has, among `recording` of its settings."""
 OTHER_ACTIONS = "other_actions"
 """Of a selection of recordings: why predicted and recorded actions are not compared; None where they are."""
 

@@ -46,6 +46,7 @@ _ELSEWHERE = {
     "rotation",
     "later_views",
     "source",
+    "accept_units",
 }
 _MOST = {
     "captured_calls": 10_000,
@@ -259,6 +260,7 @@ class ExtractSettings(RunSettings):
     capture_only: capture the first inference of every episode and do not act; for checkpoints of other arms.
     edits: what is changed in the streams at every inference; vectors: their directions and sources, by hash.
     video: GIF of the first episode, of all, or none; changes no stored number.
+    accept_units: play or show states that lie far outside the checkpoint's statistics; changes no number.
     source: in place of suite and scene, recordings to show, and the model does not act; or an environment of the
     user's own, in which it acts.
     """
@@ -273,6 +275,7 @@ class ExtractSettings(RunSettings):
     edits: tuple[Edit, ...] = ()
     vectors: Vectors = field(default_factory=dict)
     video: str = "none"
+    accept_units: bool = False
     source: LeRobotSource | EnvSource | None = None
 
     def __post_init__(self) -> None:
@@ -303,7 +306,7 @@ class ExtractSettings(RunSettings):
     def from_options(
         cls, *, model: str, dataset: str | None = None, episodes: str | None = None, select: str | None = None,
         cameras: Sequence[str] | None = None, rotations: Sequence[str] | None = None,
-        instruction: str | None = None, no_pixels: bool = False, accept_units: bool = False,
+        instruction: str | None = None, no_pixels: bool = False,
         env: str | None = None, env_options: Sequence[str] | None = None, **given: Any,
     ) -> Self:  # fmt: skip
         """As of every run. dataset: of recordings, env: an environment; the options behind them choose of them.
@@ -312,7 +315,6 @@ class ExtractSettings(RunSettings):
         """
         of_recordings = {
             "--select": select, "--camera": cameras, "--rotate": rotations, "--instruction": instruction,
-            "--accept-units": accept_units,
         }  # fmt: skip
         of_either = {"--episodes": episodes, "--no-pixels": no_pixels}
         if dataset is not None and env is not None:
@@ -325,7 +327,7 @@ class ExtractSettings(RunSettings):
             _check_no_scene(given, "--dataset, which has no scene and captures every chosen frame")
             given["source"] = LeRobotSource.from_options(
                 dataset, episodes, select or "every:1", cameras or (), rotations or (),
-                instruction=instruction, pixels=not no_pixels, accept_units=accept_units,
+                instruction=instruction, pixels=not no_pixels,
             )  # fmt: skip
         elif env is not None:
             steps = given.pop("max_steps", None)

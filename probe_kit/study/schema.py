@@ -127,6 +127,7 @@ class ConditionTable(_Table):
     early_stop: bool = False
     wordings: Names | None = None
     no_act: bool = False
+    accept_units: bool = False
     captured_calls: Count | Literal["all"] = 1
     later_views: LaterViews = "all"
 

@@ -43,7 +43,7 @@ def recorded_plan(episodes: int, pixels: bool = True, streams: tuple[StoredStrea
         "columns": ["timestamp", "next.reward"],
         "names": {"state": ["x", "y", "z"], "action": ["dx", "grip"]},
     }
-    return RecordedPlan(rows, streams, 1000, dataset, "kitchen")
+    return RecordedPlan(rows, streams, 1000, dataset, "kitchen", episodes + 2)
 
 
 def write_recorded_run(

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib import import_module
 from importlib.metadata import entry_points
 from itertools import islice
@@ -13,7 +14,7 @@ import numpy as np
 
 from probe_kit._terminal.plain_text import UNSAFE
 from probe_kit.errors import ObservationError, OwnEnvironmentError, ProbeKitError, UsageError
-from probe_kit.extract.own_environments.contract import EnvEpisode, OwnEnvironment, Step
+from probe_kit.extract.own_environments.contract import SUCCESS, EnvEpisode, OwnEnvironment, Step
 from probe_kit.extract.own_environments.env_source import LEROBOT, EnvSource
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 
@@ -143,8 +144,10 @@ def _check_episode(episode: object, where: str) -> None:
         raise OwnEnvironmentError(f"{where} has the seed {episode.seed!r}; expected a whole number from 0 on")
 
 
-def begun(answer: object, episode: EnvEpisode, where: str) -> Step:
-    """What `reset` gave, checked. Raises OwnEnvironmentError."""
+def started(environment: OwnEnvironment, episode: EnvEpisode, where: str) -> Step:
+    """The beginning of an episode, as `checked_step` gives it. Raises OwnEnvironmentError."""
+    with naming_environment(where, "reset()"):
+        answer = environment.reset(episode)
     step = checked_step(Step(answer) if isinstance(answer, Observation) else answer, episode, f"{where}, reset()")
     if step.done:
         raise OwnEnvironmentError(f"{where}, reset() says that the episode is over; expected done=False")
@@ -152,7 +155,10 @@ def begun(answer: object, episode: EnvEpisode, where: str) -> Step:
 
 
 def checked_step(answer: object, episode: EnvEpisode, where: str) -> Step:
-    """A step with pictures, state and facts as the contract has them. Raises OwnEnvironmentError."""
+    """A step with pictures, state and facts as the contract has them, in copies of its own.
+
+    An environment may write into its arrays afterwards. Raises OwnEnvironmentError.
+    """
     if not isinstance(answer, Step) or not isinstance(answer.observation, Observation):
         seen = type(answer.observation if isinstance(answer, Step) else answer).__name__
         raise OwnEnvironmentError(f"{where} gave a {seen}; expected a Step with an Observation")
@@ -182,7 +188,20 @@ def checked_step(answer: object, episode: EnvEpisode, where: str) -> Step:
             raise OwnEnvironmentError(
                 f"{where}: the fact {name!r} is {value!r}; expected a finite number or a truth value"
             )
-    return answer
+        if name == SUCCESS and value not in (0, 1):
+            raise OwnEnvironmentError(
+                f"{where}: the fact {SUCCESS!r} is {value!r}; expected a truth value: True, False, 1 or 0. Give "
+                "a part or a score another name"
+            )
+    return _copied(answer)
+
+
+def _copied(step: Step) -> Step:
+    seen = step.observation
+    cameras = {name: np.array(picture) for name, picture in seen.cameras.items()}
+    lens = None if seen.intrinsics is None else np.array(seen.intrinsics)
+    copy = replace(seen, image=np.array(seen.image), state=np.array(seen.state), intrinsics=lens, cameras=cameras)
+    return Step(copy, bool(step.done), dict(step.facts))
 
 
 def fact_values(facts: Mapping[str, Any], names: Sequence[str], where: str) -> list[float]:

@@ -1,67 +1,52 @@
-"""Reading of a LeRobotDataset of format 3.0 through lerobot: what it holds, its hashes, and its frames.
+"""A LeRobotDataset of format 3.0 that lies here: features, files, their hashes, and its download.
 
-lerobot asks the hub for whatever it does not find, warns where an episode is out of range, and gives pictures as
-floats. Files and episodes are therefore checked before it is called, and it is called without a network.
+Rows and pictures are read from the very files that are hashed, without a cache that is keyed by path and time. A
+file that meta does not name is never read.
 """
 
-import logging
+import glob
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from hashlib import blake2b, file_digest
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from probe_kit._system.bounded_json import read_json_object
-from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import RecordingError, UsageError
+from probe_kit.extract.recordings.hashed_files import HashedFiles
+from probe_kit.extract.recordings.lerobot_meta import IMAGE, KEYS, NUMERIC, EpisodeMeta, LeRobotMeta
 from probe_kit.extract.recordings.lerobot_source import LeRobotSource
 from probe_kit.hooks.checkpoints.hub import unreachable
 
-EXTRA = "datasets"
-CONVERTER = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
-IMAGE = "image"
-"""Pictures of a camera that are stored one by one."""
 MOST_FRAMES = 64
 """Chosen frames that one row holds."""
-OFF_GRID_S = 1e-4
-"""Seconds by which a timestamp may differ from frame / fps."""
 _COMMIT = re.compile(r"[0-9a-f]{40}")
-_KEYS = ("episode_index", "index", "task_index")
-_NUMERIC = ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
-_DIGITS = 16
 
 
 @dataclass(frozen=True)
 class LeRobotFolder:
-    """A data set that lies here. repo, revision: of the hub, None for a folder. meta: lerobot's metadata of it."""
+    """A data set that lies here. opened: its files by their hashes. repo, revision: of the hub, or None."""
 
     path: Path
-    meta: Any
+    meta: LeRobotMeta
+    opened: HashedFiles
     repo: str | None = None
     revision: str | None = None
-    _hashes: dict[Path, str] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def fps(self) -> float:
         """Frames per second."""
-        return float(self.meta.fps)
+        return self.meta.fps
 
     @property
     def features(self) -> Mapping[str, Any]:
         """Type, shape and names by feature."""
-        found: Mapping[str, Any] = self.meta.features
-        return found
+        return self.meta.features
 
     @property
     def cameras(self) -> list[str]:
         """Features that are colour pictures."""
-        return [key for key in self.meta.camera_keys if key not in self.meta.depth_keys]
+        return self.meta.cameras
 
     @property
     def columns(self) -> list[str]:
@@ -69,7 +54,7 @@ class LeRobotFolder:
         return [
             name
             for name, own in self.features.items()
-            if own["dtype"] in _NUMERIC and tuple(own["shape"]) == (1,) and name not in _KEYS
+            if own["dtype"] in NUMERIC and tuple(own["shape"]) == (1,) and name not in KEYS
         ]
 
     def width(self, feature: str) -> int | None:
@@ -77,7 +62,7 @@ class LeRobotFolder:
         if feature not in self.features:
             return None
         shape = tuple(self.features[feature]["shape"])
-        if len(shape) != 1 or self.features[feature]["dtype"] not in _NUMERIC:
+        if len(shape) != 1 or self.features[feature]["dtype"] not in NUMERIC:
             raise RecordingError(
                 f"{self.path.name}: {feature} is {self.features[feature]['dtype']} of shape {shape}; expected a "
                 "list of numbers"
@@ -86,13 +71,7 @@ class LeRobotFolder:
 
     def names(self, feature: str) -> list[str]:
         """What the numbers of a feature are called; their positions where the data set names none."""
-        named = self.features[feature].get("names")
-        if isinstance(named, Mapping):
-            named = next(iter(named.values()), None)
-        count = self.width(feature) or 0
-        if isinstance(named, Sequence) and not isinstance(named, str) and len(named) == count:
-            return [str(one) for one in named]
-        return [str(place) for place in range(count)]
+        return list(self.meta.names(feature) or map(str, range(self.width(feature) or 0)))
 
     def picture_shape(self, feature: str) -> tuple[int, int]:
         """(height, width) of a camera."""
@@ -110,53 +89,40 @@ class LeRobotFolder:
     @cached_property
     def lengths(self) -> list[int]:
         """Frames of every episode."""
-        return [int(length) for length in self.meta.episodes["length"]]
+        return [one.length for one in self.meta.episodes]
 
     @cached_property
-    def starts(self) -> list[int]:
-        """Index of the first frame of every episode in the whole data set."""
-        return [int(start) for start in self.meta.episodes["dataset_from_index"]]
+    def by_file(self) -> Mapping[Path, list[EpisodeMeta]]:
+        """The episodes of every data file."""
+        found: dict[Path, list[EpisodeMeta]] = {}
+        for one in self.meta.episodes:
+            found.setdefault(self.path / one.file, []).append(one)
+        return found
+
+    def episode(self, number: int) -> EpisodeMeta:
+        """What meta says of an episode."""
+        return self.meta.episodes[number]
 
     def task(self, number: int) -> str:
         """The text of a task. Raises RecordingError for a number that `meta` does not name once."""
-        texts = self.meta.tasks.index[self.meta.tasks["task_index"] == number]
-        if len(texts) != 1:
-            raise RecordingError(
-                f"{self.path.name}: meta/tasks.parquet has {len(texts)} tasks of the number {number}, which a "
-                "frame names; expected one. Repair the data set, or give --instruction TEXT"
-            )
-        return str(texts[0])
+        return self.meta.task(number)
 
-    # -- hashes ----------------------------------------------------------------------------------------
+    # -- files -----------------------------------------------------------------------------------------
 
     @cached_property
     def meta_blake2b(self) -> str:
         """Of names and bytes of all files in `meta`."""
-        return self._hash_of(sorted(path for path in (self.path / "meta").rglob("*") if path.is_file()))
+        return self.opened.hash_of(sorted(path for path in (self.path / "meta").rglob("*") if path.is_file()))
 
     def content_blake2b(self, episode: int, cameras: Sequence[str]) -> str:
         """Of the files that hold the numbers of an episode, and the pictures of some cameras."""
-        return self._hash_of(self.files(episode, cameras))
+        return self.opened.hash_of(self.files(episode, cameras))
 
     def files(self, episode: int, cameras: Sequence[str]) -> list[Path]:
-        """The files that hold an episode and the videos of some cameras. Raises RecordingError for others."""
-        videos = [self.meta.get_video_file_path(episode, key) for key in cameras if key in self.meta.video_keys]
-        found = [self.meta.get_data_file_path(episode), *videos]
-        if outside := [one for one in found if Path(one).is_absolute() or ".." in Path(one).parts]:
-            raise RecordingError(
-                f"{self.path.name}: meta/info.json names {outside[0]} for episode {episode}; expected a file in "
-                "the data set's folder. Correct data_path and video_path"
-            )
-        return [self.path / one for one in found]
-
-    def _hash_of(self, files: Sequence[Path]) -> str:
-        together = blake2b(digest_size=_DIGITS)
-        for file in files:
-            if file not in self._hashes:
-                with file.open("rb") as opened:
-                    self._hashes[file] = file_digest(opened, lambda: blake2b(digest_size=_DIGITS)).hexdigest()
-            together.update(f"{file.relative_to(self.path).as_posix()} {self._hashes[file]}\n".encode())
-        return together.hexdigest()
+        """The files that hold an episode and the videos of some cameras."""
+        own = self.episode(episode)
+        videos = [own.videos[key].file for key in cameras if self.meta.is_video(key)]
+        return [self.path / one for one in (own.file, *videos)]
 
     # -- checks ----------------------------------------------------------------------------------------
 
@@ -171,7 +137,8 @@ class LeRobotFolder:
         return list(range(count)) if episodes is None else list(episodes)
 
     def check_files(self, episodes: Sequence[int], cameras: Sequence[str]) -> None:
-        """Raise RecordingError if a file of these episodes is missing: lerobot would ask the hub for it."""
+        """Raise RecordingError for a missing file of these episodes, or one of data that meta does not name."""
+        self._check_unnamed()
         for episode in episodes:
             for file in self.files(episode, cameras):
                 if not file.is_file():
@@ -180,22 +147,34 @@ class LeRobotFolder:
                         "the data set again, or leave the episode out"
                     )
 
+    def _check_unnamed(self) -> None:
+        """Raise RecordingError for a Parquet file of data that no episode is in; hidden files are none."""
+        named = set(self.by_file)
+        folders = {self.path / one.file.parts[0] for one in self.meta.episodes if len(one.file.parts) > 1}
+        present = {path for folder in folders for path in folder.rglob("*.parquet") if path.name[0] != "."}
+        if unnamed := sorted(present - named - set((self.path / "meta").rglob("*.parquet"))):
+            raise RecordingError(
+                f"{self.path.name} holds {unnamed[0].relative_to(self.path)}, in which meta/episodes names no "
+                "episode; expected no other files of data. Move it out of the data set, or copy the data set again"
+            )
+
 
 def open_lerobot(source: LeRobotSource) -> LeRobotFolder:
     """The data set of `source`, which is downloaded if it is one of the hub; only its `meta` then.
 
     Raises RecordingError for another format or missing files, UsageError for a hub data set without network or at
-    a revision that is none, MissingExtraError without lerobot's extra.
+    a revision that is none, MissingExtraError without the extra of recordings.
     """
     if source.is_local:
-        path = Path(source.folder).expanduser().resolve()
-        _check_format(path)
-        return LeRobotFolder(path, _metadata(path))
+        return _folder_at(Path(source.folder).expanduser().resolve())
     repo, _, revision = source.folder.partition("@")
     commit = resolved_commit(repo, revision)
-    path = _download(repo, commit, ["meta/*", "meta/**/*"])
-    _check_format(path)
-    return LeRobotFolder(path, _metadata(path), repo, commit)
+    return _folder_at(_download(repo, commit, ["meta/*", "meta/**/*"]), repo, commit)
+
+
+def _folder_at(path: Path, repo: str | None = None, revision: str | None = None) -> LeRobotFolder:
+    opened = HashedFiles(path)
+    return LeRobotFolder(path, LeRobotMeta.read(path, opened), opened, repo, revision)
 
 
 def resolved_commit(repo: str, revision: str) -> str:
@@ -225,7 +204,7 @@ def fetched(folder: LeRobotFolder, episodes: Sequence[int], cameras: Sequence[st
         wanted = {
             file.relative_to(folder.path).as_posix() for one in episodes for file in folder.files(one, cameras)
         }
-        _download(folder.repo, folder.revision, sorted(wanted))
+        _download(folder.repo, folder.revision, sorted(map(glob.escape, wanted)))
 
 
 def _download(repo: str, commit: str, patterns: list[str]) -> Path:
@@ -241,120 +220,3 @@ def _download(repo: str, commit: str, patterns: list[str]) -> Path:
         )
     except (HfHubHTTPError, LocalEntryNotFoundError, OSError) as error:
         raise UsageError(f"{repo}@{commit} cannot be fetched: {error}. Give a folder that exists") from error
-
-
-def _check_format(path: Path) -> None:
-    info = path / "meta" / "info.json"
-    if not info.is_file():
-        raise RecordingError(
-            f"{path} is no LeRobotDataset: it has no meta/info.json. Give the folder that holds meta, data and "
-            "videos"
-        )
-    version = str(read_json_object(info, RecordingError, "Copy the data set again").get("codebase_version"))
-    if not version.startswith("v3."):
-        raise RecordingError(
-            f"{path.name} has format {version}; this version reads v3.0. Convert it with `{CONVERTER} --repo-id=…`"
-        )
-    if missing := [name for name in ("tasks.parquet", "episodes") if not (path / "meta" / name).exists()]:
-        raise RecordingError(f"{path.name} has no meta/{missing[0]}. Copy the data set again")
-
-
-def _metadata(path: Path) -> Any:
-    require("datasets", EXTRA).utils.logging.disable_progress_bar()
-    require("av", EXTRA)
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
-    with quiet_and_offline(path):
-        return LeRobotDatasetMetadata("local/recording", root=path)
-
-
-@contextmanager
-def quiet_and_offline(path: Path) -> Iterator[None]:
-    """No request and no log while lerobot reads; whatever it raises of its own becomes a RecordingError."""
-    from huggingface_hub import constants
-
-    before, level = constants.HF_HUB_OFFLINE, logging.root.manager.disable
-    constants.HF_HUB_OFFLINE = True
-    logging.disable(logging.WARNING)
-    try:
-        yield
-    except (RecordingError, UsageError, MemoryError):
-        raise
-    except Exception as error:
-        raise RecordingError(
-            f"lerobot cannot read {path.name}: {type(error).__name__}: {str(error)[:500]}. Check that the data "
-            "set is whole, with all files that its meta names"
-        ) from error
-    finally:
-        constants.HF_HUB_OFFLINE = before
-        logging.disable(level)
-
-
-class LeRobotFrames:
-    """Frames and numbers of chosen episodes, decoded when they are asked for. Opened once per process."""
-
-    def __init__(self, folder: LeRobotFolder, episodes: Sequence[int]) -> None:
-        self.folder, self._episodes = folder, sorted(set(episodes))
-
-    @cached_property
-    def _dataset(self) -> Any:
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-        with quiet_and_offline(self.folder.path):
-            return LeRobotDataset(
-                "local/recording", root=self.folder.path, episodes=self._episodes, video_backend="pyav"
-            )
-
-    @cached_property
-    def _places(self) -> Mapping[int, int]:
-        found: Mapping[int, int] = self._dataset.absolute_to_relative_idx
-        return found
-
-    def pictures(self, episode: int, frame: int, cameras: Sequence[str]) -> dict[str, NDArray[np.uint8]]:
-        """(H, W, 3) uint8 by camera; of stored images the very bytes. Raises RecordingError."""
-        with quiet_and_offline(self.folder.path):
-            item = self._dataset[self._places[self.folder.starts[episode] + frame]]
-            seen = int(item["episode_index"]), int(item["frame_index"])
-        if seen != (episode, frame):
-            raise RecordingError(
-                f"{self.folder.path.name}: frame {frame} of episode {episode} says that it is frame {seen[1]} of "
-                f"episode {seen[0]}. Check the data set's meta"
-            )
-        return {camera: as_bytes(np.asarray(item[camera]), camera) for camera in cameras}
-
-    def numbers(self, episode: int, features: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-        """(T, D) of every feature, of one number (T, 1). Raises RecordingError if its frames are not a grid."""
-        start, length = self.folder.starts[episode], self.folder.lengths[episode]
-        wanted = list(dict.fromkeys((*features, "frame_index", "timestamp")))
-        with quiet_and_offline(self.folder.path):
-            rows = [self._places[start + frame] for frame in range(length)]
-            table = self._dataset.hf_dataset.select_columns(wanted).with_format("arrow")[rows]
-            found: dict[str, NDArray[np.float64]] = {
-                name: np.asarray(table.column(name).to_pylist(), np.float64).reshape(length, -1) for name in wanted
-            }
-        self._check_grid(episode, found["frame_index"][:, 0], found["timestamp"][:, 0])
-        return found
-
-    def _check_grid(self, episode: int, frames: NDArray[np.float64], timestamps: NDArray[np.float64]) -> None:
-        due = np.arange(len(frames))
-        off = np.flatnonzero(
-            (frames != due) | (np.abs(timestamps - due / self.folder.fps) > OFF_GRID_S * (1 + due / 1e4))
-        )
-        if off.size:
-            place = int(off[0])
-            raise RecordingError(
-                f"{self.folder.path.name}, episode {episode}: line {place} is frame {frames[place]:g} at "
-                f"{timestamps[place]:.4f} s; expected frame {place} at {place / self.folder.fps:.4f} s "
-                f"({self.folder.fps:g} frames per second). Repair the timestamps, or leave the episode out"
-            )
-
-
-def as_bytes(picture: NDArray[Any], camera: str) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 of lerobot's (3, H, W) floats in [0, 1]. Raises RecordingError for others."""
-    if picture.ndim != 3 or picture.shape[0] != 3 or not np.issubdtype(picture.dtype, np.floating):
-        raise RecordingError(f"{camera} is {picture.dtype} {picture.shape}; expected floats (3, H, W)")
-    if not (np.isfinite(picture).all() and picture.min() >= 0 and picture.max() <= 1):
-        raise RecordingError(
-            f"pictures of {camera} have values from {picture.min():.3g} to {picture.max():.3g}; expected 0 to 1"
-        )
-    return np.ascontiguousarray(np.rint(255 * picture).astype(np.uint8).transpose(1, 2, 0))

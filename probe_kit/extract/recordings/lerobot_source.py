@@ -28,7 +28,7 @@ class LeRobotSource:
     episode, frame 0 and each so many frames on. cameras: feature of the data set by camera of the model; empty
     where both have one, or the names are equal. rotations: degrees by camera of the model, counterclockwise.
     instruction: what the model reads in place of the task of a frame. pixels: whether pictures at 32 × 32 are
-    stored for controls. accept_units: show states that lie far outside the checkpoint's statistics.
+    stored for controls.
     Raises UsageError for what no data set can have.
     """
 
@@ -39,7 +39,6 @@ class LeRobotSource:
     rotations: tuple[tuple[str, int], ...] = ()
     instruction: str | None = None
     pixels: bool = True
-    accept_units: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "folder", str(self.folder))

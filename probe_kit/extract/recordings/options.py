@@ -45,6 +45,3 @@ NoPixels = Annotated[
     bool,
     _option("--no-pixels", help="Store no pictures at 32 × 32; two controls of labels are then not possible."),
 ]
-AcceptUnits = Annotated[
-    bool, _option("--accept-units", help="Show states that lie far outside the statistics of the checkpoint.")
-]

@@ -8,9 +8,11 @@ from typing import Any, Self
 
 from probe_kit.errors import RecordingError
 from probe_kit.extract.plan import RowPlan
-from probe_kit.extract.recordings.lerobot_folder import IMAGE, MOST_FRAMES, LeRobotFolder, LeRobotFrames
+from probe_kit.extract.recordings.lerobot_folder import MOST_FRAMES, LeRobotFolder
+from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
+from probe_kit.extract.recordings.lerobot_meta import IMAGE
 from probe_kit.extract.recordings.lerobot_source import ACTION, IMAGES, STATE, LeRobotSource, Pairs
-from probe_kit.extract.run_layout import OTHER_ACTIONS
+from probe_kit.extract.run_layout import OTHER_ACTIONS, RECORDED_EPISODES
 from probe_kit.hashing import derive_seed
 
 CATEGORY = "all"
@@ -94,12 +96,14 @@ class PlannedStretch:
 class RecordedPlan(RowPlan):
     """All stretches of a run. dataset: what its identity says of the data set. name: what tables call it.
 
+    recorded: episodes that the data set has, chosen or not.
     other_actions: why the recorded actions of these episodes are not what the policy predicts; None if they are.
     """
 
     episodes: tuple[PlannedStretch, ...]
     dataset: Mapping[str, Any]
     name: str
+    recorded: int
     other_actions: str | None = None
 
     @property
@@ -116,7 +120,14 @@ class RecordedPlan(RowPlan):
     def selection(self) -> dict[str, Any]:
         """Which episodes were chosen, and whether their actions are those that the policy predicts."""
         chosen = sorted({one.source_episode for one in self.episodes})
-        return {"recording": {"name": self.name, "episodes": chosen, OTHER_ACTIONS: self.other_actions}}
+        return {
+            "recording": {
+                "name": self.name,
+                "episodes": chosen,
+                RECORDED_EPISODES: self.recorded,
+                OTHER_ACTIONS: self.other_actions,
+            }
+        }
 
     @property
     def decoder(self) -> str | None:
@@ -147,7 +158,7 @@ class Recording:
     def of(cls, folder: LeRobotFolder, source: LeRobotSource) -> Self:
         """What `source` chooses. Raises RecordingError for an episode that is not there."""
         episodes = tuple(folder.chosen(source.episodes))
-        return cls(folder, source, episodes, LeRobotFrames(folder, episodes))
+        return cls(folder, source, episodes, LeRobotFrames(folder))
 
     @property
     def features(self) -> list[str]:
@@ -169,6 +180,22 @@ class Recording:
                 f"--rotate {strange[0]}=…: that camera gets no picture; those with one are {', '.join(known)}"
             )
         return replace(self, source=replace(self.source, cameras=pairs))
+
+    def check(self) -> None:
+        """Raise RecordingError for files, numbers or pictures of the chosen episodes that cannot be shown.
+
+        Pictures are those of the mapped cameras, or of all where none is mapped. Of a hub data set they are not
+        here before that.
+        """
+        every = [] if self.folder.repo is not None else self.folder.cameras
+        features = self.features or every
+        if strange := [feature for feature in features if feature not in self.folder.cameras]:
+            raise RecordingError(
+                f"{self.folder.path.name} has no picture {strange[0]!r}; it has "
+                f"{', '.join(self.folder.cameras) or 'none'}. Correct --camera"
+            )
+        self.folder.check_files(self.episodes, features)
+        self.reader.check(self.episodes, features)
 
     @property
     def instructions(self) -> tuple[str, ...]:

@@ -284,6 +284,15 @@ class Policy(Model):
             )
         return self
 
+    def laid_out(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(n, D) states of the scene's arm (n, 8), in the order and count that this checkpoint was given them."""
+        return states
+
+    @property
+    def action_names(self) -> tuple[str, ...] | None:
+        """The names of the numbers that `predict` gives, in order; None where the checkpoint has none."""
+        return None
+
     def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(n, D) which numbers of recorded states (n, D) lie far outside the checkpoint's own statistics.
 

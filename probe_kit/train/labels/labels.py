@@ -10,6 +10,7 @@ import numpy as np
 
 from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
+from probe_kit.extract.run_layout import RECORDED_EPISODES
 from probe_kit.hashing import sha256_json
 from probe_kit.train.choices import Task
 from probe_kit.train.data.run_reader import RunReader
@@ -103,8 +104,8 @@ class Labels:
     def on(self, run: RunReader) -> "tuple[Labels, int]":
         """These labels with the keys of a run, and how many frames or episodes the run does not show.
 
-        Labels that have its keys already are returned as they are. Raises UsageError for a run of scenes, and if
-        the run shows none of the frames.
+        Labels that have its keys already are returned as they are. Raises UsageError for a run of scenes, for
+        frames or episodes that were never recorded, and if the run shows none of the frames.
         """
         if not self.of_source:
             return self, 0
@@ -115,6 +116,7 @@ class Labels:
             )
         shown = _shown(run, self.inferences is not None)
         frames: Sequence[int] = self.inferences or (-1,) * len(self.episodes)
+        _check_recorded(run, self.table, self.episodes, self.inferences)
         keys = [shown.get((episode, frame), ()) for episode, frame in zip(self.episodes, frames, strict=True)]
         at = [number for number, found in enumerate(keys) for _ in found]
         if not at:
@@ -237,6 +239,27 @@ def _shown(run: RunReader, by_frame: bool) -> dict[tuple[str, int], list[tuple[s
             if frame >= 0 or not by_frame:
                 found.setdefault((str(source), frame), []).append((str(name), call))
     return found
+
+
+def _check_recorded(
+    run: RunReader, table: LabelTable, episodes: Sequence[str], frames: Sequence[int] | None
+) -> None:
+    """Raise UsageError for an episode that the data set lacks, or a frame that its episode lacks."""
+    count: int = run.settings["recording"][RECORDED_EPISODES]  # type: ignore[attr-defined]
+    rows = zip(run.episodes[SOURCE].tolist(), run.episodes["recorded_frames"].tolist(), strict=True)
+    lengths = {str(source): int(length) for source, length in rows}
+    for row, episode in enumerate(episodes):
+        if int(episode) >= count:
+            raise UsageError(
+                f"{table.where(row, SOURCE)} is {episode}; the data set of {run.location} has {count} episodes, "
+                "counted from 0. Correct the numbers of the episodes"
+            )
+        if frames is not None and frames[row] >= lengths.get(episode, frames[row] + 1):
+            raise UsageError(
+                f"{table.where(row, FRAME)} is {frames[row]}; episode {episode} of the data set of "
+                f"{run.location} has {lengths[episode]} frames, counted from 0 in each episode. Correct the "
+                "table, which may count from 1, or by the column `index` of the data set"
+            )
 
 
 def _numbers(table: LabelTable, column: str) -> tuple[int, ...] | None:

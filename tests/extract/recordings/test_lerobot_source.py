@@ -132,7 +132,7 @@ def test_an_older_format_is_refused_with_the_converter(tmp_path: Path) -> None:
         open_lerobot(LeRobotSource(str(tmp_path)))
 
 
-@pytest.mark.parametrize("missing", ["datasets", "av"])
+@pytest.mark.parametrize("missing", ["pyarrow", "av"])
 def test_trap_8_without_the_extra_it_is_named_with_its_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str
 ) -> None:

@@ -160,6 +160,28 @@ def test_labels_of_whole_source_episodes_are_those_of_their_rows(shown_run: Run)
     assert labels.on(shown_run)[0].coded.classes == ("k0", "k1", "k2"), "no episode of the run is an x"
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"frame": 1}, r"column 'frame' is 20; episode 0 of the data set of .* has 20 frames, counted from 0"),
+        ({"source_episode": 1}, r"column 'source_episode' is 14; the data set of .* has 14 episodes"),
+    ],
+)
+def test_frames_and_episodes_that_were_never_recorded_are_refused_by_their_line(
+    shown_run: Run, change: dict[str, int], message: str
+) -> None:
+    """Unlike those that the run does not show: the table counts from 1, and every label is one off."""
+    table = source_table()
+    for column, by in change.items():
+        table[column] += by
+    with pytest.raises(UsageError, match=message):
+        labelled_samples(shown_run, Labels.read(table, "mine"), None, 0, None)
+    if "source_episode" in change:
+        whole = table.groupby("source_episode", as_index=False)["mine"].first()
+        with pytest.raises(UsageError, match=message):
+            Labels.read(whole, "mine").on(shown_run)
+
+
 def test_keys_of_recordings_are_refused_on_scenes_and_where_nothing_is_shown(
     shown_run: Run, labelled_run: Path
 ) -> None:

@@ -12,15 +12,16 @@ from probe_kit.extract.own_environments.contract import EnvEpisode
 from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.own_environments.environment_plan import EnvironmentPlan, plan_env_episodes
 from probe_kit.extract.own_environments.opening import (
-    begun,
     checked_step,
     listed_episodes,
     naming_environment,
     open_environment,
+    started,
 )
 from probe_kit.extract.recordings.recorded_plan import SIDE
 from probe_kit.extract.rollout.controllers import Turn
 from probe_kit.extract.rollout.own_environments.environment_stage import cameras_of
+from probe_kit.extract.rollout.preflight import FIRST_EPISODES, exchanged_names, unusual_shares
 from probe_kit.extract.rollout.recorded.recorded_controller import RecordedController, check_predictions
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import ExtractSettings
@@ -70,6 +71,7 @@ class FittedEnvironment:
     """An environment and a policy that was found to play it.
 
     example: what it shows first. facts: names, in stored order. chunk: actions that the policy predicts at a time.
+    unusual: (D,) share of the first states whose number lies outside the checkpoint's statistics.
     """
 
     opened: OpenedEnvironment
@@ -77,10 +79,11 @@ class FittedEnvironment:
     example: Observation
     facts: tuple[str, ...]
     chunk: int
+    unusual: NDArray[np.float64]
 
 
 def fit_environment(opened: OpenedEnvironment, policy: "Policy") -> FittedEnvironment:
-    """Set up the first chosen episode, let the policy predict once, and execute one action of it.
+    """Set up the first chosen episodes, let the policy predict once, and execute one action of the first.
 
     Raises OwnEnvironmentError for cameras, states or actions that do not fit, CheckpointError for a policy whose
     predictions are no actions.
@@ -98,9 +101,7 @@ def fit_environment(opened: OpenedEnvironment, policy: "Policy") -> FittedEnviro
         )
     environment = open_environment(source)
     try:
-        with naming_environment(source.name, "reset()"):
-            answer = environment.reset(episode)
-        first = begun(answer, episode, source.name)
+        first = started(environment, episode, source.name)
         policy = _given_cameras(policy, first.observation, source.name)
         _check_state(policy, first.observation, source.name)
         with while_acting(policy.card.family, policy.card.checkpoint):
@@ -112,12 +113,21 @@ def fit_environment(opened: OpenedEnvironment, policy: "Policy") -> FittedEnviro
                 f"({', '.join(opened.action_names)}); {policy.card.checkpoint} predicts {chunks.shape[2]}. Take a "
                 "checkpoint of this environment"
             )
+        if (reason := exchanged_names(policy, opened.action_names)) is not None:
+            raise OwnEnvironmentError(
+                f"{source.name}: {reason}. Let step() take actions in the checkpoint's order, and name them so"
+            )
         with naming_environment(source.name, "step()"):
             second = environment.step(np.array(chunks[0, 0]))
         facts = checked_step(second, episode, f"{source.name}, step() 1").facts
+        later = [one for _, one in opened.episodes[1:FIRST_EPISODES]] if policy.state_numbers is not None else []
+        states = [first, *(started(environment, one, source.name) for one in later)]
+        for begin in states:
+            _check_state(policy, begin.observation, source.name)
+        unusual = unusual_shares(policy, np.stack([begin.observation.state for begin in states]))
     finally:
         environment.close()
-    return FittedEnvironment(opened, policy, first.observation, tuple(sorted(facts)), chunks.shape[1])
+    return FittedEnvironment(opened, policy, first.observation, tuple(sorted(facts)), chunks.shape[1], unusual)
 
 
 def _given_cameras(policy: "Policy", seen: Observation, name: str) -> "Policy":

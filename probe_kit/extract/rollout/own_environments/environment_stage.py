@@ -13,20 +13,20 @@ from probe_kit.extract.own_environments.contract import SUCCESS, Step
 from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.own_environments.environment_plan import PlannedEnvEpisode
 from probe_kit.extract.own_environments.opening import (
-    begun,
     checked_step,
     fact_values,
     naming_environment,
     open_environment,
+    started,
 )
 from probe_kit.extract.rollout.recorded.recorded_stage import small_picture
 from probe_kit.extract.rollout.stage import Answer, Ending, TimedStage
-from probe_kit.extract.run_layout import FrameChoice
+from probe_kit.extract.run_layout import AT_END, ONCE, FrameChoice
 from probe_kit.extract.store.small_frames import SmallFrames, shrink
 from probe_kit.hooks.contract.observation import Observation
 
 SUCCEEDED, FAILED, ENDED = "success", "failure", "ended"
-"""Outcomes; the last one where the environment has no fact `success`."""
+"""Outcomes: whether the fact `success` is true at the last step; the last one where there is no such fact."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,7 @@ class EnvironmentStage(TimedStage):
         self._inputs: dict[str, list[NDArray[Any]]] = {}
         self._hash, self._succeeded = blake2b(digest_size=16), False
         try:
-            with naming_environment(self._name, "reset()"):
-                answer = self._environment.reset(planned.episode)
-            step = begun(answer, planned.episode, self._name)
+            step = started(self._environment, planned.episode, self._name)
             self._first = step.observation.image
             return self._see(step)
         except ProbeKitError as error:
@@ -70,7 +68,7 @@ class EnvironmentStage(TimedStage):
                     answer = self._environment.step(action.copy())
                 self._steps += 1
                 step = checked_step(answer, self._planned.episode, f"{self._name}, step() {self._steps}")
-                self._succeeded |= bool(step.facts.get(SUCCESS, False))
+                self._succeeded |= _succeeds(step)
                 if step.done or self._steps >= self._played.source.max_steps:
                     return self._end(step)
             return self._see(step)
@@ -109,8 +107,10 @@ class EnvironmentStage(TimedStage):
 
     def _end(self, step: Step) -> Ending:
         fact_values(step.facts, self._played.facts, f"{self._name}, step() {self._steps}")
+        at_end, has_success = _succeeds(step), SUCCESS in self._played.facts
         outcome = {
-            "outcome": (SUCCEEDED if self._succeeded else FAILED) if SUCCESS in self._played.facts else ENDED,
+            "outcome": (SUCCEEDED if at_end else FAILED) if has_success else ENDED,
+            **({ONCE: self._succeeded, AT_END: at_end} if has_success else {}),
             "steps": self._steps,
             "done": bool(step.done),
             "frames_blake2b": self._hash.hexdigest(),
@@ -125,6 +125,10 @@ class EnvironmentStage(TimedStage):
     def _named(self, error: ProbeKitError) -> ProbeKitError:
         error.add_note(f"in {self._planned.episode_id} ({self._planned.instruction!r})")
         return error
+
+
+def _succeeds(step: Step) -> bool:
+    return bool(step.facts.get(SUCCESS, False))
 
 
 def cameras_of(seen: Observation, model: Sequence[str]) -> list[str]:

@@ -1,10 +1,8 @@
 """What `probe-kit dataset show` says of a data set, and of a model that is to be shown it."""
 
-import numpy as np
-
 from probe_kit.extract.recordings.lerobot_source import ACTION, STATE
 from probe_kit.extract.recordings.recorded_plan import Recording
-from probe_kit.extract.rollout.recorded.recorded_controller import MOST_UNUSUAL, Fitted
+from probe_kit.extract.rollout.recorded.recorded_controller import Fitted
 
 _LONGEST = 12
 """Tasks and numbers that are listed."""
@@ -33,14 +31,14 @@ def describe_recording(recording: Recording) -> dict[str, str]:
     }
 
 
-def describe_fit(fitted: Fitted) -> tuple[dict[str, str], list[str]]:
-    """How a model is shown the data set, in words, and what is unusual."""
+def describe_fit(fitted: Fitted) -> dict[str, str]:
+    """How a model is shown the data set, in words."""
     recording, policy = fitted.recording, fitted.policy
     cameras = [f"{camera} from {feature}" for camera, feature in recording.source.cameras]
     masked = [camera for camera in policy.card.cameras if camera not in dict(recording.source.cameras)]
     chunk, width = fitted.prediction
     recorded = recording.folder.width(ACTION)
-    facts = {
+    return {
         "model": f"{policy.card.family}  weights {policy.card.weights_sha256[:12]}",
         "shown": "; ".join(cameras) + (f"; without a picture: {', '.join(masked)}" if masked else ""),
         "predicts": f"{chunk} actions of {width} numbers; the data set has {recorded or 'no actions'}"
@@ -50,15 +48,6 @@ def describe_fit(fitted: Fitted) -> tuple[dict[str, str], list[str]]:
         else "compared with the recorded ones, see `probe-kit run show RUN --action-errors`",
         "state": _shares(fitted),
     }
-    names = recording.folder.names(STATE) if fitted.unusual.size else []
-    far = [names[one] for one in np.flatnonzero(fitted.unusual > MOST_UNUSUAL)]
-    warnings = []
-    if far:
-        warnings.append(
-            f"{STATE}: {', '.join(far)} lie outside the statistics of the checkpoint in more than "
-            f"{MOST_UNUSUAL:.0%} of the frames; `extract` refuses this without --accept-units"
-        )
-    return facts, warnings
 
 
 def _shares(fitted: Fitted) -> str:

@@ -12,6 +12,7 @@ from probe_kit.extract.recordings.lerobot_folder import fetched
 from probe_kit.extract.recordings.lerobot_source import ACTION, STATE
 from probe_kit.extract.recordings.recorded_plan import Recording
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
+from probe_kit.extract.rollout.preflight import MOST_UNUSUAL, check_units, other_order, unusual_shares
 from probe_kit.extract.rollout.recorded.recorded_stage import example_of
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.hooks.checkpoints.containment import copied
@@ -19,9 +20,6 @@ from probe_kit.hooks.checkpoints.third_party import while_acting
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
-
-MOST_UNUSUAL = 0.2
-"""Share of unusual values of one number of the state, above which a run is refused."""
 
 
 class RecordedController(PolicyController):
@@ -69,7 +67,7 @@ def fit(recording: Recording, policy: "Policy") -> Fitted:
     """
     recording = recording.mapped(policy.card.cameras)
     fetched(recording.folder, recording.episodes, recording.features)
-    recording.folder.check_files(recording.episodes, recording.features)
+    recording.check()
     try:
         policy = policy.with_cameras([camera for camera, _ in recording.source.cameras])
     except ObservationError as error:
@@ -118,13 +116,12 @@ def _chosen_numbers(recording: Recording) -> dict[str, NDArray[np.float32]]:
 
 
 def _unusual(recording: Recording, policy: "Policy", states: NDArray[np.float32] | None) -> NDArray[np.float64]:
-    if states is None or policy.state_numbers is None:
+    if states is None:
         return np.zeros(0)
     if not np.isfinite(states).all():
         name = recording.folder.path.name
         raise RecordingError(f"{name}: {STATE} holds NaN or infinity; leave such episodes out")
-    shares: NDArray[np.float64] = policy.unusual_states(states).mean(axis=0)
-    return shares
+    return unusual_shares(policy, states)
 
 
 def _other_actions(
@@ -137,6 +134,8 @@ def _other_actions(
         return f"the policy predicts {predicted} numbers, the data set has {actions.shape[1]}"
     if policy.predicts_relative:
         return "the policy predicts changes relative to the state (use_relative_actions)"
+    if (reason := other_order(policy, recording.folder.meta.names(ACTION) or ())) is not None:
+        return reason
     shares = policy.unusual_actions(actions).mean(axis=0)
     if not (shares > MOST_UNUSUAL).any():
         return None
@@ -145,18 +144,11 @@ def _other_actions(
     return f"recorded actions lie outside the statistics of the checkpoint ({far}), so the units differ"
 
 
-def check_units(fitted: Fitted) -> None:
-    """Raise RecordingError for states far outside the checkpoint's statistics, unless that is accepted."""
-    shares, folder = fitted.unusual, fitted.recording.folder
-    if fitted.recording.source.accept_units or not (shares > MOST_UNUSUAL).any():
-        return
-    names = folder.names(STATE)
-    worst = ", ".join(f"{names[one]} {shares[one]:.0%}" for one in np.flatnonzero(shares > MOST_UNUSUAL))
-    raise RecordingError(
-        f"{folder.path.name}: of the frames' {STATE} many values lie outside the statistics of "
-        f"{fitted.policy.card.checkpoint} ({worst}); expected at most {MOST_UNUSUAL:.0%} of each number. The "
-        "units or the robot differ: take the data set's own checkpoint, or accept it with --accept-units"
-    )
+def check_recorded_units(fitted: Fitted, accepted: bool) -> None:
+    """Raise UnitsError for recorded states far outside the checkpoint's statistics, unless that is accepted."""
+    folder = fitted.recording.folder
+    names = folder.names(STATE) if fitted.unusual.size else []
+    check_units(fitted.unusual, names, f"{folder.path.name}, {STATE}", fitted.policy, accepted)
 
 
 def check_predictions(chunks: Any, count: int) -> None:

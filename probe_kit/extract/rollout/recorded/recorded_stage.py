@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from probe_kit.errors import ProbeKitError
+from probe_kit.errors import ProbeKitError, RecordingError
 from probe_kit.extract.recordings.lerobot_folder import open_lerobot
 from probe_kit.extract.recordings.lerobot_source import ACTION, STATE, LeRobotSource
 from probe_kit.extract.recordings.recorded_plan import SIDE, PlannedStretch, Recording
@@ -39,6 +39,7 @@ class RecordedStage(TimedStage):
         self._frames = blake2b(digest_size=16)
         try:
             recording = self._recording
+            self._check_content(planned)
             wanted = [name for name in (STATE, ACTION) if recording.folder.width(name) is not None]
             self._numbers = recording.reader.numbers(planned.source_episode, [*wanted, *recording.folder.columns])
             return self._see()
@@ -55,6 +56,17 @@ class RecordedStage(TimedStage):
             return self._see() if self._position < self._planned.count else self._end()
         except ProbeKitError as error:
             raise self._named(error) from None
+
+    def _check_content(self, planned: PlannedStretch) -> None:
+        """Raise RecordingError unless the files of an episode are those that the plan was made of."""
+        recording = self._recording
+        now = recording.folder.content_blake2b(planned.source_episode, recording.features)
+        if now != planned.content:
+            raise RecordingError(
+                f"{recording.folder.path.name}: the files of {planned.item_id} were changed after the run was "
+                f"planned: their hash was {planned.content}, now it is {now}. Leave the data set as it is until "
+                "the run ends"
+            )
 
     @property
     def _frame(self) -> int:

@@ -107,7 +107,7 @@ class EvaluatedPi0(LerobotFlow):
             return super().look(camera, [squashed(image, (height, width)) for image in images])
         return padded_top_left(super().look(camera, images), (height, width))
 
-    def laid_out(self, state: NDArray[np.float32]) -> NDArray[np.float32]:
+    def laid_out(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
         """Seven numbers where the evaluation's statistics are of seven."""
         seven = self.evaluation.statistics is not None or self._statistics is not None
-        return laid_out(state, self._state_numbers if seven else ARM_NUMBERS, self.evaluation.openness)
+        return laid_out(states, self._state_numbers if seven else ARM_NUMBERS, self.evaluation.openness)

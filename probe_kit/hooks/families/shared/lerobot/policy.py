@@ -346,6 +346,13 @@ class LerobotPolicy(Policy):
         """See `showing`."""
         return self.showing(cameras)
 
+    @property
+    def action_names(self) -> tuple[str, ...] | None:
+        """As the configuration has them (`action_feature_names`), if there is one for each number."""
+        names = getattr(self.config, "action_feature_names", None)
+        count = self.config.output_features["action"].shape[0]
+        return tuple(map(str, names)) if names and len(names) == count else None
+
     def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
         return self.state_units.unusual(states)
@@ -429,10 +436,6 @@ class LerobotPolicy(Policy):
                 f"the state has {rows.shape[1]} numbers; this checkpoint reads {self._state_numbers}"
             )
         return self.state_units.normalise(rows)
-
-    def laid_out(self, state: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(B, numbers) of (B, 8): the state in the order this checkpoint was given it."""
-        return state
 
     def _pictures(self, camera: str, seen: Sequence[Observation]) -> Tensor:
         """(B, 3, H, W) in [0, 1]: each picture as this checkpoint looks at it."""

@@ -1,0 +1,368 @@
+"""The `meta` of a LeRobotDataset of format 3.0: features, tasks, episodes, and contradictions among them."""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from math import isfinite
+from pathlib import Path
+from typing import Any, Self
+
+from probe_kit._system.bounded_json import read_json_object
+from probe_kit._system.optional_dependencies import require
+from probe_kit.errors import RecordingError
+from probe_kit.extract.recordings.hashed_files import HashedFiles
+
+CONVERTER = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
+EXTRA = "datasets"
+IMAGE, VIDEO = "image", "video"
+INFO, TASKS, EPISODES = "meta/info.json", "meta/tasks.parquet", "meta/episodes"
+PARQUET = "parquet"
+NUMERIC = ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
+KEYS = ("episode_index", "index", "task_index")
+"""Features of one number that lead to other tables."""
+HALF = 0.5
+"""Frames by which a time range of a video may differ from whole frames."""
+RATE_ROUNDING = 1e-3
+_NUMBER, _LENGTH, _FROM, _TO = "episode_index", "length", "dataset_from_index", "dataset_to_index"
+_CHUNK, _FILE = "data/chunk_index", "data/file_index"
+_TASK = "task"
+_UNNAMED_INDEX = "__index_level_0__"
+_AGAIN = "Copy the data set again, or repair its meta"
+
+
+@dataclass(frozen=True)
+class VideoRange:
+    """The part of a video file that shows an episode. begin, end: seconds in the file. file: in the data set."""
+
+    file: Path
+    begin: float
+    end: float
+
+
+@dataclass(frozen=True)
+class EpisodeMeta:
+    """One episode. start: index of its first frame in the data set. file: of its numbers. videos: by camera."""
+
+    number: int
+    length: int
+    start: int
+    file: Path
+    videos: Mapping[str, VideoRange]
+
+
+@dataclass(frozen=True)
+class LeRobotMeta:
+    """What `meta` says. name: of the data set, for errors. tasks: (number, text) of every line of the table."""
+
+    name: str
+    info: Mapping[str, Any]
+    tasks: tuple[tuple[Any, Any], ...]
+    episodes: tuple[EpisodeMeta, ...]
+
+    @classmethod
+    def read(cls, root: Path, files: HashedFiles) -> Self:
+        """The meta of the data set in `root`.
+
+        Raises RecordingError for another format, a missing file, and where two parts contradict each other;
+        MissingExtraError without the libraries that read it.
+        """
+        info = _read_info(root, files)
+        require("pyarrow", EXTRA)
+        require("av", EXTRA)
+        _check_info(root, info)
+        tasks = _read_tasks(root, files)
+        episodes = tuple(_read_episodes(root, files, info))
+        found = cls(root.name, info, tasks, episodes)
+        found._check_totals()
+        found._check_names()
+        found._check_videos()
+        return found
+
+    @cached_property
+    def fps(self) -> float:
+        """Frames per second."""
+        return float(self.info["fps"])
+
+    @property
+    def features(self) -> Mapping[str, Any]:
+        """Type, shape and names by feature."""
+        features: Mapping[str, Any] = self.info["features"]
+        return features
+
+    @property
+    def cameras(self) -> list[str]:
+        """Features that are colour pictures."""
+        return [name for name, own in self.features.items() if own["dtype"] in (IMAGE, VIDEO) and not _depth(own)]
+
+    def is_video(self, feature: str) -> bool:
+        """Whether the pictures of a camera lie in video files."""
+        return bool(self.features[feature]["dtype"] == VIDEO)
+
+    def names(self, feature: str) -> tuple[str, ...] | None:
+        """The names of the numbers of a feature; None where the data set names none, or not all."""
+        named = _flat_names(self.features[feature].get("names"))
+        return named if named is not None and (len(named),) == tuple(self.features[feature]["shape"]) else None
+
+    def task(self, number: int) -> str:
+        """The text of a task. Raises RecordingError for a number that is not named once, or that has no text."""
+        texts = self._texts.get(number, [])
+        if len(texts) != 1:
+            raise RecordingError(
+                f"{self.name}: {TASKS} has {len(texts)} tasks of the number {number}, which a frame names; "
+                "expected one. Repair the data set, or give --instruction TEXT"
+            )
+        if not isinstance(texts[0], str) or not texts[0].strip():
+            raise RecordingError(
+                f"{self.name}: {TASKS} has {texts[0]!r} as the task {number}, which a frame names; expected a "
+                "text. Repair the data set, or give --instruction TEXT"
+            )
+        return texts[0]
+
+    @cached_property
+    def _texts(self) -> dict[Any, list[Any]]:
+        found: dict[Any, list[Any]] = {}
+        for number, text in self.tasks:
+            found.setdefault(number, []).append(text)
+        return found
+
+    # -- contradictions --------------------------------------------------------------------------------
+
+    def _check_totals(self) -> None:
+        """Raise RecordingError unless numbers, ranges and totals of the episodes fit each other."""
+        numbers = [one.number for one in self.episodes]
+        if twice := [number for number, count in Counter(numbers).items() if count > 1]:
+            raise RecordingError(
+                f"{self.name}: {EPISODES} has {numbers.count(twice[0])} lines of episode {twice[0]}; expected "
+                f"one. Remove the file that does not belong to the data set. {_AGAIN}"
+            )
+        total = self.info.get("total_episodes", len(numbers))
+        if lacking := sorted(set(range(max((total, *numbers)) if numbers else total)) - set(numbers)):
+            raise RecordingError(
+                f"{self.name}: {EPISODES} has {len(numbers)} episodes, up to number {max(numbers, default=0)}, "
+                f"and not episode {lacking[0]}; expected all from 0 on. Give the episodes new numbers, or take "
+                "the data set as it was before an episode was removed"
+            )
+        expected = 0
+        for one in self.episodes:
+            if one.start != expected:
+                raise RecordingError(
+                    f"{self.name}: {EPISODES} says that episode {one.number} begins at index {one.start}; "
+                    f"expected {expected}, where the one before it ends. {_AGAIN}"
+                )
+            expected += one.length
+        for total_name, count in (
+            ("total_episodes", len(numbers)),
+            ("total_frames", expected),
+            ("total_tasks", len(self.tasks)),
+        ):
+            if self.info.get(total_name, count) != count:
+                raise RecordingError(
+                    f"{self.name}: {INFO} has {total_name} {self.info[total_name]!r}; its tables have {count}. "
+                    f"{_AGAIN}"
+                )
+
+    def _check_names(self) -> None:
+        """Raise RecordingError for a feature two of whose numbers have one name."""
+        for feature in self.features:
+            names = self.names(feature) or ()
+            if twice := [name for name, count in Counter(names).items() if count > 1]:
+                raise RecordingError(
+                    f"{self.name}: {INFO} names two numbers of {feature} {twice[0]!r}; expected each name once. "
+                    "Correct the names"
+                )
+
+    def _check_videos(self) -> None:
+        """Raise RecordingError for time ranges that overlap, or do not hold as many frames as their episode."""
+        for camera in filter(self.is_video, self.cameras):
+            rate = (self.features[camera].get("info") or {}).get("video.fps")
+            if rate is not None and not _equal_rates(rate, self.fps):
+                raise RecordingError(
+                    f"{self.name}: {INFO} says that {camera} has {rate!r} frames per second, and the data set "
+                    f"{self.fps:g}; expected the same. {_AGAIN}"
+                )
+            slack = HALF / self.fps
+            by_file: dict[Path, list[tuple[VideoRange, int]]] = {}
+            for one in self.episodes:
+                part = one.videos[camera]
+                if not abs(part.end - part.begin - one.length / self.fps) <= slack or part.begin < -slack:
+                    raise RecordingError(
+                        f"{self.name}: {EPISODES} says that {part.begin:.4f} to {part.end:.4f} s of {part.file} "
+                        f"show episode {one.number}, of {one.length} frames; expected "
+                        f"{one.length / self.fps:.4f} s at {self.fps:g} frames per second. {_AGAIN}"
+                    )
+                by_file.setdefault(part.file, []).append((part, one.number))
+            for file, parts in by_file.items():
+                parts.sort(key=lambda pair: pair[0].begin)
+                for (before, first), (after, second) in pairwise(parts):
+                    if after.begin < before.end - slack:
+                        raise RecordingError(
+                            f"{self.name}: {EPISODES} says that {file} shows episode {first} until "
+                            f"{before.end:.4f} s and episode {second} from {after.begin:.4f} s on; expected "
+                            f"ranges that do not overlap. {_AGAIN}"
+                        )
+
+
+def _equal_rates(one: Any, other: float) -> bool:
+    """Whether two rates are equal but for the rounding of one such as 30000 / 1001."""
+    return isinstance(one, int | float) and abs(one - other) <= RATE_ROUNDING * other
+
+
+def _depth(feature: Mapping[str, Any]) -> bool:
+    info, video = feature.get("info") or {}, feature.get("video_info") or {}
+    told = info.get("is_depth_map"), info.get("video.is_depth_map"), video.get("video.is_depth_map")
+    return any(told)
+
+
+def _flat_names(named: Any) -> tuple[str, ...] | None:
+    """Names as a list: of {"motors": […]}, of groups of names, or of places by name."""
+    if isinstance(named, Mapping):
+        places = list(named.values())
+        if sorted(map(repr, places)) == sorted(map(repr, range(len(places)))):
+            return tuple(sorted(named, key=lambda name: named[name]))
+        if any(isinstance(part, str) or not isinstance(part, Sequence) for part in places):
+            return None
+        named = [name for part in places for name in part]
+    if isinstance(named, str) or not isinstance(named, Sequence):
+        return None
+    return tuple(map(str, named))
+
+
+def _read_info(root: Path, files: HashedFiles) -> Mapping[str, Any]:
+    path = root / INFO
+    if not path.is_file():
+        raise RecordingError(
+            f"{root} is no LeRobotDataset: it has no {INFO}. Give the folder that holds meta, data and videos"
+        )
+    files.check(path)
+    info = read_json_object(path, RecordingError, "Copy the data set again")
+    version = str(info.get("codebase_version"))
+    if not version.startswith("v3."):
+        raise RecordingError(
+            f"{root.name} has format {version}; this version reads v3.0. Convert it with `{CONVERTER} --repo-id=…`"
+        )
+    if (stored := info.get("storage_format", PARQUET)) != PARQUET:
+        raise RecordingError(
+            f"{root.name} has the storage_format {stored!r}; this version reads {PARQUET!r}. Convert it with "
+            "lerobot"
+        )
+    if missing := [name for name in (TASKS, EPISODES) if not (root / name).exists()]:
+        raise RecordingError(f"{root.name} has no {missing[0]}. Copy the data set again")
+    return info
+
+
+def _check_info(root: Path, info: Mapping[str, Any]) -> None:
+    """Raise RecordingError unless rate and features are what frames can be read by."""
+    fps = info.get("fps")
+    if isinstance(fps, bool) or not isinstance(fps, int | float) or not (isfinite(fps) and fps > 0):
+        raise RecordingError(f"{root.name}: {INFO} has fps {fps!r}; expected a number above 0. {_AGAIN}")
+    features = info.get("features")
+    if not isinstance(features, Mapping) or not all(map(_is_feature, features.values())):
+        raise RecordingError(f"{root.name}: {INFO} has no features with dtype and shape each. {_AGAIN}")
+
+
+def _is_feature(own: Any) -> bool:
+    return (
+        isinstance(own, Mapping)
+        and isinstance(own.get("dtype"), str)
+        and isinstance(own.get("shape"), Sequence)
+        and all(type(size) is int for size in own["shape"])
+    )
+
+
+def _read_table(root: Path, files: HashedFiles, path: Path, columns: Sequence[str] | None = None) -> Any:
+    """The table of a Parquet file of meta. Raises RecordingError for one that cannot be read or lacks a column."""
+    pa, pq = require("pyarrow", EXTRA), require("pyarrow.parquet", EXTRA)
+    name = path.relative_to(root)
+    try:
+        with files.open(path) as opened, pq.ParquetFile(opened) as parquet:
+            if missing := [column for column in columns or () if column not in parquet.schema_arrow.names]:
+                raise RecordingError(f"{root.name}: {name} has no column {missing[0]!r}. {_AGAIN}")
+            return parquet.read(columns)
+    except pa.ArrowException as error:
+        raise RecordingError(f"{root.name}: {name} cannot be read: {str(error)[:300]}. {_AGAIN}") from error
+
+
+def _read_tasks(root: Path, files: HashedFiles) -> tuple[tuple[Any, Any], ...]:
+    """Number and text of every task. lerobot has the texts in the index of pandas; others in a column `task`."""
+    table = _read_table(root, files, root / TASKS)
+    index = (table.schema.pandas_metadata or {}).get("index_columns", [])
+    candidates = dict.fromkeys([_TASK, *(name for name in index if isinstance(name, str)), _UNNAMED_INDEX])
+    columns = [tuple(table.column(name).to_pylist()) for name in candidates if name in table.column_names]
+    texts = dict.fromkeys(cells for cells in columns if any(isinstance(cell, str) for cell in cells))
+    if "task_index" not in table.column_names or len(texts) != 1:
+        raise RecordingError(
+            f"{root.name}: {TASKS} has the columns {', '.join(table.column_names) or 'none'}; expected "
+            f"task_index, and the texts of the tasks in one column {_TASK!r} or in the index of pandas. {_AGAIN}"
+        )
+    return tuple(zip(table.column("task_index").to_pylist(), next(iter(texts)), strict=True))
+
+
+def _read_episodes(root: Path, files: HashedFiles, info: Mapping[str, Any]) -> Iterator[EpisodeMeta]:
+    """Every line of `meta/episodes`, by number."""
+    cameras = [name for name, own in info["features"].items() if own["dtype"] == VIDEO]
+    parts = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+    columns = [_NUMBER, _LENGTH, _FROM, _TO, _CHUNK, _FILE]
+    columns += [f"videos/{camera}/{part}" for camera in cameras for part in parts]
+    paths = sorted(path for path in (root / EPISODES).rglob("*.parquet") if not path.name.startswith("."))
+    lines = [
+        (path, line) for path in paths for line in _read_table(root, files, path, columns).to_pylist()
+    ]  # fmt: skip
+    if not lines:
+        raise RecordingError(f"{root.name}: {EPISODES} has no episode. Copy the data set again")
+    for path, line in lines:
+        _check_line(line, f"{root.name}: {path.relative_to(root)}")
+    for _, line in sorted(lines, key=lambda pair: pair[1][_NUMBER]):
+        number = line[_NUMBER]
+        videos = {
+            camera: VideoRange(
+                _path_of(root, info, "video_path", number, video_key=camera,
+                         chunk_index=line[f"videos/{camera}/chunk_index"],
+                         file_index=line[f"videos/{camera}/file_index"]),
+                float(line[f"videos/{camera}/from_timestamp"]),
+                float(line[f"videos/{camera}/to_timestamp"]),
+            )
+            for camera in cameras
+        }  # fmt: skip
+        file = _path_of(
+            root, info, "data_path", number, chunk_index=line[_CHUNK], file_index=line[_FILE]
+        )  # fmt: skip
+        yield EpisodeMeta(number, line[_LENGTH], line[_FROM], file, videos)
+
+
+def _check_line(line: Mapping[str, Any], where: str) -> None:
+    """Raise RecordingError for an episode with an empty cell, a negative number, or a length unlike its range."""
+    for name, cell in line.items():
+        is_time = name.endswith("_timestamp")
+        if (
+            not isinstance(cell, float | int if is_time else int)
+            or not isfinite(cell)
+            or (cell < 0 and not is_time)
+        ):
+            raise RecordingError(
+                f"{where} has {name} {cell!r} for episode {line[_NUMBER]!r}; expected "
+                f"{'seconds' if is_time else 'a whole number from 0 on'}. {_AGAIN}"
+            )
+    if line[_LENGTH] < 1 or line[_TO] - line[_FROM] != line[_LENGTH]:
+        raise RecordingError(
+            f"{where} says that episode {line[_NUMBER]} has {line[_LENGTH]} frames, and the indices "
+            f"{line[_FROM]} to {line[_TO]}; expected at least one frame, and as many indices as frames. {_AGAIN}"
+        )
+
+
+def _path_of(root: Path, info: Mapping[str, Any], template: str, episode: int, **parts: Any) -> Path:
+    """A file that `info` names, in the data set's folder. Raises RecordingError for one that is outside it."""
+    try:
+        path = Path(str(info[template]).format(**parts))
+    except (KeyError, IndexError, ValueError, AttributeError) as error:
+        raise RecordingError(
+            f"{root.name}: {INFO} has {template} {info.get(template)!r}, which names no file of chunk_index and "
+            f"file_index ({error}). {_AGAIN}"
+        ) from error
+    if path.is_absolute() or ".." in path.parts:
+        raise RecordingError(
+            f"{root.name}: {INFO} names {path} for episode {episode}; expected a file in the data set's folder. "
+            "Correct data_path and video_path"
+        )
+    return path
