@@ -5,18 +5,17 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
 
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import RecordingError
 from probe_kit.extract.recordings.lerobot_folder import LeRobotFolder
 from probe_kit.extract.recordings.lerobot_meta import EXTRA, HALF, EpisodeMeta
+from probe_kit.suite.pictures import decode_bytes
 
 OFF_GRID_S = 1e-4
 """Seconds by which a timestamp may differ from frame / fps, and a picture of a video from its timestamp."""
@@ -190,14 +189,7 @@ class LeRobotFrames:
                 + "; expected the bytes "
                 "of a picture, because only they are hashed. Write the data set again with its pictures in it"
             )
-        try:
-            with Image.open(BytesIO(content)) as image:
-                upright = ImageOps.exif_transpose(image)
-        except (OSError, SyntaxError, ValueError) as error:
-            raise RecordingError(f"{where} cannot be decoded: {error}. Copy the data set again") from error
-        if upright.mode != "RGB":
-            raise RecordingError(f"{where} is {upright.mode}; expected RGB with 8 bits per channel")
-        return np.asarray(upright).copy()
+        return np.asarray(decode_bytes(content, f"{where}:", RecordingError, "Copy the data set again.")).copy()
 
     def _of_video(self, episode: int, frame: int, camera: str) -> NDArray[np.uint8]:
         own = self.folder.episode(episode)

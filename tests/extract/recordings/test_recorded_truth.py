@@ -206,18 +206,34 @@ def test_a_picture_that_lies_outside_the_data_file_is_refused(copy: Path) -> Non
         shown_states(copy)
 
 
-@pytest.mark.parametrize("mode", ["RGBA", "L", "I;16"])
-def test_pictures_of_other_modes_are_refused(copy: Path, mode: str) -> None:
+def encoded(mode: str, kind: str) -> bytes:
+    """A black picture, or one without any opaque pixel."""
     buffer = BytesIO()
-    Image.new(mode, (64, 48)).save(buffer, "PNG")
-    change(copy / DATA, CAMERA, lambda rows: [{"bytes": buffer.getvalue(), "path": None} for _ in rows])
-    with pytest.raises(RecordingError, match=r"frame 0 of episode 0 is .*; expected RGB with 8 bits"):
+    Image.new(mode, (64, 48)).save(buffer, kind)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [(encoded("I;16", "PNG"), "has more than 8 bits per channel"), (encoded("RGB", "TIFF"), "is TIFF; expected")],
+)
+def test_deep_pictures_and_other_formats_are_refused(copy: Path, content: bytes, expected: str) -> None:
+    change(copy / DATA, CAMERA, lambda rows: [{"bytes": content, "path": None} for _ in rows])
+    with pytest.raises(RecordingError, match=f"at frame 0 of episode 0: {expected}"):
         shown_states(copy)
+
+
+@pytest.mark.parametrize(("mode", "value"), [("RGBA", 255), ("L", 0)])
+def test_transparency_is_white_and_grey_is_rgb_as_in_suites(copy: Path, mode: str, value: int) -> None:
+    content = encoded(mode, "PNG")
+    change(copy / DATA, CAMERA, lambda rows: [{"bytes": content, "path": None} for _ in rows])
+    picture = LeRobotFrames(opened(copy)).pictures(0, 0, [CAMERA])[CAMERA]
+    np.testing.assert_array_equal(picture, np.full((48, 64, 3), value, np.uint8))
 
 
 def test_half_a_picture_is_refused_by_its_frame(copy: Path) -> None:
     change(copy / DATA, CAMERA, lambda rows: [{**row, "bytes": row["bytes"][:400]} for row in rows])
-    with pytest.raises(RecordingError, match=r"the picture of .* at frame 0 of episode 0 cannot be decoded"):
+    with pytest.raises(RecordingError, match=r"the picture of .* at frame 0 of episode 0: not a picture"):
         shown_states(copy)
 
 
@@ -482,7 +498,7 @@ def test_time_ranges_of_videos_that_do_not_fit_are_refused(filmed: Path, tmp_pat
         ),
         (
             lambda f: change(f / DATA, CAMERA, lambda rows: [{"bytes": b"", "path": None} for _ in rows]),
-            "be decoded",
+            "not a picture",
         ),
         (lambda f: shutil.copy(f / DATA, f / "data/chunk-000/file-001.parquet"), "meta/episodes names no episode"),
     ],
