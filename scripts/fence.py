@@ -276,7 +276,7 @@ def compare_answers_and_actions(fence: Fence) -> None:
     # Cubes end within 1 cm of the middle, so that only small zones tell a radius from another.
     small_zones = ("--epsilons", "0.004,0.006,0.008", "--last-steps", 2)
     add_retention(fence, "acting", "retention in small zones", "acting", *small_zones)
-    printed = json.loads(call("stages", ASKED, "acting", "--json"))
+    printed = table("retention", ASKED, "acting", "--stages")
     fence.add("comparison", "stages", printed if isinstance(printed, list) else [printed])
 
 

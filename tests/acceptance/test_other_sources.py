@@ -187,7 +187,7 @@ def test_showing_the_same_frames_again_from_python_gives_the_same_activations(
 
 
 def test_errors_of_predicted_actions_are_those_of_the_stored_numbers(shown: Path) -> None:
-    rows = json.loads(probe_kit("dataset", "errors", shown, "--json").out)
+    rows = json.loads(probe_kit("run", "show", shown, "--action-errors", "--json").out)
     assert rows
     assert "NaN" not in json.dumps(rows)
 

@@ -80,7 +80,7 @@ def play(folder: Path) -> Path:
     probe_kit("study", "run", file, "--only", "idle", "--env-workers", "0")
     first = stored(folder)
     assert len(first) == 4, "two items in both layouts"
-    assert probe_kit("study", "status", file, code=1).text
+    assert probe_kit("study", "run", file, "--dry-run", "--exit-code", code=1).text
     probe_kit("study", "run", file, "--env-workers", "0")
     assert first.items() <= stored(folder).items(), "what was stored is played again"
     return file
@@ -99,7 +99,7 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(tmp_path: Path) -> None:
     assert [path.name for path in file.parent.iterdir()] == ["study.toml"]
     assert all(name in text for name in ("expert", "short"))
     assert re.search(r"\b12\b", json.dumps(plan)), "three runs of four episodes"
-    assert probe_kit("study", "status", file, code=1).text
+    assert probe_kit("study", "run", file, "--dry-run", "--exit-code", code=1).text
 
 
 def test_a_study_resumes_and_a_whole_one_plays_nothing(study: Path) -> None:
@@ -107,7 +107,8 @@ def test_a_study_resumes_and_a_whole_one_plays_nothing(study: Path) -> None:
     assert len(before) == 12
     probe_kit("study", "run", study, "--env-workers", "0")
     assert stored(study.parent) == before
-    assert "whole" in probe_kit("study", "status", study, "--verify").text
+    typed = ("study", "run", study, "--dry-run", "--exit-code", "--verify")
+    assert "whole" in probe_kit(*typed).text
 
 
 def rates(study: Path) -> dict[str, float]:
@@ -170,7 +171,7 @@ def test_figures_are_drawn_as_png_and_pdf(study: Path, tmp_path: Path) -> None:
 
 
 def test_the_report_of_a_study_is_one_file_with_its_tables(study: Path, tmp_path: Path) -> None:
-    probe_kit("study", "report", study, "--html", tmp_path / "report.html")
+    probe_kit("study", "table", study, "--html", tmp_path / "report.html")
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert all(name in text for name in ("expert", "Idle", "max_steps"))

@@ -146,7 +146,7 @@ def test_the_embedded_suite_is_drawn_alike_twice_and_is_valid(tmp_path: Path) ->
     assert [item.instruction for item in suites[0].items] == [item.instruction for item in suites[1].items]
     assert Counter(item.correct_side for item in suites[0].items) == {"left": 6, "right": 6}
     probe_kit("suite", "validate", tmp_path / "first")
-    words = set(probe_kit("suite", "words").out.split())
+    words = set(probe_kit("models", "--words").out.split())
     used = {word for item in suites[0].items for word in item.instruction.lower().split()}
     assert used <= words
 

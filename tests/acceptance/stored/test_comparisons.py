@@ -105,7 +105,8 @@ def test_vlm_minus_vla_is_the_paired_difference_on_the_same_first_frames(runs: S
 
 
 def test_stages_count_items_by_answered_encoded_and_acted(runs: StoredRuns) -> None:
-    rows = {row["category"]: row for row in probe_kit("stages", runs.asked, runs.trained, "--json").json()["rows"]}
+    typed = ("retention", runs.asked, runs.trained, "--stages")
+    rows = {row["category"]: row for row in probe_kit(*typed, "--format", "json").json()["rows"]}
     for category in ("color", "state"):
         row = rows[category]
         answered, acted = (correct(run, category).groupby("item_id").all() for run in (runs.asked, runs.trained))
@@ -115,7 +116,7 @@ def test_stages_count_items_by_answered_encoded_and_acted(runs: StoredRuns) -> N
         both = sum(number for which, number in row["counts"].items() if which[0] == which[2] == "1")
         assert both == (answered & acted).sum()
         assert row["encoded"] == sum(number for which, number in row["counts"].items() if which[1] == "1")
-    text = probe_kit("stages", runs.asked, runs.trained).out
+    text = probe_kit(*typed).out
     for category, row in rows.items():
         printed = " ".join(cell for cells in rows_with(text, category) for cell in cells)
         assert f"{row['answered_correctly']} (" in printed

@@ -101,7 +101,8 @@ def other_frames(room: Room) -> tuple[object, ...]:
         "frontal",
     )
     probe_kit("ask", *settings, "--out", room.folder / "asked")
-    return ("stages", next((room.folder / "asked").glob("*/run.json")).parent, room.runs.trained)
+    asked = next((room.folder / "asked").glob("*/run.json")).parent
+    return ("retention", asked, room.runs.trained, "--stages")
 
 
 def too_few_groups(room: Room) -> tuple[object, ...]:
@@ -224,7 +225,7 @@ def test_the_installed_program_exits_with_the_documented_codes(tmp_path: Path) -
 
 def test_escape_sequences_of_outside_text_never_reach_the_terminal(runs: StoredRuns, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(runs.expert, tmp_path / "copy"))
-    labelled = probe_kit("run", "label", copy, "red\x1b[31m", code=None)
+    labelled = probe_kit("run", "show", copy, "--label", "red\x1b[31m", code=None)
     table = probe_kit("retention", copy)
     missing = probe_kit("retention", f"{tmp_path}/\x1b[2Jnowhere", code=2)
     for answer in (labelled, table, missing):

@@ -30,7 +30,7 @@ OUTSIDE = re.compile(
 def hostile(runs: StoredRuns, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the trained run whose name in tables is a script."""
     copy = Path(shutil.copytree(runs.trained, tmp_path_factory.mktemp("hostile") / "a<b>&'c"))
-    probe_kit("run", "label", copy, HOSTILE)
+    probe_kit("run", "show", copy, "--label", HOSTILE)
     return copy
 
 
