@@ -53,6 +53,7 @@ def bucket() -> Iterator[str]:
     server.server_close()
 
 
+@pytest.mark.slow
 def test_a_study_in_a_bucket_equals_the_same_in_a_folder(bucket: str, tmp_path: Path) -> None:
     tables = []
     for run in (f"{bucket}/study/run", str(tmp_path / "run")):
@@ -69,14 +70,29 @@ def test_a_study_in_a_bucket_equals_the_same_in_a_folder(bucket: str, tmp_path: 
     assert remote.episodes["episode_id"].tolist() == local.episodes["episode_id"].tolist()
 
 
-def test_a_bucket_without_the_run_is_wrong_usage_and_other_settings_are_refused(bucket: str) -> None:
+def test_a_run_in_a_bucket_is_verified_and_tabled_and_refuses_other_settings(bucket: str) -> None:
     answer = probe_kit("retention", f"{bucket}/nowhere", code=2)
     assert "RunNotFoundError" in answer.err
-    other = (*SETTINGS[:-2], "--seed", "3", "--items", "2")
     few = f"{bucket}/few"
-    probe_kit("extract", "--model", "idle", "--max-steps", "1", *SETTINGS[3:5], *other[5:], "--out", few)
-    refused = probe_kit(
-        "extract", "--model", "idle", "--max-steps", "2", *SETTINGS[3:5], *other[5:], "--out", few, code=3
+    typed = (
+        "extract",
+        "--model",
+        "idle",
+        "--categories",
+        "color",
+        "--items",
+        "2",
+        "--env-workers",
+        "0",
+        "--out",
+        few,
     )
+    probe_kit(*typed, "--max-steps", "1")
+    verified = probe_kit("run", "verify", few, "--deep", "--json").json()
+    assert verified["ok"]
+    assert verified["committed"] == len(pk.open_run(few).episodes) == 4
+    rows = probe_kit("retention", few, "--format", "json").json()
+    assert {(row["success"]["n_episodes"], row["success"]["sr"]) for row in rows} == {(4, 0)}
+    refused = probe_kit(*typed, "--max-steps", "2", code=3)
     assert "SettingsMismatchError" in refused.err
     assert "max_steps" in refused.text

@@ -177,6 +177,7 @@ def test_a_recording_is_shown_frame_by_frame_and_its_numbers_are_stored_beside_t
     assert np.isfinite(run.inputs.read("prediction")[:, :FRAMES]).all()
 
 
+@pytest.mark.slow
 def test_showing_the_same_frames_again_from_python_gives_the_same_activations(
     recording: Path, shown: Path, tmp_path: Path
 ) -> None:
@@ -237,6 +238,7 @@ def test_a_policy_acts_in_an_environment_and_its_facts_become_labels(acted: Path
     assert "env.left" in table + (acted.parent / "labels.csv").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_episodes_of_an_environment_are_the_same_when_they_are_played_again(
     environment_module: str, acted: Path, tmp_path: Path
 ) -> None:

@@ -49,9 +49,10 @@ def test_a_cube_is_placed_up_to_the_radius_and_not_beyond_it(model: str, inside:
     assert 0.05 < away.mean() < 0.09
     for name, share, expected in (("wider", 1.05, inside), ("narrower", 0.95, "oob")):
         radius = round(share * float(away.mean()), 4)
-        scored = stopped(tmp_path / name, SEVEN_CM, "--epsilon", radius, model=model).episodes
-        assert set(scored["outcome"]) == {expected}
-        assert scored["epsilon"].tolist() == [radius] * 4
+        scored = stopped(tmp_path / name, SEVEN_CM, "--epsilon", radius, model=model)
+        assert set(scored.episodes["outcome"]) == {expected}
+        assert scored.episodes["epsilon"].tolist() == [radius] * 4
+        assert rules(scored)["sr_by_rule"]["disc"] == (expected == "correct"), "judged again from the trajectory"
 
 
 def test_radii_of_a_table_are_metres_from_the_middle_of_the_correct_picture(tmp_path: Path) -> None:

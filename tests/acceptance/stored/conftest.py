@@ -50,6 +50,7 @@ def play(folder: Path) -> None:
     runs = StoredRuns(folder)
     both, color = ("--categories", "color,state"), ("--categories", "color")
     policy = ("--model", "pi0-tiny", "--items", "12", "--batch", "24", "--env-workers", "0", "--max-steps", "6")
+    policy += ("--execute", "3")
     probes = ("--permutations", "3", "--controls", "none")
     probe_kit("extract", *policy, *both, "--out", runs.trained, "--label", "trained")
     probe_kit("train", runs.trained, *probes)
