@@ -29,6 +29,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what 
 gc.disable()  # until all tests are collected: imports and tests make objects that stay
 CHECKOUT = Path(__file__).parents[1]
 GOLDEN = Path(__file__).parent / "golden"
+FENCE = Path(__file__).parent / "acceptance"
 SHARED = Path(os.environ.get("PROBE_KIT_SHARED", CHECKOUT.parent / "shared"))
 _CHANGED = pytest.StashKey[str]()
 
@@ -59,13 +60,14 @@ def _golden(family: str) -> Path:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
-    """The whole suite takes every core, unless -n says otherwise; single files run in this process.
+    """The whole suite and the fence take every core, unless -n says otherwise; single files run in this process.
 
     A file's tests stay together: what a file sets up once is not set up once per core.
     """
     if hasattr(config, "workerinput"):  # a core of its own already; it must not ask for more
         return
-    whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS and not config.option.collectonly
+    fence = [config.invocation_params.dir / folder for folder in config.args] == [FENCE]
+    whole = (fence or config.args_source is pytest.Config.ArgsSource.TESTPATHS) and not config.option.collectonly
     if whole and config.pluginmanager.hasplugin("xdist") and config.option.numprocesses is None:
         config.option.numprocesses = len(os.sched_getaffinity(0))
         if config.option.dist == "no":
