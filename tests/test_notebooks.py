@@ -19,8 +19,8 @@ NAMES = (
     "01-first-run", "02-layer-curves", "03-compare-models", "04-your-own-model", "05-your-own-questions",
     "06-vlm-against-vla", "07-from-readable-to-used", "08-your-own-labels", "09-your-own-recordings",
 )  # fmt: skip
-WHOLE_ONLY = NAMES[7:]
-"""They run in the slow suite only: other tests play the same way in the default one."""
+WHOLE_ONLY = NAMES[2:]
+"""They run in the slow suite only: the tests in `acceptance/` use the same commands in the default one."""
 EXTRAS = {"09-your-own-recordings": ("datasets", "av")}
 """Modules of extras that a notebook needs."""
 MACHINE = re.compile(r"/(?:home|root|tmp|Users|usr|opt|work|private|var)/|site-packages|[A-Z]:\\\\")
@@ -32,12 +32,9 @@ PICTURE = re.compile(r"(?:\.plot\(\)|^pk\.layer_curve\(.*\)|^Image\.open\(.*\)|^
 SCENE = 'scene=pk.SceneSpec.preset("act2answer", max_steps=4), batch=12, '
 SHORT = {
     'ExtractSettings("pi0-tiny", ': f'ExtractSettings("pi0-tiny", {SCENE}',
-    "ExtractSettings(model, ": f"ExtractSettings(model, {SCENE}",
     "permutations=24": "permutations=3",
-    '["color", "state"]': '["color"]',
-    '"backbone.*", "kv.*"': '"backbone.03", "kv.02"',
 }
-"""Short episodes, few label permutations, one category, two places."""
+"""Short episodes and few label permutations."""
 
 
 def shortened(source: str) -> str:
@@ -82,7 +79,7 @@ def test_the_short_notebooks_are_shorter() -> None:
         if name not in WHOLE_ONLY
         for cell in nbformat.read(FOLDER / f"{name}.ipynb", as_version=4).cells
     ]
-    assert [sum(long in source for source in sources) for long in SHORT] == [6, 1, 8, 1, 1]
+    assert [sum(long in source for source in sources) for long in SHORT] == [2, 3]
 
 
 def printed(notebook: NotebookNode) -> str:
@@ -135,6 +132,7 @@ def test_the_untrained_network_is_marked_and_shows_no_signal(made: tuple[Path, d
     assert not any(row.retention.defined for row in retention_table([run]).rows)
 
 
+@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
 def test_the_adapter_of_the_fourth_notebook_passes_its_contract(
     made: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
@@ -145,6 +143,7 @@ def test_the_adapter_of_the_fourth_notebook_passes_its_contract(
     assert open_run(made[0] / "work" / "runs" / "tiny-vla").certificate["hooks_on_equals_hooks_off"]
 
 
+@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
 def test_the_questions_of_the_fifth_notebook_are_valid_and_answered(
     made: tuple[Path, dict[str, NotebookNode]],
 ) -> None:
@@ -154,6 +153,7 @@ def test_the_questions_of_the_fifth_notebook_are_valid_and_answered(
     assert len(open_run(made[0] / "work" / "runs" / "blots").episodes) == 24
 
 
+@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
 def test_the_vlms_of_the_sixth_notebook_are_what_it_says(made: tuple[Path, dict[str, NotebookNode]]) -> None:
     runs = [open_run(made[0] / "work" / "runs" / name) for name in ("vlm-tiny", "habit", "pi0-tiny-asked")]
     asked, habit, acted = runs
@@ -163,6 +163,7 @@ def test_the_vlms_of_the_sixth_notebook_are_what_it_says(made: tuple[Path, dict[
     assert asked.episodes["first_frame_sha256"].tolist() == acted.episodes["first_frame_sha256"].tolist()
 
 
+@pytest.mark.parametrize("made", [pytest.param("whole", marks=pytest.mark.slow)], indirect=True)
 def test_the_last_layer_of_the_seventh_notebook_is_read_by_nothing(
     made: tuple[Path, dict[str, NotebookNode]],
 ) -> None:

@@ -14,7 +14,7 @@ class StoredRuns:
     """Folders of runs on the same items, of seed 0.
 
     trained: the embedded policy on Color and State, with probes and a swap of pictures. untrained: its network
-    with random weights on Color, in two wordings, with probes. asked: the embedded VLM on both. expert,
+    with random weights on Color, with probes. asked: the embedded VLM on both. expert,
     mirrored, idle: scripted policies on four items of Color.
     """
 
@@ -55,7 +55,7 @@ def play(folder: Path) -> None:
     probe_kit("extract", *policy, *both, "--out", runs.trained, "--label", "trained")
     probe_kit("train", runs.trained, *probes)
     probe_kit("intervene", runs.trained, *color)
-    other = ("--random-weights", "--wordings", "knowledge,named", "--label", "untrained")
+    other = ("--random-weights", "--label", "untrained")
     probe_kit("extract", *policy, *color, *other, "--out", runs.untrained)
     probe_kit("train", runs.untrained, *probes)
     probe_kit("ask", "--model", "vlm-tiny", "--items", "12", *both, "--prompt", "p1", "--out", folder / "asked")
