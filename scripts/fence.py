@@ -495,7 +495,7 @@ def numeric_platform() -> dict[str, str]:
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.exists() else []
     vendor = next((line.split(":")[1].strip() for line in lines if line.startswith("vendor_id")), "unknown")
-    # Not scikit-learn: its versions 1.8.0 and 1.9.1 give every number of the default part bit for bit.
+    # Not scikit-learn: 1.8.0 and 1.9.1 give the same bits, in the default part and in `erase`, which calls it.
     names = ("torch", "numpy", "scipy", "pybullet", "pillow", "opencv-python-headless", "transformers", "lerobot")
     libraries = {
         f"{one['internal_api']} {one.get('version')} {one.get('architecture', '')}".strip()

@@ -59,6 +59,7 @@ def test_every_model_is_one_line_at_eighty_columns(monkeypatch: pytest.MonkeyPat
     assert all(line.startswith(row["model"]) for line, row in zip(listed[1:], rows, strict=False))
 
 
+@pytest.mark.slow
 def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite: Suite, tmp_path: Path) -> None:
     run = tmp_path / "run"
     made = in_process(

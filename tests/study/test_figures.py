@@ -48,6 +48,7 @@ def test_the_overview_says_what_has_no_episodes_and_takes_names_as_they_are(tmp_
     assert name in [text.get_text() for text in physical.get_yticklabels()]
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_by_name_from_stored_runs(played: LoadedStudy, tmp_path: Path) -> None:
     out = tmp_path / "figures"
     made = CliRunner().invoke(app, ["study", "figure", str(played.file), "sides", "--out", str(out)])

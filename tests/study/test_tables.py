@@ -191,6 +191,7 @@ def test_a_table_is_also_rows_of_csv_with_both_ends_of_intervals(played: LoadedS
     assert "main, sides, score, light" in every.stderr
 
 
+@pytest.mark.slow
 def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: LoadedStudy, tmp_path: Path) -> None:
     file, page, run = tmp_path / "named.toml", tmp_path / "report.html", CliRunner()
     text = played.file.read_text(encoding="utf-8").partition("[figures.curves]")[0]
