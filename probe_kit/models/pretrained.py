@@ -1,4 +1,4 @@
-"""Loading of transformers' objects from the files of a checkpoint, without the Python code that those files name."""
+"""Loading of transformers' objects from a checkpoint's files, without the Python code that those files name."""
 
 from pathlib import Path
 from typing import Any

@@ -42,7 +42,7 @@ def plant(folder: Path, marker: Path, names: Sequence[str], unknown_classes: boo
     files = {path for path in (*folder.rglob("*.json"), *made) if path.name in names}
     for path in files:
         content = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        entry = {name: "evil.Thing" for name in AUTO_CLASSES} | {"AutoTokenizer": ["evil.Thing", "evil.Thing"]}
+        entry = dict.fromkeys(AUTO_CLASSES, "evil.Thing") | {"AutoTokenizer": ["evil.Thing", "evil.Thing"]}
         content["auto_map"] = entry
         if unknown_classes:
             content |= {key: "Thing" for key in CLASS_KEYS if key in content or key == "tokenizer_class"}
