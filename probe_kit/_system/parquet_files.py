@@ -78,8 +78,9 @@ def _check_sizes(metadata: Any, columns: Sequence[str] | None, groups: Sequence[
             width = _WIDTHS.get(chunk.physical_type, 0)
             size += max(chunk.total_uncompressed_size, width * chunk.num_values)
             values += chunk.num_values
-            if chunk.physical_type not in _WIDTHS:
-                longest = max(longest, chunk.total_uncompressed_size)
+            if path != metadata.schema.column(at).name and chunk.physical_type not in _WIDTHS:
+                # A text inside a list or a struct leaves its dictionary when it is read.
+                longest = max(longest, chunk.total_uncompressed_size * -(-chunk.num_values // group.num_rows))
     _check(size, MOST_BYTES, "bytes")
     _check(values, MOST_VALUES, "values")
     return max(1, min(_ROWS, _BATCH_BYTES // longest))

@@ -56,9 +56,9 @@ def test_a_small_file_that_stands_for_much_is_refused_before_its_cells_are_in_me
     before = pa.default_memory_pool()
     pa.set_memory_pool(pool)
     try:
-        with open_parquet(tmp_path / "x.parquet", "export") as parquet:
-            with pytest.raises(TooLargeError, match="expected at most 67,108,864"):
-                read_parquet(parquet)
+        refused = pytest.raises(TooLargeError, match="expected at most 67,108,864")
+        with open_parquet(tmp_path / "x.parquet", "export") as parquet, refused:
+            read_parquet(parquet)
     finally:
         pa.set_memory_pool(before)
     assert pool.max_memory() < 3 * BOUND
@@ -69,9 +69,9 @@ def test_more_values_than_python_can_hold_are_refused_by_their_number(
 ) -> None:
     monkeypatch.setattr(parquet_files, "MOST_VALUES", 999_999)
     pq.write_table(pa.table({"a": [True] * 1_000_000, "b": [1] * 1_000_000}), tmp_path / "x.parquet")
-    with open_parquet(tmp_path / "x.parquet", "export") as parquet:
-        with pytest.raises(TooLargeError, match="its cells have 1,000,000 values once they are read"):
-            read_parquet(parquet, ["a"])
+    refused = pytest.raises(TooLargeError, match="its cells have 1,000,000 values once they are read")
+    with open_parquet(tmp_path / "x.parquet", "export") as parquet, refused:
+        read_parquet(parquet, ["a"])
 
 
 def table() -> Any:
