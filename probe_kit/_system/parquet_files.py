@@ -48,7 +48,7 @@ def read_parquet(parquet: Any, columns: Sequence[str] | None = None, groups: Seq
 
     Raises TooLargeError before more than `MOST_BYTES` or `MOST_VALUES` are in memory.
     """
-    import pyarrow as pa
+    pa = require("pyarrow", "export")
 
     groups = range(parquet.num_row_groups) if groups is None else groups
     rows = _check_sizes(parquet.metadata, columns, groups)
@@ -96,8 +96,7 @@ def _check(found: int, most: int, unit: str) -> None:
 
 def _decoded_bytes(array: Any) -> int:
     """Bytes of an array whose dictionary is written out."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
+    pa, pc = require("pyarrow", "export"), require("pyarrow.compute", "export")
 
     if not pa.types.is_dictionary(array.type):
         return int(array.nbytes)

@@ -99,7 +99,7 @@ def _words(study: LoadedStudy, pack: Pack, episodes: int) -> Iterator[str]:
     yield f"# {markdown_safe(study.study.name)}"
     yield ""
     yield f"A study made with probe_kit {pack.version}: {len(pack.keys)} runs, {episodes:,} episodes."
-    yield f"Suite: {markdown_safe(str(pack.suite['identity']))}. Left out: {markdown_safe(', '.join(pack.left_out))}."
+    yield markdown_safe(f"Suite: {pack.suite['identity']}. Left out: {', '.join(pack.left_out)}.")
     yield ""
     yield f"* `{EPISODES}`: a row per episode of every run"
     yield f"* `{TABLES}/`: every table as JSON, Markdown and LaTeX"
