@@ -14,7 +14,7 @@ _MARKUP = re.compile(
     | ^\s*\d{1,9}[.)](?=\s|$)      # numbered lists
     | (?<=:)/(?=/)                 # addresses, which become links by themselves
     | (?<=www)\.
-    | (?<=\w)@(?=\w)
+    | (?<=\w)@(?=[\w.-]*\.[a-z])
     """,
     re.VERBOSE | re.IGNORECASE,
 )

@@ -36,7 +36,9 @@ def test_hostile_text_is_shown_as_it_is(text: str) -> None:
     assert shown(markdown_safe(text)) == re.sub(r"\s*\n+\s*", " ", text)
 
 
-@pytest.mark.parametrize("text", ["snake_case_name", "[0.41, 0.63]", "p < 0.05", "−0.3 ± 0.1", "0.65 (n = 3)"])
+@pytest.mark.parametrize(
+    "text", ["snake_case_name", "suite@1#0123", "[0.41, 0.63]", "p < 0.05", "−0.3 ± 0.1", "0.65 (n = 3)"]
+)
 def test_names_and_numbers_are_written_without_escapes(text: str) -> None:
     assert markdown_safe(text) == text
 
