@@ -1,5 +1,6 @@
 """Parsing of untrusted JSON, with limits on size and depth; NaN and infinite numbers are refused."""
 
+import gzip
 import json
 import re
 from codecs import BOM_UTF8
@@ -7,10 +8,9 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from probe_kit._system.bounded_files import MOST_BYTES, open_regular, read_regular
 from probe_kit.errors import ProbeKitError
 
-MOST_BYTES = 256 << 20
-"""The largest JSON file that is read; the vocabularies of tokenizers are a tenth of it."""
 _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
 
@@ -55,13 +55,27 @@ def _finite(number: str) -> float:
     return value
 
 
+def load_json(file: Path, most: int = MOST_BYTES) -> Any:
+    """Return the value in a file of at most `most` bytes.
+
+    Raises OSError as `read_regular` does, ValueError as `parse_json` does.
+    """
+    return parse_json(read_regular(file, most))
+
+
+def load_gzipped_json(file: Path) -> Any:
+    """Return the value in a gzipped file of at most `MOST_BYTES` unpacked bytes. Raises as `load_json`."""
+    with open_regular(file) as packed, gzip.open(packed) as unpacked:
+        content = unpacked.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise ValueError(f"it unpacks to more than {MOST_BYTES / 1e6:,.0f} MB")
+    return parse_json(content)
+
+
 def read_json(file: Path, raises: type[ProbeKitError], advice: str) -> Any:
     """What the file says. Raises `raises` with `advice` if it is missing, too large, unreadable or no JSON."""
     try:
-        if (size := file.stat().st_size) > MOST_BYTES:
-            most = f"expected JSON of at most {MOST_BYTES / 1e6:,.0f} MB"
-            raise raises(f"{file} has {size / 1e6:,.0f} MB; {most}. {advice}")
-        return parse_json(file.read_bytes())
+        return load_json(file)
     except FileNotFoundError:
         raise raises(f"{file} is missing. {advice}") from None
     except OSError as error:

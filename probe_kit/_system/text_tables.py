@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO
 
+from probe_kit._system.bounded_files import open_regular
 from probe_kit._system.csv_text import unescaped
 from probe_kit._system.table_cells import is_missing, plain_cell
 from probe_kit.errors import ProbeKitError, UsageError
@@ -148,13 +149,10 @@ def _separator(
 def _encoding(path: Path, error: type[ProbeKitError]) -> str:
     """UTF-8, or UTF-16 where a byte order mark says so. Raises `error` for a file without end, or too large."""
     try:
-        size = path.stat().st_size
-        with path.open("rb") as file:
+        with open_regular(path, MOST_BYTES) as file:
             start = file.read(4)
     except OSError as problem:
         raise error(f"{path} cannot be read as a table: {problem.strerror}. {_REMEDY}") from problem
-    if size > MOST_BYTES:
-        raise error(f"{path} has {size / 1e6:,.0f} MB; expected a table of at most {MOST_BYTES / 1e6:,.0f} MB")
     if other := next((name for beginning, name in _NO_TEXT if start.startswith(beginning)), None):
         raise error(f"{path} is {other}, not a table of text. {_REMEDY}")
     marked = next((name for mark, name in _BYTE_ORDER if start.startswith(mark)), None)

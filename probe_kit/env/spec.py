@@ -15,6 +15,7 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.bounded_files import read_regular
 from probe_kit.errors import SceneError
 from probe_kit.scene_names import ArmName, Rendering
 from probe_kit.suite.items import Side
@@ -377,7 +378,7 @@ def _file_of(name: str, wanted: str, files: Mapping[str, Path]) -> Path:
 
 def _content_sha256(path: Path) -> str:
     try:
-        return f"sha256:{hashlib.sha256(path.read_bytes()).hexdigest()}"
+        return f"sha256:{hashlib.sha256(read_regular(path)).hexdigest()}"
     except OSError as error:
         raise SceneError(
             f"{path} cannot be read ({error.strerror}). Give another file, or leave it out."

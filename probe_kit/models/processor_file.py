@@ -1,10 +1,10 @@
 """The `preprocessor_config.json` of a checkpoint."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 
 PROCESSOR_FILE = "preprocessor_config.json"
@@ -22,7 +22,7 @@ def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[s
             "Copy it from the model's page"
         )
     try:
-        values = json.loads(file.read_text(encoding="utf-8"))
+        values = load_json(file)
     except ValueError as error:
         raise CheckpointError(f"{file} is not JSON ({error}); download the checkpoint again") from error
     if not isinstance(values, dict) or (missing := [name for name in needed if values.get(name) is None]):

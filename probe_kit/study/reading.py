@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
+from probe_kit._system.bounded_files import read_regular
 from probe_kit.errors import UsageError
 from probe_kit.study import schema
 from probe_kit.study.archive import RUNS, STUDY_FILE, Pack, open_archive
@@ -96,7 +97,9 @@ def _packed_suite(archive: Path) -> PlannedSuite:
 def _parsed(file: Path) -> dict[str, Any]:
     """The content of a file. Raises UsageError for a text that is no TOML."""
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8-sig"))
+        return tomllib.loads(read_regular(file).decode("utf-8-sig"))
+    except OSError as error:
+        raise UsageError(f"{file} cannot be read: {error.strerror}. Give a study file in TOML") from error
     except UnicodeDecodeError as error:
         raise UsageError(f"{file} is no UTF-8 text: {error}") from error
     except RecursionError:

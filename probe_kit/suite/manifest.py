@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from probe_kit._system.bounded_json import MOST_BYTES
+from probe_kit._system.bounded_files import MOST_BYTES
 from probe_kit._system.csv_text import csv_of_rows
 from probe_kit._system.drafts import draft_of
 from probe_kit.errors import SuiteError, UsageError

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from PIL import Image, ImageFile, ImageOps, UnidentifiedImageError
 
+from probe_kit._system.bounded_files import read_regular
 from probe_kit.errors import ProbeKitError, SuiteError
 
 RESTORE = "Restore the suite's files or build it again."
@@ -91,9 +92,9 @@ def decode_picture(path: Path) -> Image.Image:
     Raises SuiteError naming the file if it is missing or cannot be decoded.
     """
     try:
-        encoded = path.read_bytes()
+        encoded = read_regular(path)
     except OSError as error:
-        reason = "there is no such picture" if not path.is_file() else f"cannot be read ({error.strerror})"
+        reason = "there is no such picture" if not path.exists() else f"cannot be read ({error.strerror})"
         raise SuiteError(f"{path}: {reason}. {RESTORE}") from error
     return decode_bytes(encoded, f"{path}:")
 

@@ -90,7 +90,8 @@ def _serve(runs: "list[Run]", lender: "Run | None", port: int, no_browser: bool)
     server = ViewerServer(Catalogue(runs, lender), port)
     out.print(server.address, soft_wrap=True)
     say("Ctrl-C ends the viewer.")
-    if not no_browser:
-        webbrowser.open(server.address)
-    with suppress(KeyboardInterrupt):
-        server.run()
+    with server.private_file() as file:
+        if not no_browser:
+            webbrowser.open(file.as_uri())
+        with suppress(KeyboardInterrupt):
+            server.run()

@@ -1,18 +1,20 @@
 """The viewer's server: loopback only, behind a token, and names are looked up and never joined to a path.
 
-Checks in order: the Host header (another name of this machine may be a rebound one), the method and the site of
-the request, the token or the cookie, and the name of the payload.
+Checks in order: the Host header (another name of this machine may be a rebound one), the method, the token, the
+site of the request and the cookie, and the name of the payload.
 """
 
 import asyncio
 import hashlib
 import json
+import os
 import re
 import secrets
 import socket
-from collections.abc import AsyncIterator
-from contextlib import suppress
-from http.cookies import SimpleCookie
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Lock, Thread
 from urllib.parse import parse_qs
 
@@ -22,7 +24,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.middleware import Middleware
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, RedirectResponse, Response, StreamingResponse
+from starlette.responses import HTMLResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -35,6 +37,9 @@ HOST = "127.0.0.1"
 TICK_S = 2.0
 """Seconds between two listings of the commits of a run that grows."""
 _GZIP_FROM = 2000
+_MOST_HEADER_BYTES = 1 << 20
+"""Of a request: a browser sends the cookies of every other server of 127.0.0.1 too, at most 180 of 4 KB."""
+_LEADING_TO = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url={address}">\n'
 _PICTURE = re.compile(r"([A-Za-z0-9._-]+)/f/([0-9]{5,8})\.webp")
 _KINDS = {"css": "text/css", "html": "text/html", "js": "text/javascript", "svg": "image/svg+xml"}
 _POLICY = (
@@ -74,18 +79,33 @@ class _Guard:
         """A refusal, or the way from the token to the page; None for what is admitted."""
         if request.headers.get("host") not in self._hosts:
             return PlainTextResponse("unknown host", 400)
-        site = request.headers.get("sec-fetch-site", "none")
-        if request.method not in ("GET", "HEAD") or site not in ("none", "same-origin"):
+        if request.method not in ("GET", "HEAD"):
             return PlainTextResponse("refused", 403)
-        given = parse_qs(request.url.query).get("token", [""])[0]
-        if given and secrets.compare_digest(given.encode(), self._token.encode()):
-            response = RedirectResponse("/", 303)
+        token = parse_qs(request.url.query).get("token", [""])[0]
+        if token and _are_equal(token, self._token):
+            # A page of this server, not a redirect: a browser that comes from a file sends a strict cookie only
+            # with requests that this page makes.
+            response = HTMLResponse(_LEADING_TO.format(address="/"))
             response.set_cookie(self._cookie, self._pass, httponly=True, samesite="strict")
             return response
-        cookie = SimpleCookie(request.headers.get("cookie", "")).get(self._cookie)
-        if cookie is None or not secrets.compare_digest(cookie.value.encode(), self._pass.encode()):
+        if request.headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
+            return PlainTextResponse("refused", 403)
+        if not any(_are_equal(value, self._pass) for value in _cookies(request, self._cookie)):
             return PlainTextResponse("Open the address that `probe-kit view` printed.", 403)
         return None
+
+
+def _are_equal(text: str, secret: str) -> bool:
+    return secrets.compare_digest(text.encode(), secret.encode())
+
+
+def _cookies(request: Request, name: str) -> list[str]:
+    """The values of all cookies of a name.
+
+    Cookies of other servers of 127.0.0.1 come with ours, in any form, so only the text around `;` and `=` is read.
+    """
+    pairs = (pair.partition("=") for line in request.headers.getlist("cookie") for pair in line.split(";"))
+    return [value.strip() for key, _, value in pairs if key.strip() == name]
 
 
 class _Pages:
@@ -219,12 +239,34 @@ class ViewerServer:
         self._token = secrets.token_urlsafe(16)
         self._pages = _Pages(catalogue, TICK_S)
         app = _application(self._pages, self.port, self._token)
-        self._server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                app,
+                log_level="error",
+                timeout_graceful_shutdown=1,
+                http="h11",
+                h11_max_incomplete_event_size=_MOST_HEADER_BYTES,
+            )
+        )
 
     @property
     def address(self) -> str:
         """The address that opens the page."""
         return f"http://{HOST}:{self.port}/?token={self._token}"
+
+    @contextmanager
+    def private_file(self) -> Iterator[Path]:
+        """A file that leads a browser to `address`, which only this user can read; removed afterwards.
+
+        A command line can be read by every user of a machine, and an address on it would let them in.
+        """
+        with TemporaryDirectory(prefix="probe-kit-view-") as folder:
+            file = Path(folder) / "open.html"
+            with os.fdopen(
+                os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8"
+            ) as page:
+                page.write(_LEADING_TO.format(address=self.address))
+            yield file
 
     def run(self) -> None:
         """Serve until interrupted, or until `stop`."""

@@ -63,6 +63,24 @@ def test_an_impossible_name_is_refused(name: str, tmp_path: Path) -> None:
         write_adapter(name, tmp_path / "mine")
 
 
+@pytest.mark.parametrize(
+    ("name", "origin"),
+    [
+        ("json", "Python's standard library"), ("sys", "Python's standard library"), ("numpy", "numpy"),
+        ("torch", "torch"), ("probe-kit", "probe_kit"), ("safetensors", "safetensors"), ("yaml", "PyYAML"),
+        ("my-local-module", "my_local_module.py"),
+    ],
+)  # fmt: skip
+def test_the_name_of_a_module_is_refused_because_the_package_would_hide_it(
+    name: str, origin: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "my_local_module.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(UsageError, match=f"would hide the module .*{origin}.*give yours another name"):
+        write_adapter(name, tmp_path / "mine")
+    assert not (tmp_path / "mine").exists()
+
+
 def test_a_name_that_is_taken_and_a_folder_that_is_full_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="already"):
         write_adapter("pi0", tmp_path / "mine")

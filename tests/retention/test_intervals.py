@@ -265,9 +265,30 @@ def test_an_untrained_network_that_is_beaten_alike_in_every_group_has_an_interva
 def test_a_band_of_few_permuted_labels_is_not_drawn(probed_run: ProbedRun) -> None:
     results = load_results(probed_run({"color": GOOD}))
     assert LayerCurveDisplay.from_results(results, "color").null_band is not None
-    few = {place: replace(curve, null=curve.null[:, :5]) for place, curve in results.curves.items()}
-    assert LayerCurveDisplay.from_results(replace(results, curves=few), "color").null_band is None
-    layer_curve(replace(results, curves=few))
+    for count, is_drawn in ((5, False), (19, False), (20, True)):
+        few = {place: replace(curve, null=curve.null[:, :count]) for place, curve in results.curves.items()}
+        band = LayerCurveDisplay.from_results(replace(results, curves=few), "color").null_band
+        assert (band is not None) == is_drawn
+        layer_curve(replace(results, curves=few))
+
+
+def test_the_band_holds_the_middle_95_percent_of_the_accuracies_of_permuted_labels(probed_run: ProbedRun) -> None:
+    """Of 200 whole numbers from 1 to 200 %, five lie below the band and five above it."""
+    results = load_results(probed_run({"color": GOOD}))
+    accuracies = np.random.default_rng(0).permutation(np.arange(1, 201) / 100)
+    curves = {
+        place: replace(curve, null=np.resize(accuracies, (len(curve.sites), 200)))
+        for place, curve in results.curves.items()
+    }
+    display = LayerCurveDisplay.from_results(replace(results, curves=curves), "color")
+    assert display.null_band is not None
+    low, high = display.null_band
+    assert ((accuracies < low).sum(), (accuracies > high).sum()) == (5, 5)
+    axes = display.plot().ax_
+    assert axes is not None
+    [(left, bottom), *_, (right, top)] = [axes.patches[0].get_bbox().min, axes.patches[0].get_bbox().max]
+    assert (bottom, top) == pytest.approx((100 * low, 100 * high))
+    assert left < right
 
 
 # -- ratios --------------------------------------------------------------------------------------------------

@@ -17,9 +17,11 @@ from probe_kit.retention.behaviour.vlm_answers import scored
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.retention.formats.latex import latex_table
+from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.statistics.paired_tests import holm
 from probe_kit.study import LoadedStudy, load_study, make_table, write_study_report
 from probe_kit.study.tables.compared import difference_table, stages_table
+from probe_kit.study.tables.named_table import caption
 from probe_kit.study.tables.rates import score_table, success_table, vlm_table
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
 from tests.view.payload_reader import read_payload
@@ -82,6 +84,28 @@ def test_domains_of_several_categories_have_the_mean_of_their_category_means() -
     (number,) = [one for one in made.numbers if one["system"] == "one" and one.get("categories")]
     assert (number["domain"], number["sr"]) == ("physical", pytest.approx((rates["color"] + rates["shape"]) / 2))
     assert "outcome rule disc; 40 episodes per category" in made.text.note
+
+
+def test_a_caption_says_rule_call_and_episodes_of_what_is_in_the_table() -> None:
+    table = retention_table(drawn(["one"]), pairs=())
+    assert caption(table, ["first", "second"]) == "first; second; outcome rule disc; 40 episodes per category"
+
+    def changed(
+        row: RetentionRow, call: int | None = None, episodes: int = 40, **success: float | None
+    ) -> RetentionRow:
+        run, own = replace(row.run, call=call), replace(row.success, n_episodes=episodes, **success)
+        return replace(row, run=run, success=own)
+
+    first, *others = table.rows
+    of_calls = replace(table, rows=(changed(first, 2), *(changed(row, 0) for row in others)))
+    assert caption(of_calls, []) == "outcome rule disc; captured inference 0, 2; 40 episodes per category"
+    at_first = replace(table, rows=tuple(changed(row, 0) for row in table.rows))
+    assert caption(at_first, []) == "outcome rule disc; 40 episodes per category"
+    uneven = replace(table, rows=(changed(first, episodes=12), *others))
+    assert caption(uneven, []) == "outcome rule disc; 12 to 40 episodes per category"
+    never_acted = replace(table, rows=tuple(changed(row, sr=None) for row in table.rows))
+    assert caption(never_acted, []) == "40 episodes per category"
+    assert caption(replace(table, rows=()), ["alone"]) == "alone"
 
 
 def test_latex_spans_domains_and_divides_what_is_too_wide() -> None:

@@ -3,6 +3,7 @@
 import gzip
 import http.client
 import json
+import os
 import re
 import shutil
 import socket
@@ -49,8 +50,8 @@ class Client:
 
     def admit(self) -> None:
         """Open the address that the command prints."""
-        status, headers, _ = self.ask(f"/?token={self.token}")
-        assert (status, headers["location"]) == (303, "/")
+        status, headers, page = self.ask(f"/?token={self.token}", Sec_Fetch_Site="cross-site")
+        assert (status, b'content="0; url=/"' in page) == (200, True)
         assert {"HttpOnly", "SameSite=strict"} <= set(re.split("; ?", headers["set-cookie"]))
         self.cookie = headers["set-cookie"].partition(";")[0]
 
@@ -114,6 +115,51 @@ def test_only_the_page_itself_is_answered(
         found, _, content = server.ask(path, method, **headers)
         assert found == (204 if status == 200 and path == "/follow" else status)
         assert status == 200 or b"put(" not in content
+
+
+@pytest.mark.parametrize(
+    "foreign",
+    [
+        "a=b", "=", ";;;", "a", "[x]=1", "a b=c", 'q="un;closed', "$Version=1", "é=ü", "x={json: 1}", "a=\x01",
+        "n=" + "v" * 60_000, "; ".join(f"c{number}={'v' * 4000}" for number in range(180)),
+        "{name}=of-another-server", "{name}=", '{name}="quoted"',
+    ],
+)  # fmt: skip
+def test_cookies_of_other_servers_of_this_machine_do_not_lock_the_page_out(server: Client, foreign: str) -> None:
+    name = server.cookie.partition("=")[0]
+    foreign = foreign.replace("{name}", name)
+    for cookie in (f"{foreign}; {server.cookie}", f"{server.cookie}; {foreign}"):
+        assert server.ask("/data/index.js", Cookie=cookie)[0] == 200
+    assert server.ask("/data/index.js", Cookie=foreign)[0] == 403
+
+
+def test_the_token_stands_on_no_command_line_and_in_a_file_of_this_user_alone(
+    little_runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`webbrowser.open` puts its argument on the command line of a browser."""
+    from probe_kit.view.server import ViewerServer
+
+    opened: list[tuple[str, str, int, int]] = []
+
+    def open_browser(address: str) -> bool:
+        file = Path(address.removeprefix("file://"))
+        modes = file.stat().st_mode & 0o777, file.parent.stat().st_mode & 0o777
+        opened.append((address, file.read_text(encoding="utf-8"), *modes))
+        return True
+
+    monkeypatch.setattr("webbrowser.open", open_browser)
+    monkeypatch.setattr(ViewerServer, "run", lambda _: None)
+    before = os.umask(0)
+    done = CliRunner().invoke(app, ["view", str(little_runs / "run")])
+    os.umask(before)
+    assert done.exit_code == 0, done.output
+    [(address, page, file_mode, folder_mode)] = opened
+    printed = done.stdout.splitlines()[0]
+    assert "token" not in address
+    assert printed.partition("token=")[2] not in address
+    assert f'content="0; url={printed}"' in page
+    assert (file_mode, folder_mode) == (0o600, 0o700)
+    assert not Path(address.removeprefix("file://")).parent.exists()
 
 
 def test_a_port_that_is_in_use_is_refused_by_number(server: Client, little_runs: Path) -> None:

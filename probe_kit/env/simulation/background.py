@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from probe_kit._system.bounded_files import read_regular
 from probe_kit.env.rotations import Array
 from probe_kit.env.simulation.camera import Camera, Picture
 from probe_kit.errors import SceneError
@@ -25,7 +26,7 @@ def load_photo(path: Path, width: int, height: int) -> Picture:
     """The photo at `path`, squeezed to (height, width, 3). Raises SceneError if it cannot be read."""
     remedy = "Give another file, or leave `background` out for our own wooden table."
     try:
-        encoded = path.read_bytes()
+        encoded = read_regular(path)
     except OSError as error:
         raise SceneError(f"background {path}: cannot be read ({error.strerror}). {remedy}") from error
     picture = decode_bytes(encoded, f"background {path}:", SceneError, remedy)

@@ -6,9 +6,12 @@ from hashlib import blake2b, file_digest
 from pathlib import Path
 from typing import BinaryIO
 
+from probe_kit._system.bounded_files import open_regular
 from probe_kit.errors import RecordingError
 
 _DIGITS = 16
+_MOST_BYTES = 1 << 40
+"""Of a file, videos included: no bound but that of a disk."""
 _Stamp = tuple[int, ...]
 
 
@@ -58,7 +61,7 @@ class HashedFiles:
 
 def _opened(file: Path, root: Path) -> BinaryIO:
     try:
-        return file.open("rb")
+        return open_regular(file, _MOST_BYTES)
     except OSError as error:
         raise RecordingError(
             f"{file.relative_to(root)} of {root.name} cannot be read: {error.strerror}. Copy the data set again"

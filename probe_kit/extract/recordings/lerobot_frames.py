@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.optional_dependencies import require
+from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
 from probe_kit.extract.recordings.lerobot_folder import LeRobotFolder
 from probe_kit.extract.recordings.lerobot_meta import EXTRA, HALF, EpisodeMeta
@@ -104,7 +105,7 @@ class LeRobotFrames:
             groups = np.flatnonzero((ends > first) & (ends - sizes < end))
             if _size_of(parquet.metadata, columns) <= MOST_AT_ONCE:
                 groups = np.flatnonzero(sizes)
-            return parquet.read_row_groups(groups.tolist(), columns=list(columns)), int((ends - sizes)[groups[0]])
+            return read_parquet(parquet, columns, groups.tolist()), int((ends - sizes)[groups[0]])
 
     def _scanned(self, path: Path) -> _DataFile:
         """A data file whose rows are those that meta says. Raises RecordingError for others."""
@@ -114,7 +115,7 @@ class LeRobotFrames:
                     f"{self._where(path)} has no column {missing[0]!r}; expected the columns of format 3.0. Copy "
                     "the data set again"
                 )
-            table = parquet.read([_EPISODE, _INDEX])
+            table = read_parquet(parquet, [_EPISODE, _INDEX])
         episodes, indices = (np.asarray(table.column(name).to_pylist(), np.float64) for name in (_EPISODE, _INDEX))
         named = {one.number: one for one in self.folder.by_file[path]}
         begins = dict(zip(*(part.tolist() for part in np.unique(episodes, return_index=True)), strict=True))
@@ -258,9 +259,9 @@ def _quiet() -> Iterator[None]:
 @contextmanager
 def _parquet(folder: LeRobotFolder, path: Path) -> Iterator[Any]:
     """A data file, opened as the file that was hashed. Raises RecordingError for one that cannot be read."""
-    pa, pq = require("pyarrow", EXTRA), require("pyarrow.parquet", EXTRA)
+    pa = require("pyarrow", EXTRA)
     try:
-        with folder.opened.open(path) as opened, pq.ParquetFile(opened) as parquet:
+        with folder.opened.open(path) as opened, open_parquet(opened, EXTRA) as parquet:
             yield parquet
     except (pa.ArrowException, OSError) as error:
         raise RecordingError(

@@ -11,6 +11,7 @@ from typing import Any, Self
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit._system.optional_dependencies import require
+from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
 from probe_kit.extract.recordings.hashed_files import HashedFiles
 
@@ -273,14 +274,14 @@ def _is_feature(own: Any) -> bool:
 
 def _read_table(root: Path, files: HashedFiles, path: Path, columns: Sequence[str] | None = None) -> Any:
     """The table of a Parquet file of meta. Raises RecordingError for one that cannot be read or lacks a column."""
-    pa, pq = require("pyarrow", EXTRA), require("pyarrow.parquet", EXTRA)
+    pa = require("pyarrow", EXTRA)
     name = path.relative_to(root)
     try:
-        with files.open(path) as opened, pq.ParquetFile(opened) as parquet:
+        with files.open(path) as opened, open_parquet(opened, EXTRA) as parquet:
             if missing := [column for column in columns or () if column not in parquet.schema_arrow.names]:
                 raise RecordingError(f"{root.name}: {name} has no column {missing[0]!r}. {_AGAIN}")
-            return parquet.read(columns)
-    except pa.ArrowException as error:
+            return read_parquet(parquet, columns)
+    except (pa.ArrowException, OSError) as error:
         raise RecordingError(f"{root.name}: {name} cannot be read: {str(error)[:300]}. {_AGAIN}") from error
 
 

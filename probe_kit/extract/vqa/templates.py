@@ -14,6 +14,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
+from probe_kit._system.bounded_files import read_regular_text
 from probe_kit.errors import UsageError
 from probe_kit.extract.vqa.phrases import Phrase
 from probe_kit.hashing import sha256_text
@@ -127,7 +128,9 @@ def find_template(name: str) -> Template:
             f"there is no prompt {name!r}; known: {', '.join(TEMPLATES)}, or a text file with {{object}}"
         )
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_regular_text(path)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror}. Give a text file with {{object}}") from error
     except UnicodeDecodeError:
         raise UsageError(f"{path} is not UTF-8 text; write the prompt as plain text with {{object}}") from None
     return Template(re.sub(r"[^\w-]+", "-", path.stem), text.rstrip("\n"))

@@ -5,7 +5,9 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.bounded_files import MOST_BYTES, check_regular, read_regular
+from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_yaml import load_yaml
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks.checkpoints.hub import unreachable
 from probe_kit.models.bounds import check_sizes
@@ -15,6 +17,7 @@ WEIGHTS_FILE, INDEX_FILE = "model.safetensors", "model.safetensors.index.json"
 
 # What decides how a model is built and spoken to, and the beginnings of names that hold weights or list them.
 _READ = (".json", ".safetensors", ".model", ".txt", ".jinja", ".yaml", ".yml")
+_MOST_WEIGHT_BYTES = 1 << 44
 _WEIGHTS = ("model.safetensors", "model-", "adapter_model", "pytorch_model")
 _CONFIGURATIONS = ("*config*.json", "dims.json", "*.yaml", "*.yml")
 PATTERNS = ("*.json", "*.safetensors", "*.model", "*.txt", "*.jinja")
@@ -100,10 +103,21 @@ def hub_files(checkpoint: str) -> list[str]:
 
 
 def _possible(folder: Path) -> Path:
-    """The folder, if no configuration in it asks for a network beyond all sizes. Raises CheckpointError.
+    """The folder, if its files can be read and no configuration asks for a network beyond all sizes.
 
     A configuration that is none is left to its loader, which names it.
+    Raises CheckpointError for those, and for a file beside the weights that is a pipe, a device or huge: libraries
+    read such files without a bound.
     """
+    for file in sorted(path for pattern in ("*", "*/*") for path in folder.glob(pattern)):
+        if file.suffix in _READ and not file.is_dir() and file.exists():
+            weights = file.suffix == ".safetensors" or file.name.startswith(_WEIGHTS)
+            try:
+                check_regular(file, _MOST_WEIGHT_BYTES if weights else MOST_BYTES)
+            except OSError as error:
+                raise CheckpointError(
+                    f"{file} cannot be read: {error.strerror}. Take the original checkpoint"
+                ) from error
     for file in sorted(path for pattern in _CONFIGURATIONS for path in folder.glob(pattern)):
         try:
             check_sizes(_content(file), str(file))
@@ -115,13 +129,8 @@ def _possible(folder: Path) -> Path:
 def _content(file: Path) -> Any:
     """Raises ValueError for what is not JSON or YAML."""
     if file.suffix == ".json":
-        return parse_json(file.read_bytes())
-    import yaml
-
-    try:
-        return yaml.safe_load(file.read_bytes())
-    except yaml.YAMLError as error:
-        raise ValueError(error) from error
+        return load_json(file)
+    return load_yaml(file)
 
 
 def chosen_dtype(asked: str | None, stored: object, offered: Collection[str]) -> str:
@@ -155,7 +164,7 @@ def side_files(folder: Path, prefix: str = "") -> dict[str, Path]:
 
 def content_hashes(files: Mapping[str, Path]) -> dict[str, str]:
     """`file <name>` → sha256 of its bytes, for `Card.settings`: where a checkpoint lies does not matter."""
-    return {f"file {name}": hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()}
+    return {f"file {name}": hashlib.sha256(read_regular(path)).hexdigest() for name, path in files.items()}
 
 
 def shard_name(name: object) -> str:
@@ -168,7 +177,7 @@ def shard_name(name: object) -> str:
 def listed_shards(index: Path) -> list[str]:
     """Names of the files that an index of shards lists, sorted. Raises ValueError for one that is none."""
     try:
-        return sorted({shard_name(name) for name in parse_json(index.read_bytes())["weight_map"].values()})
+        return sorted({shard_name(name) for name in load_json(index)["weight_map"].values()})
     except (OSError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(error) from error
 

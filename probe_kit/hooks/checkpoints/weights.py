@@ -13,7 +13,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import WeightsError
 from probe_kit.hooks.checkpoints.adapter_files import AdapterFiles, adapter_in
 from probe_kit.hooks.checkpoints.checkpoint import check_unambiguous, shard_name
@@ -131,7 +131,7 @@ def _read_folder(folder: Path, unlisted: Iterable[str]) -> Weights:
 def _shards(index: Path) -> dict[str, set[str] | None]:
     shards: dict[str, set[str] | None] = {}
     try:
-        listed = parse_json(index.read_bytes())["weight_map"].items()
+        listed = load_json(index)["weight_map"].items()
         for tensor, shard in listed:
             names = shards.setdefault(shard_name(shard), set())
             assert names is not None

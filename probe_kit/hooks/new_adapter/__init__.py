@@ -6,8 +6,11 @@ by step, instead of meeting all of the contract at once.
 
 import keyword
 import re
+import sys
+from importlib.metadata import packages_distributions
 from importlib.resources import files
 from importlib.resources.abc import Traversable
+from importlib.util import find_spec
 from pathlib import Path
 from string import Template
 
@@ -23,7 +26,8 @@ _PACKAGE = "package"
 def write_adapter(name: str, folder: Path | str | None = None) -> list[Path]:
     """Write the package of the family `name` into `folder`, by default one of its name; returns its files.
 
-    Raises UsageError for a name that no family can have or that one has, and for a folder that holds anything.
+    Raises UsageError for a name that no family can have or that one has, for that of an installed module, and for
+    a folder that holds anything.
     """
     if not _NAME.fullmatch(name) or keyword.iskeyword(name):
         raise UsageError(
@@ -31,13 +35,28 @@ def write_adapter(name: str, folder: Path | str | None = None) -> list[Path]:
         )
     if name in family_names():
         raise UsageError(f"there is a family {name!r} already; give yours another name")
+    module = name.replace("-", "_")
+    if origin := _origin(module):
+        raise UsageError(
+            f"a package {module} would hide the module {module} of {origin}; give yours another name, such as "
+            f"my-{name}"
+        )
     folder = Path(name if folder is None else folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} holds something already; give a new folder with --out")
-    module = name.replace("-", "_")
     title = "".join(part.capitalize() for part in name.split("-"))
     words = {"name": name, "module": module, "Name": title, "version": __version__}
     return sorted(_write(files(__name__) / "template", folder, words))
+
+
+def _origin(module: str) -> str | None:
+    """The distribution or the part of Python that has a module of this name; None where there is none."""
+    if module in sys.stdlib_module_names or module in sys.builtin_module_names:
+        return "Python's standard library"
+    if module in packages_distributions():
+        return " and ".join(sorted(set(packages_distributions()[module])))
+    spec = find_spec(module)
+    return None if spec is None or spec.origin is None else str(spec.origin)
 
 
 def _write(source: Traversable, target: Path, words: dict[str, str]) -> list[Path]:

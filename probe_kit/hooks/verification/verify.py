@@ -1,6 +1,5 @@
 """`probe-kit verify`: compares an adapter with outputs recorded from the original implementation."""
 
-import gzip
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit._system.bounded_json import load_gzipped_json, load_json
 from probe_kit.errors import UsageError
 from probe_kit.hooks.checkpoints.third_party import in_words, while_loading
 from probe_kit.hooks.registry import find_family
@@ -124,7 +124,7 @@ _DAMAGED = (OSError, ValueError, EOFError, KeyError, AttributeError, NotImplemen
 def _read_arrays(file: Path) -> dict[str, NDArray[Any]]:
     """What an .npz file holds. Raises UsageError if it is damaged or holds something else than numbers."""
     try:
-        with np.load(file) as arrays:
+        with open_arrays(file) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except _DAMAGED as why:
         raise UsageError(
@@ -186,8 +186,7 @@ def _read_key_list(file: Path) -> dict[str, Any]:
     if not file.is_file():
         raise UsageError(f"key list {file} does not exist")
     try:
-        raw = file.read_bytes()
-        content = parse_json(gzip.decompress(raw) if file.suffix == ".gz" else raw)
+        content = load_gzipped_json(file) if file.suffix == ".gz" else load_json(file)
         keys: dict[str, Any] = dict(content["keys"].items())
         for entry in keys.values():
             tuple(entry["shape"]), str(entry["dtype"])

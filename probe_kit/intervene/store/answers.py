@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit.errors import NoInterventionsError
 from probe_kit.extract.run_layout import INTERVENTIONS
 from probe_kit.extract.store.format.bundles import (
@@ -105,7 +106,7 @@ class ConditionOutcomes:
     @classmethod
     def from_bytes(cls, content: bytes) -> "ConditionOutcomes":
         """Load what `to_bytes` gave."""
-        with np.load(BytesIO(content), allow_pickle=False) as arrays:
+        with open_arrays(content) as arrays:
             found: dict[str, Any] = dict(arrays)
         return cls(**{**found, "conditions": tuple(map(str, found["conditions"]))})
 

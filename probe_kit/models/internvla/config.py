@@ -4,15 +4,15 @@ The run's file names parts of a fixed table (`dinov2_vits14`, `DiT-B`); sizes of
 checkpoints have them, stand in a file `dims.json` beside or above it, under the names of those checkpoints.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from transformers import Qwen2_5_VLConfig
 
+from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_yaml import load_yaml
 from probe_kit.errors import CheckpointError
 from probe_kit.models.qwen import without_precision
 
@@ -125,10 +125,9 @@ def find_config(folder: Path) -> tuple[dict[str, Any], Path]:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    text = file.read_text(encoding="utf-8")
     try:
-        values = json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)
-    except (json.JSONDecodeError, yaml.YAMLError) as error:
+        values = load_json(file) if file.suffix == ".json" else load_yaml(file)
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"{file} cannot be read: {error}") from error
     if not isinstance(values, dict):
         raise CheckpointError(f"{file} holds a {type(values).__name__}; expected named values")

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from probe_kit.models.building import build_empty, replaced
 from probe_kit.models.lerobot.pi05 import Gate
+from probe_kit.models.pretrained import load_pretrained
 from probe_kit.models.prompt_kv import PromptKV
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -62,7 +63,7 @@ def network_config(place: Path | None = None) -> NetworkConfig:
         # lerobot calls a check that transformers announces to remove; no user can change that.
         warnings.filterwarnings("ignore", "`rope_config_validation`", FutureWarning)
         found: NetworkConfig = (
-            NetworkConfig(**RELEASED) if place is None else NetworkConfig.from_pretrained(str(place))
+            NetworkConfig(**RELEASED) if place is None else load_pretrained(NetworkConfig, place)
         )
     return found
 

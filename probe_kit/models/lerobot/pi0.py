@@ -4,7 +4,6 @@ lerobot knows two sizes by name and reads no width from `config.json`. Checkpoin
 `dims.json`; while such a policy is built, three names inside lerobot's module are replaced, then restored.
 """
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -17,6 +16,7 @@ from lerobot.policies.pi0 import modeling_pi0
 from lerobot.policies.pi0.configuration_pi0 import PI0Config
 from lerobot.policies.pi0.modeling_pi0 import PI0Policy
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.models.building import replaced
 
@@ -56,7 +56,7 @@ class Pi0Size:
     @classmethod
     def from_file(cls, path: Path) -> "Pi0Size":
         """Read `dims.json`. Raises CheckpointError if a dimension is missing or unknown."""
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = load_json(path)
         try:
             return cls(
                 GemmaSize(**values["vlm"]),

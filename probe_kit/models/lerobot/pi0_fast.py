@@ -7,7 +7,6 @@ also draws each row by its own seed, and decodes at least as many tokens as are 
 Source: arXiv 2501.09747, through lerobot's `PI0FastPytorch`.
 """
 
-import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -22,6 +21,7 @@ from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
 from lerobot.policies.pi0_fast.modeling_pi0_fast import PI0FastPolicy
 from torch import Tensor
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.models.building import replaced
 from probe_kit.models.lerobot.pi0 import GemmaSize, SiglipSize, sized_paligemma
@@ -41,7 +41,7 @@ class Pi0FastSize:
     @classmethod
     def from_file(cls, path: Path) -> "Pi0FastSize":
         """Read `dims.json`. Raises CheckpointError if a dimension is missing or unknown."""
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = load_json(path)
         try:
             return cls(GemmaSize(**values["vlm"]), SiglipSize(**values["vision"]), int(values["vocab_size"]))
         except (KeyError, TypeError) as error:

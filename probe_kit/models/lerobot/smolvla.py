@@ -3,9 +3,10 @@
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import torch
 from lerobot.policies.smolvla import smolvlm_with_expert
@@ -17,6 +18,7 @@ from transformers import SmolVLMConfig
 from probe_kit.errors import CheckpointError
 from probe_kit.models.building import replaced
 from probe_kit.models.lerobot.pi0_keys import STATISTICS
+from probe_kit.models.pretrained import load_pretrained
 
 
 def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> SmolVLAPolicy:
@@ -33,7 +35,7 @@ def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> S
     config.vlm_model_name = locate_vlm(config, folder)
     try:
         # lerobot prints while it builds; stdout belongs to results.
-        with torch.device(device), redirect_stdout(sys.stderr):
+        with torch.device(device), redirect_stdout(sys.stderr), replaced(smolvlm_with_expert, _without_code()):
             policy = SmolVLAPolicy(config)
     except OSError as error:
         raise CheckpointError(
@@ -42,6 +44,14 @@ def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> S
         ) from error
     policy.eval()
     return cast(SmolVLAPolicy, policy)
+
+
+def _without_code() -> dict[str, Any]:
+    """The loaders that lerobot calls, so that they run no Python code of the VLM's files."""
+    loaders = {name: getattr(smolvlm_with_expert, name) for name in ("AutoConfig", "AutoProcessor")}
+    return {
+        name: SimpleNamespace(from_pretrained=partial(load_pretrained, loader)) for name, loader in loaders.items()
+    }
 
 
 def locate_vlm(config: SmolVLAConfig, folder: Path) -> str:
@@ -87,8 +97,8 @@ def _released_vlm() -> Iterator[None]:
     )
     tokenizer = SimpleNamespace(fake_image_token_id=0, global_image_token_id=0)
     answers = {
-        "AutoConfig": SimpleNamespace(from_pretrained=lambda _: config),
-        "AutoProcessor": SimpleNamespace(from_pretrained=lambda _: SimpleNamespace(tokenizer=tokenizer)),
+        "AutoConfig": SimpleNamespace(from_pretrained=lambda _, **__: config),
+        "AutoProcessor": SimpleNamespace(from_pretrained=lambda _, **__: SimpleNamespace(tokenizer=tokenizer)),
     }
     with replaced(smolvlm_with_expert, answers):
         yield

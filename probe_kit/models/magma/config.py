@@ -4,7 +4,6 @@
 `vision_config` is a plain dictionary; what it leaves out is the trunk's own.
 """
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from typing import Any
 
 from transformers import LlamaConfig
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 
 # Per name in the file: timm's trunk, and the width of the contrastive head that the forward pass never reads.
@@ -64,7 +64,7 @@ class MagmaConfig:
         file = folder / "config.json"
         if not file.is_file():
             raise CheckpointError(f"{file} is missing; {folder} is not a Magma checkpoint")
-        return cls.from_json(json.loads(file.read_text(encoding="utf-8")), str(file))
+        return cls.from_json(load_json(file), str(file))
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "MagmaConfig":

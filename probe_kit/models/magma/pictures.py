@@ -4,7 +4,6 @@ Colours are normalised first; then the picture is stretched, aspect not kept, to
 shows most of its pixels, without antialiasing.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.models.magma.config import VisionConfig
 
@@ -57,7 +57,7 @@ class PictureSettings:
         """
         for name, part in (("preprocessor_config.json", None), ("action_config.json", "preprocessor")):
             if (folder / name).is_file():
-                values = json.loads((folder / name).read_text(encoding="utf-8"))
+                values = load_json(folder / name)
                 return cls.from_json(values if part is None else values.get(part, {}), str(folder / name))
         return cls(vision.base, vision.crops)
 

@@ -6,7 +6,6 @@ rms_norm_eps 1e-6 for Llama, not Llama-2's own 1e-5. A training run's file, as T
 under `model` and no part for the language model; that is then the published one, with its own 1e-5.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 from transformers import CONFIG_MAPPING
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 
 _DINO = "vit_large_patch14_reg4_dinov2.lvd142m"
@@ -122,7 +122,7 @@ class PrismaticConfig:
         file = folder / "config.json"
         if not file.is_file():
             raise CheckpointError(f"{file} is missing; {folder} is not a Prismatic or OpenVLA checkpoint")
-        return cls.from_json(json.loads(file.read_text(encoding="utf-8")), str(file))
+        return cls.from_json(load_json(file), str(file))
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "PrismaticConfig":

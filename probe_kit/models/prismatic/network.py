@@ -63,7 +63,7 @@ class PrismaticNetwork(nn.Module):
         super().__init__()
         self.vision_backbone = VisionBackbone(config.towers)
         self.projector = Projector(self.vision_backbone.width, config.text.hidden_size, config.fused)
-        self.language_model: Any = AutoModelForCausalLM.from_config(config.text)
+        self.language_model: Any = AutoModelForCausalLM.from_config(config.text, trust_remote_code=False)
         self.prompt_kv = PromptKV(int(config.text.num_hidden_layers))
 
     @property

@@ -3,7 +3,6 @@
 Channels 3k … 3k+2 are what tower k reads: the same pixels, resized to its side and normalised with its own means.
 """
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import CheckpointError
 from probe_kit.models.prismatic.config import RESIZE_STRATEGIES, PrismaticConfig
@@ -49,7 +49,7 @@ class PictureSettings:
 
     @classmethod
     def _from_file(cls, file: Path) -> "PictureSettings":
-        values = json.loads(file.read_text(encoding="utf-8"))
+        values = load_json(file)
         return cls(
             values["image_resize_strategy"],
             tuple(int(size[-1]) for size in values["input_sizes"]),

@@ -1,6 +1,5 @@
 """Images to patches, as in the processors of Qwen's models; the size depends on the image's own."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from torch import Tensor
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil, smart_resize
 from transformers.models.qwen2_vl.image_processing_qwen2_vl import Qwen2VLImageProcessor
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError, ObservationError
 
 SETTINGS_FILE = "preprocessor_config.json"
@@ -49,7 +49,7 @@ class QwenPictures:
                 f"{file} is missing; it defines the size of this checkpoint's pictures. "
                 "It comes with the checkpoint, or with the vision-language model it was made of"
             )
-        values = json.loads(file.read_text(encoding="utf-8"))
+        values = load_json(file)
         if missing := [name for name in _NEEDED if name not in values]:
             raise CheckpointError(f"{file} lacks {', '.join(missing)}")
         found = tuple(int(values[name]) for name in _NEEDED[:3])

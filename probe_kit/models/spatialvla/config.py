@@ -4,7 +4,6 @@ The three networks inside are described as transformers describes them; what the
 default, as it was when the file was written.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 from transformers import Gemma2Config, SiglipVisionConfig, ZoeDepthConfig
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 
 MODEL_TYPE = "spatialvla"
@@ -61,7 +61,7 @@ class SpatialVLAConfig:
         file = folder / "config.json"
         if not file.is_file():
             raise CheckpointError(f"{file} is missing; {folder} is not a SpatialVLA checkpoint")
-        return cls.from_json(json.loads(file.read_text(encoding="utf-8")), str(file))
+        return cls.from_json(load_json(file), str(file))
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "SpatialVLAConfig":

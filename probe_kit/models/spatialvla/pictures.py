@@ -1,6 +1,5 @@
 """Images and camera intrinsics, bit-identical to the original processor."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.models.spatialvla.config import SpatialVLAConfig
 
@@ -38,7 +38,7 @@ class PictureSettings:
         Raises CheckpointError for what contradicts the model or is not known here.
         """
         file = folder / PREPROCESSOR_FILE
-        values = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
+        values = load_json(file) if file.is_file() else None
         settings = cls(config.side) if values is None else cls._from_json(values, config.side)
         if settings.side != config.side:
             raise CheckpointError(

@@ -1,6 +1,5 @@
 """The `config.json` of a Xiaomi-Robotics-R0 checkpoint."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 from transformers import Qwen3VLConfig
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.models.qwen import without_precision
 
@@ -47,7 +47,7 @@ class XiaomiConfig:
         file = folder / "config.json"
         if not file.is_file():
             raise CheckpointError(f"{file} is missing; {folder} is not a Xiaomi-Robotics-R0 checkpoint")
-        return cls.from_json(json.loads(file.read_text(encoding="utf-8")), str(file))
+        return cls.from_json(load_json(file), str(file))
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "XiaomiConfig":

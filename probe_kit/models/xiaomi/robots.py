@@ -1,6 +1,5 @@
 """The robots of a checkpoint: action statistics, and how each observes its scene and state."""
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.models.bounds import check_deviations
@@ -54,9 +54,7 @@ def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
     several without a choice.
     """
     file = folder / STATISTICS_FILE
-    known: Mapping[str, Any] = (json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}).get(
-        "action_config"
-    ) or {}
+    known: Mapping[str, Any] = (load_json(file) if file.is_file() else {}).get("action_config") or {}
     if not known:
         raise CheckpointError(
             f"{file} has no action_config: the actions have no physical unit and no length. "

@@ -13,6 +13,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.csv_text import csv_of_frame
+from probe_kit._system.markdown_text import markdown_safe
 from probe_kit.retention.behaviour.success_rate import Regime, normalised_score, regime
 from probe_kit.retention.columns.text import NOT_ACTED, model_name, number, percent
 from probe_kit.retention.columns.text_table import TextTable
@@ -72,7 +73,7 @@ class PaperTable:
         """Return the table in Markdown, with its note below."""
         from probe_kit.retention.formats.markdown import markdown_table
 
-        return f"{markdown_table(self.text)}\n{self.text.note}."
+        return f"{markdown_table(self.text)}\n{markdown_safe(self.text.note)}."
 
     def to_latex(self) -> str:
         """Return the table as a LaTeX `table` environment."""

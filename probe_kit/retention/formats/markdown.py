@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from probe_kit._system.markdown_text import markdown_safe
 from probe_kit.retention.behaviour.wordings import WordingPair
 from probe_kit.retention.columns.conditions import wording_tables
 from probe_kit.retention.columns.row_names import named_cells, row_headings, titled
@@ -27,12 +28,12 @@ def markdown(
     """
     found = summarise_runs(rows)
     whole = summary_table(found, differences)
-    parts = [_markdown_table(whole.title, whole.columns, whole.cells), f"{whole.note}.\n"]
-    parts += [f"* {sentence}" for run in found for sentence in run.sentences]
+    parts = [_markdown_table(whole.title, whole.columns, whole.cells), f"{markdown_safe(whole.note)}.\n"]
+    parts += [f"* {markdown_safe(sentence)}" for run in found for sentence in run.sentences]
     parts += ["", *(_table(table) for table in tables_of(rows, differences, unpaired))]
     plain = [*wording_tables(wordings), *further]
-    parts += [f"{markdown_table(own)}\n{own.note}\n" for own in plain]
-    return "\n".join([*parts, *(f"> {note}\n" for note in notes)])
+    parts += [f"{markdown_table(own)}\n{markdown_safe(own.note)}\n" for own in plain]
+    return "\n".join([*parts, *(f"> {markdown_safe(note)}\n" for note in notes)])
 
 
 def _table(table: Table) -> str:
@@ -40,7 +41,7 @@ def _table(table: Table) -> str:
     cells = [
         [*named_cells(table, row), *(cell_text(column, row) for column in table.columns)] for row in table.rows
     ]
-    captions = (f"> {caption}\n" for caption in table.captions)
+    captions = (f"> {markdown_safe(caption)}\n" for caption in table.captions)
     return "\n".join([_markdown_table(titled(table), columns, cells), *captions])
 
 
@@ -51,11 +52,11 @@ def markdown_table(table: TextTable) -> str:
 
 def _markdown_table(heading: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [
-        f"**{heading}**",
+        f"**{markdown_safe(heading)}**",
         "",
-        _markdown_line(columns),
+        _markdown_line([markdown_safe(column) for column in columns]),
         _markdown_line(["---"] * len(columns)),
-        *(_markdown_line([_marked(cell.replace("|", r"\|")) for cell in cells]) for cells in rows),
+        *(_markdown_line([_marked(cell) for cell in cells]) for cells in rows),
         "",
     ]
     return "\n".join(lines)
@@ -63,7 +64,8 @@ def _markdown_table(heading: str, columns: Sequence[str], rows: Sequence[Sequenc
 
 def _marked(cell: str) -> str:
     """Markdown has no colour that renders everywhere: a red sign and bold type."""
-    return f"🔴 **{cell}**" if cell.endswith(ABOVE_CHANCE) else cell
+    safe = markdown_safe(cell)
+    return f"🔴 **{safe}**" if cell.endswith(ABOVE_CHANCE) else safe
 
 
 def _markdown_line(cells: Sequence[str]) -> str:

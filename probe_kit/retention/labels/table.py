@@ -7,6 +7,7 @@ from math import nan
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.csv_text import csv_of_frame
+from probe_kit._system.markdown_text import markdown_safe
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.behaviour.run_labels import full_names
@@ -170,7 +171,7 @@ class LabelRetentionTable:
         """The table and its sentences in Markdown."""
         from probe_kit.retention.formats.markdown import markdown_table
 
-        said = "\n".join(f"* {sentence}" for sentence in self.sentences)
+        said = "\n".join(f"* {markdown_safe(sentence)}" for sentence in self.sentences)
         return f"{markdown_table(self.text)}\n{_NOTE}\n\n{said}"
 
     def to_latex(self) -> str:

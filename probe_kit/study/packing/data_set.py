@@ -5,6 +5,7 @@ from collections.abc import Hashable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from probe_kit._system.markdown_text import markdown_safe
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import UsageError
 from probe_kit.study.archive import PACK_FILE, SUMS_FILE, TABLES, Pack, files_of, open_archive, write_sums
@@ -95,10 +96,10 @@ def _card(study: LoadedStudy, pack: Pack, table: "pd.DataFrame", licence: str | 
 
 
 def _words(study: LoadedStudy, pack: Pack, episodes: int) -> Iterator[str]:
-    yield f"# {study.study.name}"
+    yield f"# {markdown_safe(study.study.name)}"
     yield ""
     yield f"A study made with probe_kit {pack.version}: {len(pack.keys)} runs, {episodes:,} episodes."
-    yield f"Suite: {pack.suite['identity']}. Left out: {', '.join(pack.left_out)}."
+    yield markdown_safe(f"Suite: {pack.suite['identity']}. Left out: {', '.join(pack.left_out)}.")
     yield ""
     yield f"* `{EPISODES}`: a row per episode of every run"
     yield f"* `{TABLES}/`: every table as JSON, Markdown and LaTeX"
@@ -108,7 +109,7 @@ def _words(study: LoadedStudy, pack: Pack, episodes: int) -> Iterator[str]:
         yield ""
         yield "Not in it:"
         yield ""
-        yield from (f"* {name}: {reason}" for name, reason in pack.missing.items())
+        yield from (f"* {markdown_safe(f'{name}: {reason}')}" for name, reason in pack.missing.items())
     yield ""
     yield "## Tables"
     for name in study.study.tables:

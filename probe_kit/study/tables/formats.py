@@ -5,6 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from probe_kit._system.csv_text import csv_of_rows
+from probe_kit._system.markdown_text import markdown_safe
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.formats.markdown import markdown_table
 from probe_kit.study.tables.named_table import NamedTable
@@ -12,7 +13,7 @@ from probe_kit.study.tables.named_table import NamedTable
 
 def markdown_text(made: NamedTable) -> str:
     """The table in Markdown, with its note below."""
-    return f"{markdown_table(made.text)}\n{made.text.note}."
+    return f"{markdown_table(made.text)}\n{markdown_safe(made.text.note)}."
 
 
 def table_record(made: NamedTable) -> dict[str, Any]:

@@ -4,13 +4,14 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from hashlib import sha256
+from hashlib import file_digest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from probe_kit._system.bounded_files import open_regular
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.suite.card import new_suite
@@ -283,6 +284,7 @@ class _Conversion:
         )
 
 
+_MOST_FILE_BYTES = 1 << 40
 _PLACES = ("image_root", "llm_base", "llm_cache", "instances")  # of this machine, not of the suite
 
 
@@ -296,4 +298,5 @@ def _reviewed(bundles: list[Bundle], accepted: dict[str, Proposal]) -> list[Bund
 
 
 def _file_sha256(path: Path) -> str:
-    return sha256(path.read_bytes()).hexdigest()
+    with open_regular(path, _MOST_FILE_BYTES) as file:
+        return file_digest(file, "sha256").hexdigest()

@@ -8,6 +8,7 @@ from typing import Any
 
 from PIL import Image
 
+from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.bounded_json import parse_json
 from probe_kit._system.csv_text import csv_of_rows
 from probe_kit._system.drafts import write_whole
@@ -210,7 +211,9 @@ def _from_csv(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def _from_lines(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_regular(path).decode("utf-8-sig")
+    except OSError as problem:
+        raise SuiteError(f"{path} cannot be read: {problem.strerror}. Give the file of a review.") from problem
     except UnicodeDecodeError as problem:
         raise SuiteError(f"{path} is not UTF-8 text ({problem}). Save it as UTF-8.") from problem
     for number, line in enumerate(text.split("\n"), start=1):

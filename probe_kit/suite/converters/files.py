@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import SuiteError
 from probe_kit.suite.pictures import WHITE, decode_picture
 
 MARGIN = 0.08  # of the longer side, around trimmed art
+MOST_BYTES = 1 << 30
+"""Of annotations; the instances of COCO have 350 MB."""
 _TRIM_STEP = 12  # levels that ink differs from white
 
 
@@ -21,7 +23,9 @@ def read_json(path: Path, source: str, remedy: str) -> Any:
     if not path.is_file():
         raise SuiteError(f"{source}: {path} not found. {remedy}")
     try:
-        return parse_json(path.read_bytes())
+        return load_json(path, MOST_BYTES)
+    except OSError as problem:
+        raise SuiteError(f"{source}: {path} cannot be read: {problem.strerror}. {remedy}") from problem
     except ValueError as problem:
         raise SuiteError(f"{source}: {path} is not valid JSON ({problem}). {remedy}") from problem
 

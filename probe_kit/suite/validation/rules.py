@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import PurePosixPath
 
+from probe_kit._system.bounded_files import read_regular
 from probe_kit.errors import SuiteError
 from probe_kit.suite.grouping import ties
 from probe_kit.suite.items import Item, Side
@@ -45,7 +46,7 @@ def _check_file(item: Item, side: Side) -> Iterator[Finding]:
         most = f"expected at most {MOST_PICTURE_BYTES >> 20} MiB"
         yield error("E07", where, f"picture {name!r} has {size / 1e6:,.0f} MB; {most}")
     else:
-        encoded = path.read_bytes()
+        encoded = read_regular(path)
         yield from _check_bytes(encoded, item, side)
         yield from _check_size(encoded, item, side)
 

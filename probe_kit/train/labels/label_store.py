@@ -10,6 +10,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.extract.run_layout import PROBES
@@ -131,7 +132,7 @@ def _read(run: RunReader, bundle: Bundle) -> LabelResults:
     try:
         lists = {name: tuple(stored[name]) for name in ("categories", "views")}
         settings = LabelSettings(**{**stored, **lists})
-        with np.load(BytesIO(bundle.read(PREDICTIONS)), allow_pickle=False) as arrays:
+        with open_arrays(bundle.read(PREDICTIONS)) as arrays:
             samples = {name: arrays[name] for name in _SAMPLES}
             aligned = arrays.get(_ALIGNED)
             curves = {view: _curve(arrays, view) for view in settings.views}

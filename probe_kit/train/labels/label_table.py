@@ -11,7 +11,9 @@ from uuid import UUID
 
 import numpy as np
 
+from probe_kit._system.bounded_files import check_regular
 from probe_kit._system.optional_dependencies import require
+from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit._system.table_cells import group_names, number_of
 from probe_kit._system.text_tables import MOST_BYTES, cell_of, open_table
 from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
@@ -161,13 +163,9 @@ def read_table(table: "Path | str | pd.DataFrame", wanted: Sequence[str]) -> Lab
 
 def _check_file(path: Path) -> None:
     try:
-        size = path.stat().st_size
+        check_regular(path, MOST_BYTES)
     except OSError as error:
         raise UsageError(f"{path} cannot be read: {error.strerror}. Give a CSV or Parquet file") from error
-    if size > MOST_BYTES:
-        raise UsageError(
-            f"{path} has {size / 1e6:,.0f} MB; expected a table of at most {MOST_BYTES / 1e6:,.0f} MB"
-        )
 
 
 def _of_csv(path: Path, wanted: Sequence[str]) -> LabelTable:
@@ -220,14 +218,17 @@ def _short(number: int) -> str:
 
 def _of_parquet(path: Path, wanted: Sequence[str]) -> LabelTable:
     """Cells by arrow, because pandas rounds large integers beside empty cells."""
-    parquet = require("pyarrow.parquet", "export")
+    require("pyarrow.parquet", "export")
     try:
-        with parquet.ParquetFile(path) as file:
+        with open_parquet(path, "export") as file:
             names = file.schema_arrow.names
             place = _places(names, wanted, str(path))
-            read = file.read(columns=list(place))
+            read = read_parquet(file, list(place))
     except UsageError:
         raise
+    except OSError as error:
+        reason = str(error.strerror or error).rstrip(".")
+        raise UsageError(f"{path} cannot be read: {reason}. Give a CSV or Parquet file") from error
     except Exception as error:  # pyarrow raises many kinds for files that are no Parquet
         reason = str(error).rstrip(".")
         raise UsageError(f"{path} is no Parquet file: {reason}. Write it again, or give a CSV file") from error

@@ -7,6 +7,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit.extract.store.format.bundles import Bundle
 from probe_kit.hooks.contract.sites import Site
 
@@ -73,7 +74,7 @@ class StoredDirections(Mapping[Place, Direction]):
     def read(self, places: Iterable[Place]) -> dict[Place, Direction]:
         """Several directions in one opening of the file. Raises KeyError for a place that was not probed."""
         found = {}
-        with self._open() as file, np.load(file, allow_pickle=False) as arrays:
+        with self._open() as file, open_arrays(file) as arrays:
             for place in places:
                 name = "/".join(map(str, place))
                 if f"{name}/weights" not in arrays:
@@ -82,7 +83,7 @@ class StoredDirections(Mapping[Place, Direction]):
         return found
 
     def __iter__(self) -> Iterator[Place]:
-        with self._open() as file, np.load(file, allow_pickle=False) as arrays:
+        with self._open() as file, open_arrays(file) as arrays:
             for name in dict.fromkeys(member.rpartition("/")[0] for member in arrays):
                 category, view, site = name.rsplit("/", 2)
                 yield category, view, Site.parse(site)

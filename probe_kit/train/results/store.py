@@ -14,6 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError
 from probe_kit.extract.run_layout import PROBE_DIRECTIONS, PROBES
@@ -219,7 +220,7 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
     settings = settings_of(bundle)
     _check_foreign(run, bundle, settings)
     try:
-        with np.load(BytesIO(bundle.read(DECISIONS)), allow_pickle=False) as arrays:
+        with open_arrays(bundle.read(DECISIONS)) as arrays:
             curves = _unpack(arrays)
     except (BadZipFile, ValueError, KeyError, TypeError, OSError) as error:
         raise RunDamagedError(

@@ -55,3 +55,9 @@ def test_a_site_that_is_always_right_may_be_all() -> None:
 def test_one_group_sets_no_limit() -> None:
     with pytest.raises(TooFewGroupsError, match="1 independent groups"):
         at_most(GroupSums(np.ones((2, 1)), np.ones(1)))
+
+
+def test_two_groups_set_a_limit_and_it_is_a_wide_one() -> None:
+    limit = at_most(GroupSums(np.array([[2.0, 3.0]]), np.array([4.0, 4.0])))
+    assert ABSENT_BELOW < limit <= 1
+    assert limit > at_most(GroupSums(np.array([[2.0, 3.0] * 10]), np.full(20, 4.0)))

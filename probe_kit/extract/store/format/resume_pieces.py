@@ -9,6 +9,7 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.store.format.bundles import PARTIAL
 from probe_kit.extract.store.format.hashes import DIGEST_BYTES, digest
@@ -49,7 +50,7 @@ class Pieces:
                 f"{self.run}/{self._key(name)} was changed after it was written, or is another piece or of other "
                 f"episodes. Remove it; {self.redo}"
             )
-        with np.load(BytesIO(stored), allow_pickle=False) as arrays:
+        with open_arrays(stored) as arrays:
             return dict(arrays)
 
     def keep(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:

@@ -104,5 +104,6 @@ def token_blocks(rows: Rows, at: tuple[int, ...], mask: NDArray[np.bool_], block
         values = np.zeros((*chosen.shape, rows.array.shape[-1]), np.float32)
         for position in np.flatnonzero(chosen.any(axis=1)):
             bits = rows.read(position, (*at, slice(start, start + block)))
-            values[position] = decode_bfloat16(bits) * chosen[position, :, None]
+            # Not a product: padding may hold NaN or infinity, and NaN times 0 is NaN.
+            values[position] = np.where(chosen[position, :, None], decode_bfloat16(bits), 0)
         yield TokenBlock(start, values, chosen)

@@ -3,8 +3,8 @@
 import errno
 import fcntl
 import os
+import secrets
 import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -261,8 +261,8 @@ class Folder(Location):
     @contextmanager
     def rebuilding(self, folder: str, stamp: str) -> Iterator[Store]:
         """Aside; then renamed, so that a crash leaves the old group or none."""
-        aside = Path(tempfile.mkdtemp(dir=self._path, prefix=folder, suffix=".tmp"))
-        aside.chmod(0o755)
+        aside = self._path / f"{folder}{secrets.token_hex(8)}.tmp"
+        aside.mkdir()
         try:
             yield LocalStore(aside)
             self.remove(folder)
@@ -288,14 +288,15 @@ def _alone(file: IO[bytes]) -> bool:
 @contextmanager
 def _written_aside(path: Path, content: bytes, flush: bool) -> Iterator[Path]:
     """A file of this content beside `path`, gone afterwards; on the disk already if it was flushed."""
-    handle, name = tempfile.mkstemp(dir=path.parent, suffix=".tmp")
-    os.fchmod(handle, 0o644)  # a run may be read by others
+    aside = path.with_name(f"{secrets.token_hex(8)}.tmp")
+    # Who may read a run is a matter of the umask; tempfile would keep it from the others of a group.
+    handle = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
             if flush:
                 file.flush()
                 os.fsync(file.fileno())
-        yield Path(name)
+        yield aside
     finally:
-        Path(name).unlink(missing_ok=True)
+        aside.unlink(missing_ok=True)

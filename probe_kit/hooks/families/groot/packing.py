@@ -29,6 +29,7 @@ from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
+from probe_kit.models.pretrained import load_pretrained
 
 _READ = (
     "input_ids", "attention_mask", "pixel_values", "image_grid_thw", "mm_token_type_ids", "embodiment_id"
@@ -136,11 +137,11 @@ class Packing:
         """transformers' processor of Qwen3-VL, as lerobot puts it together. Raises CheckpointError."""
         place = str(self.vlm)
         try:
-            tokenizer = AutoTokenizer.from_pretrained(place, trust_remote_code=False)
+            tokenizer = load_pretrained(AutoTokenizer, place)
             processor = Qwen3VLProcessor(
-                image_processor=Qwen2VLImageProcessor.from_pretrained(place),
+                image_processor=load_pretrained(Qwen2VLImageProcessor, place),
                 tokenizer=tokenizer,
-                video_processor=Qwen3VLVideoProcessor.from_pretrained(place),
+                video_processor=load_pretrained(Qwen3VLVideoProcessor, place),
                 chat_template=tokenizer.chat_template,
             )
         except (OSError, ValueError) as error:

@@ -5,12 +5,12 @@ steps as `checkpoints/steps_<n>_pytorch_model.pt`, of which one is downloaded an
 of the vision-language model lie elsewhere.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.adapter_files import adapter_in
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, checkpoint_folder, hub_files
@@ -136,7 +136,7 @@ def _vlm(values: Mapping[str, Any], place: Path, chosen: str | None) -> tuple[Pa
             f"{folder} has no config.json of a {_VLM_TYPE} model; InternVLA-M1 is made of Qwen2.5-VL. "
             "Name that model's folder with -M vlm=DIR"
         )
-    return folder, json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    return folder, load_json(folder / "config.json")
 
 
 def _vlm_folder(values: Mapping[str, Any], place: Path, chosen: str | None) -> Path:
@@ -155,4 +155,4 @@ def _vlm_folder(values: Mapping[str, Any], place: Path, chosen: str | None) -> P
 
 def _is_vlm(folder: Path) -> bool:
     file = folder / "config.json"
-    return file.is_file() and json.loads(file.read_text(encoding="utf-8")).get("model_type") == _VLM_TYPE
+    return file.is_file() and load_json(file).get("model_type") == _VLM_TYPE

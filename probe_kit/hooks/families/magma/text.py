@@ -1,6 +1,5 @@
 """Magma's chat as token ids, from the checkpoint's `tokenizer.json`, with the positions of the question."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +8,8 @@ from typing import Any
 
 from tokenizers import Tokenizer
 
+from probe_kit._system.bounded_files import read_regular_text
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.models.magma import MagmaConfig, chat_text, conversation, picture_question
 
@@ -53,13 +54,13 @@ class ChatText:
     @cached_property
     def _settings(self) -> dict[str, Any]:
         beside = self.folder / "tokenizer_config.json"
-        return dict(json.loads(beside.read_text(encoding="utf-8"))) if beside.is_file() else {}
+        return dict(load_json(beside)) if beside.is_file() else {}
 
     @cached_property
     def _template(self) -> str | None:
         """The checkpoint's chat template in Jinja, None if it has none."""
         beside = self.folder / "chat_template.jinja"
-        stored = beside.read_text(encoding="utf-8") if beside.is_file() else self._settings.get("chat_template")
+        stored = read_regular_text(beside) if beside.is_file() else self._settings.get("chat_template")
         if stored is not None and not isinstance(stored, str):
             raise CheckpointError(
                 f"{self.folder} has {len(stored)} chat templates; expected one. Keep the one the model was "
@@ -97,7 +98,7 @@ class ChatText:
     def ends(self) -> frozenset[int]:
         """Ids that end the assistant's turn."""
         file = self.folder / "generation_config.json"
-        stored = json.loads(file.read_text(encoding="utf-8")).get("eos_token_id") if file.is_file() else None
+        stored = load_json(file).get("eos_token_id") if file.is_file() else None
         named: list[Any] = [self.config.text.eos_token_id, stored, self._tokenizer.token_to_id("<|eot_id|>")]
         flat = [number for entry in named for number in (entry if isinstance(entry, list) else [entry])]
         return frozenset(int(number) for number in flat if number is not None)

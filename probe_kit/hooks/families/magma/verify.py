@@ -4,7 +4,6 @@ B batch, S positions, L blocks, N output tokens. References come without a token
 the checkpoint holds what the original processor and evaluation client know.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.magma.adapter import BINS, Magma, load_magma
@@ -37,7 +37,7 @@ _RELEASED = PictureSettings(512, 4)
 def verify_magma(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
     """Compare a reference."""
     file = folder / "checkpoint" / _CLIENT
-    client: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    client: dict[str, Any] = load_json(file) if file.is_file() else {}
     steps = int(recorded["generated_ids"].size) if "generated_ids" in recorded else 1
     model = load_magma(
         str(folder / "checkpoint"), shrink=0, steps=steps, statistics=str(file) if "norm_stats" in client else None

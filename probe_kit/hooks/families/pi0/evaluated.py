@@ -1,6 +1,5 @@
 """pi0's evaluation: settings of older files, units, pictures and states that no checkpoint file contains."""
 
-import json
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS, laid_out
@@ -90,7 +90,7 @@ class EvaluatedPi0(LerobotFlow):
             return self.evaluation.picture
         if self._statistics is not None:
             return "squashed"
-        values = json.loads((self.folder / CONFIG_FILE).read_text(encoding="utf-8"))
+        values = load_json(self.folder / CONFIG_FILE)
         return "padded-top-left" if is_old_layout(values) else "padded"
 
     def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:

@@ -6,7 +6,6 @@ the lowest frequency of every dimension first. Each coefficient is a character; 
 Source: arXiv 2501.09747; decoding as in `UniversalActionProcessor`, which lerobot ships for MolmoAct2.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.fft import idct  # type: ignore[import-untyped]
 from tokenizers import Tokenizer
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder
 
@@ -50,7 +50,7 @@ class FastTokenizer:
                 f"{folder} is no FAST tokenizer: it has no {' and no '.join(lacking)}. Download it again"
             )
         try:
-            values = json.loads((folder / FILES[1]).read_text(encoding="utf-8"))
+            values = load_json(folder / FILES[1])
             scale, least = float(values["scale"]), int(values["min_token"])
             pieces = Tokenizer.from_file(str(folder / FILES[0]))
         except (KeyError, TypeError, ValueError, Exception) as error:  # tokenizers raises Exception itself

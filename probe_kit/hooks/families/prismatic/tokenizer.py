@@ -4,7 +4,6 @@ Read by the `tokenizers` library itself: transformers 5 rebuilds Llama's tokeniz
 released models were trained with what the file says.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,6 +12,7 @@ from typing import Any, Protocol
 
 from tokenizers import Tokenizer
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 
 BYTES = "bytes"
@@ -72,7 +72,7 @@ class FileTokenizer:
     @cached_property
     def _config(self) -> dict[str, Any]:
         beside = self.file.with_name("tokenizer_config.json")
-        return dict(json.loads(beside.read_text(encoding="utf-8"))) if beside.is_file() else {}
+        return dict(load_json(beside)) if beside.is_file() else {}
 
     @cached_property
     def special(self) -> frozenset[int]:

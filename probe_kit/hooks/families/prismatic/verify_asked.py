@@ -4,7 +4,6 @@ B rows, T text tokens, P patches, L blocks, D width. Recorded rows were read alo
 recorded without the picture's positions and padded behind.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -15,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.contract.model import Prompt
@@ -42,9 +42,7 @@ def verify_asked(model: Prismatic, folder: Path, recorded: Arrays) -> tuple[Comp
             row["text"].removeprefix(frame.before).removesuffix(frame.behind),
             tuple(model.lead + letter for letter in LETTERS),
         )
-        for row, number in zip(
-            json.loads(file.read_text(encoding="utf-8"))["rows"], recorded["in_rows_picture"], strict=True
-        )
+        for row, number in zip(load_json(file)["rows"], recorded["in_rows_picture"], strict=True)
     ]
     return compare_all(recorded, _Asked(model, questions, recorded).produced())
 

@@ -1,7 +1,6 @@
 """Units from an evaluation's statistics file: quantiles p01 and p99 of states and actions, as in INT-ACT."""
 
 import hashlib
-import json
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -10,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.bounded_files import read_regular
+from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.families.shared.lerobot.normaliser import outside
 
@@ -78,12 +79,12 @@ class StatisticsFile:
             raise CheckpointError(
                 f"no statistics at {named}: there is no such file, and shipped are only {', '.join(SHIPPED)}"
             )
-        return cls._of(path.name, path.read_bytes())
+        return cls._of(path.name, read_regular(path))
 
     @classmethod
     def _of(cls, name: str, content: bytes) -> "StatisticsFile":
         try:
-            values = json.loads(content)
+            values = parse_json(content)
         except ValueError as error:
             raise CheckpointError(f"the statistics {name} are not JSON ({error})") from error
         if not isinstance(values, dict):

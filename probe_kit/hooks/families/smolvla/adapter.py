@@ -24,6 +24,7 @@ from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, flow_stacks
 from probe_kit.models.lerobot.smolvla import build_smolvla, current_smolvla_keys, locate_vlm
+from probe_kit.models.pretrained import load_pretrained
 
 
 class SmolVLA(LerobotFlow):
@@ -77,7 +78,7 @@ class SmolVLA(LerobotFlow):
             return self._joint.processor.tokenizer
         from transformers import AutoTokenizer
 
-        return AutoTokenizer.from_pretrained(locate_vlm(self.config, self.folder))
+        return load_pretrained(AutoTokenizer, locate_vlm(self.config, self.folder))
 
     def side_files(self) -> dict[str, Path]:
         """Also the VLM's configuration and tokenizer, where they lie in a folder here."""

@@ -1,6 +1,5 @@
 """Loading of SpatialVLA checkpoints: released ones, fine-tunes in the same layout, random weights."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +7,7 @@ from typing import Any
 
 import torch
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
@@ -91,7 +91,7 @@ def read_processor(folder: Path) -> dict[str, Any]:
         raise CheckpointError(
             f"{file} is missing: it holds the action bins, statistics and cameras. Copy it from the model's page"
         )
-    return dict(json.loads(file.read_text(encoding="utf-8")))
+    return dict(load_json(file))
 
 
 def _random(

@@ -34,6 +34,7 @@ from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.xvla import BLOCK, INTERVENTIONS
 from probe_kit.hooks.families.xvla.steps import STEPS, XvlaSteps, read_steps
 from probe_kit.models.lerobot.xvla import build_xvla, current_xvla_keys, denoised_actions
+from probe_kit.models.pretrained import load_pretrained
 
 SOFT_PROMPT = "soft_prompt"
 """The role of the robot's learned tokens."""
@@ -156,7 +157,7 @@ class Xvla(LerobotPolicy):
         """Of the folder itself, or the one it names."""
         from transformers import AutoTokenizer
 
-        return AutoTokenizer.from_pretrained(str(self._tokenizer_folder), trust_remote_code=False)
+        return load_pretrained(AutoTokenizer, self._tokenizer_folder)
 
     def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
         """The instructions as they are."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit.errors import UsageError
 from probe_kit.intervene.edits.sites import ALL, TILE_ROLES
 from probe_kit.intervene.kinds.base import Measurement
@@ -56,7 +57,7 @@ class AttentionShares:
     @classmethod
     def from_bytes(cls, content: bytes) -> Self:
         """Load what `to_bytes` made."""
-        with np.load(BytesIO(content), allow_pickle=False) as arrays:
+        with open_arrays(content) as arrays:
             found: dict[str, Any] = {own.name: arrays[own.name] for own in fields(cls)}
         return cls(**{**found, "roles": tuple(map(str, found["roles"]))})
 

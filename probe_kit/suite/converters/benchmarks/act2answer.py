@@ -9,6 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from probe_kit._system.bounded_files import read_regular
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.suite.card import new_suite
@@ -63,7 +64,7 @@ def convert_set(
     items = [assets.item(category, pair) for pair in pairs[:n]]
     assets.compare_sizes()
     card = {
-        "annotation_files": {name: sha256((root / name).read_bytes()).hexdigest() for name in (PAIRS, TILES)},
+        "annotation_files": {name: sha256(read_regular(root / name)).hexdigest() for name in (PAIRS, TILES)},
         "source_url": _URL,
     }
     settings = asdict(options) | {"items_per_category": n, "source": SOURCE}

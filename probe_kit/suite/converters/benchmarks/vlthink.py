@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
@@ -146,7 +147,7 @@ _UNREADABLE = (
 def _texture(path: Path) -> Image.Image:
     """The first embedded picture of a GLB: a JSON chunk says which bytes of the binary chunk it is."""
     try:
-        chunks = dict(_chunks(path.read_bytes()))
+        chunks = dict(_chunks(read_regular(path)))
         scene = parse_json(chunks[_JSON_CHUNK])
         view = scene["bufferViews"][scene["images"][0]["bufferView"]]
         start = view.get("byteOffset", 0)

@@ -119,11 +119,6 @@ class TestFolder(LocationContract):
         monkeypatch.chdir(tmp_path)
         return locate("runs/run")
 
-    def test_files_of_a_run_can_be_read_by_everybody(self, location: Location) -> None:
-        location.found(BEGINNING, "run.json")
-        location.create("commits/1.json", b"1")
-        assert {path.stat().st_mode & 0o444 for path in location.path.rglob("*.json")} == {0o444}
-
     def test_free_space_is_that_of_the_disk_where_it_will_lie(self, location: Location) -> None:
         assert location.free_bytes() > 0
 

@@ -15,6 +15,7 @@ from probe_kit.hooks.checkpoints.hub import unreachable
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.pipelines import tokenizer_folder
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
+from probe_kit.models.pretrained import load_pretrained
 
 _TOKENIZER = "google/paligemma-3b-pt-224"
 LEAST_BYTES = 1_000_000_000
@@ -49,9 +50,9 @@ class PaliGemmaPolicy(LerobotPolicy):
     def tokenizer(self) -> Any:
         """PaliGemma's, from the checkpoint folder or the hub."""
         if (place := self._tokenizer_folder()) is not None:
-            return AutoTokenizer.from_pretrained(place)
+            return load_pretrained(AutoTokenizer, place)
         try:
-            return AutoTokenizer.from_pretrained(_TOKENIZER, local_files_only=bool(unreachable()))
+            return load_pretrained(AutoTokenizer, _TOKENIZER, local_files_only=bool(unreachable()))
         except OSError as error:
             raise CheckpointError(
                 f"{self.folder} has no tokenizer.json and the gated {_TOKENIZER} cannot be fetched. Run "

@@ -1,6 +1,5 @@
 """The image region that a policy sees: lerobot's crop-and-resize step, read from a checkpoint."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchvision.transforms.v2 import functional
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError, ObservationError
 
 STEP = "image_crop_resize_processor"
@@ -56,7 +56,7 @@ def read_window(folder: Path, camera: str, size: tuple[int, int] | None = None) 
     Raises CheckpointError if the step holds something else than lerobot writes.
     """
     path = folder / "policy_preprocessor.json"
-    steps = json.loads(path.read_text(encoding="utf-8"))["steps"] if path.is_file() else []
+    steps = load_json(path)["steps"] if path.is_file() else []
     for step in steps:
         if step["registry_name"] == STEP:
             try:

@@ -1,6 +1,5 @@
 """Loading of a vision-language model: configuration, renamed weights, random weights."""
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ import torch
 from huggingface_hub.errors import StrictDataclassError
 from torch import nn
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import read_weights
@@ -55,7 +55,7 @@ def load_vlm(
     folder = checkpoint_folder(checkpoint)
     file = folder / CONFIG_FILE
     with _describing(file):
-        config = recipe.config(without_precision(json.loads(file.read_text(encoding="utf-8"))))
+        config = recipe.config(without_precision(load_json(file)))
 
     def build(kind: torch.dtype, place: str) -> Any:
         with _describing(file):

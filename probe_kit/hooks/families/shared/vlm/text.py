@@ -3,7 +3,6 @@
 Read by the `tokenizers` library from the checkpoint's own `tokenizer.json`; no template is rendered.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,6 +12,7 @@ from typing import Any
 
 from tokenizers import Tokenizer
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 
 TOKENIZER_FILE, SETTINGS_FILE, GENERATION_FILE = (
@@ -176,6 +176,6 @@ def _read(file: Path) -> dict[str, Any]:
     if not file.is_file():
         return {}
     try:
-        return dict(json.loads(file.read_text(encoding="utf-8")))
+        return dict(load_json(file))
     except ValueError as error:
         raise CheckpointError(f"{file} is not JSON ({error}); download the checkpoint again") from error

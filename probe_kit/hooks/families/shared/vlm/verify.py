@@ -4,7 +4,6 @@ B rows, T positions, L blocks, D width, V vocabulary. The questions stand in `di
 whole prompts; the adapter is given what stands between their frames.
 """
 
-import json
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.contract.model import Prompt
@@ -75,7 +75,7 @@ def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> 
     file = folder / DIMS_FILE
     if not file.is_file():
         raise UsageError(f"{file} is missing: it holds the questions that {folder} was recorded with")
-    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
+    rows = load_json(file)["rows"]
     shown = [recorded[f"in_picture_{int(number)}"] for number in recorded["in_rows_picture"]]
     return [
         Prompt(Observation(picture, np.zeros(8, np.float32), ""), _between(row["text"], model), _letters(model))

@@ -1,0 +1,104 @@
+"""The one reader of foreign Parquet files: sizes are read and checked before cells fill the memory."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from probe_kit._system.bounded_files import open_regular
+from probe_kit._system.optional_dependencies import require
+
+MOST_BYTES = 1 << 30
+"""Of the cells of one reading, in memory."""
+MOST_VALUES = 1 << 25
+"""Numbers and texts of one reading; in Python each takes some 50 bytes."""
+MOST_FILE_BYTES = 1 << 40
+_ROWS = 4096
+_BATCH_BYTES = 64 << 20
+_WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "FLOAT": 4, "DOUBLE": 8, "INT96": 12}
+_TEXT = "BYTE_ARRAY"
+
+
+class TooLargeError(OSError):
+    """Cells of a Parquet file that would take more memory than is given to them."""
+
+
+@contextmanager
+def open_parquet(source: Path | BinaryIO, extra: str) -> Iterator[Any]:
+    """Yield a `pyarrow.parquet.ParquetFile`; `read_parquet` reads its cells.
+
+    Texts stay in their dictionaries: a column of one long text in every row is small until it is written out.
+    Raises OSError for what is no regular file, pyarrow's ArrowException for another format, MissingExtraError.
+    """
+    parquet = require("pyarrow.parquet", extra)
+    if isinstance(source, Path):
+        with open_regular(source, MOST_FILE_BYTES) as opened, open_parquet(opened, extra) as found:
+            yield found
+        return
+    metadata = parquet.read_metadata(source)
+    columns = [metadata.schema.column(number) for number in range(metadata.num_columns)]
+    texts = [one.path for one in columns if one.physical_type == _TEXT and one.path == one.name]
+    source.seek(0)
+    with parquet.ParquetFile(source, read_dictionary=texts) as found:
+        yield found
+
+
+def read_parquet(parquet: Any, columns: Sequence[str] | None = None, groups: Sequence[int] | None = None) -> Any:
+    """Return some columns and row groups of a file of `open_parquet` as a `pyarrow.Table`; None for all.
+
+    Raises TooLargeError before more than `MOST_BYTES` or `MOST_VALUES` are in memory.
+    """
+    pa = require("pyarrow", "export")
+
+    groups = range(parquet.num_row_groups) if groups is None else groups
+    rows = _check_sizes(parquet.metadata, columns, groups)
+    total, batches = 0, []
+    names = None if columns is None else list(columns)
+    for batch in parquet.iter_batches(batch_size=rows, row_groups=list(groups), columns=names):
+        total += sum(map(_decoded_bytes, batch.columns))
+        _check(total, MOST_BYTES, "bytes")
+        plain = [one.dictionary_decode() if pa.types.is_dictionary(one.type) else one for one in batch.columns]
+        fields = [field.with_type(one.type) for field, one in zip(batch.schema, plain, strict=True)]
+        batches.append(pa.RecordBatch.from_arrays(plain, schema=pa.schema(fields, batch.schema.metadata)))
+    if batches:
+        return pa.Table.from_batches(batches)
+    return parquet.read_row_groups(list(groups), columns=names)
+
+
+def _check_sizes(metadata: Any, columns: Sequence[str] | None, groups: Sequence[int]) -> int:
+    """The rows of a batch. Raises TooLargeError by what the footer says of the uncompressed cells."""
+    size, values, longest = 0, 0, 1
+    for number in groups:
+        group = metadata.row_group(number)
+        for at in range(group.num_columns):
+            chunk = group.column(at)
+            path = chunk.path_in_schema
+            if columns is not None and not any(path == name or path.startswith(f"{name}.") for name in columns):
+                continue
+            width = _WIDTHS.get(chunk.physical_type, 0)
+            size += max(chunk.total_uncompressed_size, width * chunk.num_values)
+            values += chunk.num_values
+            if path != metadata.schema.column(at).name and chunk.physical_type not in _WIDTHS:
+                # A text inside a list or a struct leaves its dictionary when it is read.
+                longest = max(longest, chunk.total_uncompressed_size * -(-chunk.num_values // group.num_rows))
+    _check(size, MOST_BYTES, "bytes")
+    _check(values, MOST_VALUES, "values")
+    return max(1, min(_ROWS, _BATCH_BYTES // longest))
+
+
+def _check(found: int, most: int, unit: str) -> None:
+    if found > most:
+        raise TooLargeError(
+            f"its cells have {found:,} {unit} once they are read; expected at most {most:,}. Give a smaller "
+            "table, or leave columns out"
+        )
+
+
+def _decoded_bytes(array: Any) -> int:
+    """Bytes of an array whose dictionary is written out."""
+    pa, pc = require("pyarrow", "export"), require("pyarrow.compute", "export")
+
+    if not pa.types.is_dictionary(array.type):
+        return int(array.nbytes)
+    lengths = pc.binary_length(array.dictionary)
+    return int(pc.sum(pc.cast(lengths.take(array.indices), pa.int64())).as_py() or 0) + 4 * len(array)

@@ -1,0 +1,170 @@
+"""Foreign files are read if they are regular and of bounded size, by every reader of the package."""
+
+import ast
+import gzip
+import os
+import socket
+import stat
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import probe_kit
+from probe_kit._system import bounded_arrays, bounded_json
+from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit._system.bounded_files import check_regular, open_regular, read_regular
+from probe_kit._system.bounded_json import load_gzipped_json, load_json
+from probe_kit._system.bounded_yaml import load_yaml
+
+PACKAGE = Path(probe_kit.__file__).parent
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def endless_device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def listening_socket(path: Path) -> None:
+    made = socket.socket(socket.AF_UNIX)
+    made.bind(str(path))
+    made.close()
+
+
+def folder(path: Path) -> None:
+    path.mkdir()
+
+
+IRREGULAR = [
+    (pipe, "it is a pipe; expected a regular file"),
+    (endless_device, "it is a device; expected a regular file"),
+    (listening_socket, "it is a socket; expected a regular file"),
+    (folder, "Is a directory"),
+]
+READERS = [check_regular, open_regular, read_regular, load_json, load_gzipped_json, load_yaml]
+
+
+@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.__name__)
+@pytest.mark.parametrize(("make", "reason"), IRREGULAR, ids=lambda value: getattr(value, "__name__", ""))
+def test_what_is_no_regular_file_is_refused_by_name_and_never_waited_for(
+    tmp_path: Path, make: Callable[[Path], None], reason: str, reader: Callable[[Path], object]
+) -> None:
+    make(tmp_path / "x")
+    begin = time.monotonic()
+    with pytest.raises(OSError) as refused:  # noqa: PT011 - the reason is compared below
+        reader(tmp_path / "x")
+    assert refused.value.strerror == reason
+    assert time.monotonic() - begin < 10
+
+
+def test_a_file_of_the_bound_is_read_and_one_byte_more_is_refused_by_its_size(tmp_path: Path) -> None:
+    (tmp_path / "x").write_bytes(b"1" * 3_000_000)
+    assert len(read_regular(tmp_path / "x", 3_000_000)) == 3_000_000
+    with pytest.raises(OSError, match=r"it has 3 MB; expected at most 3 MB"):
+        read_regular(tmp_path / "x", 2_999_999)
+
+
+def test_a_sparse_file_of_a_terabyte_is_refused_by_its_size_alone(tmp_path: Path) -> None:
+    with (tmp_path / "x.json").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(OSError, match=r"it has 1,099,512 MB; expected at most 268 MB"):
+        load_json(tmp_path / "x.json")
+
+
+def test_a_gzip_file_is_unpacked_to_the_bound_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bounded_json, "MOST_BYTES", 1 << 20)
+    for size, fits in (((1 << 20) - 2, True), (1 << 20, False)):
+        (tmp_path / "x.gz").write_bytes(gzip.compress(b'"' + b"a" * size + b'"'))
+        if fits:
+            assert len(load_gzipped_json(tmp_path / "x.gz")) == size
+        else:
+            with pytest.raises(ValueError, match="it unpacks to more than 1 MB"):
+                load_gzipped_json(tmp_path / "x.gz")
+
+
+def test_arrays_are_refused_by_their_size_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    np.savez_compressed(tmp_path / "x.npz", a=np.zeros(1_000_000))
+    content = (tmp_path / "x.npz").read_bytes()
+    assert len(content) < 20_000
+    for source in (tmp_path / "x.npz", content):
+        with open_arrays(source) as arrays:
+            assert arrays["a"].shape == (1_000_000,)
+    monkeypatch.setattr(bounded_arrays, "MOST_BYTES", 7_999_999)
+    for source in (tmp_path / "x.npz", content):
+        with pytest.raises(ValueError, match="its arrays have 8 MB unpacked; expected at most 8 MB"):
+            open_arrays(source)
+
+
+def test_nine_lines_of_yaml_do_not_stand_for_a_billion_values(tmp_path: Path) -> None:
+    names = "abcdefghij"
+    lines = ["a: &a [x,x,x,x,x,x,x,x,x,x]"]
+    lines += [f"{now}: &{now} [{','.join([f'*{before}'] * 10)}]" for before, now in pairwise(names)]
+    (tmp_path / "x.yaml").write_text("\n".join(lines), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"its aliases stand for 1e\+10 values"):
+        load_yaml(tmp_path / "x.yaml")
+    (tmp_path / "x.yaml").write_text("a: &a [1, 2]\nb: *a", encoding="utf-8")
+    assert load_yaml(tmp_path / "x.yaml") == {"a": [1, 2], "b": [1, 2]}
+    (tmp_path / "x.yaml").write_text("a: &a [*a]", encoding="utf-8")
+    with pytest.raises(ValueError, match="refers to itself"):
+        load_yaml(tmp_path / "x.yaml")
+
+
+UNBOUNDED = {
+    "read_bytes", "read_text", "safe_load", "ParquetFile", "read_table", "read_parquet", "read_csv", "decompress",
+}  # fmt: skip
+ELSEWHERE = {
+    "_system/bounded_yaml.py": "the reader itself",
+    "_system/bounded_arrays.py": "the reader itself",
+    "extract/store/exports/matrices.py": "the matrix that it has just written",
+    "_system/parquet_files.py": "the reader itself",
+    "_system/machine.py": "files of the system",
+    "doctor.py": "files of the system",
+    "hooks/new_adapter/__init__.py": "files of the package",
+    "hooks/families/shared/statistics_bounds.py": "files of the package",
+    "hooks/conformance/loading.py": "a copy of a checkpoint that was read",
+    "models/magma/statistics.py": "files of the package",
+    "suite/generators/drawing/art.py": "files of the package",
+    "suite/pictures.py": "`stored_picture`: files of the package",
+    "suite/build.py": "files of the package",
+    "view/page_files.py": "files of the package",
+    "retention/report/render.py": "files of the package",
+    "extract/store/provenance.py": "files of the package",
+    "suite/manifest.py": "regular files of compared sizes",
+    "suite/converters/llm.py": "the reply that it has just written",
+    "view/export.py": "the first line of a README that it wrote",
+    "extract/rollout/worker.py": "the video that it has just written",
+    "extract/store/locations/folder.py": "objects of a run, by its own check of regular files",
+    "extract/store/format/bundles.py": "objects of a run",
+    "train/labels/label_table.py": "calls the bounded reader",
+    "extract/recordings/lerobot_meta.py": "calls the bounded reader",
+    "extract/recordings/lerobot_frames.py": "calls the bounded reader",
+    "study/archive.py": "archives have bounds of their own",
+    "study/tables/make.py": "archives have bounds of their own",
+    "study/packing/data_set.py": "what it has just packed",
+    "study/packing/pack.py": "what it packs",
+    "study/packing/report.py": "what it packs",
+}
+
+
+def test_no_reader_of_foreign_files_lacks_a_bound() -> None:
+    found = {
+        f"{path.relative_to(PACKAGE)}:{node.lineno} {node.func.attr}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        if str(path.relative_to(PACKAGE)) not in ELSEWHERE
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and (node.func.attr in UNBOUNDED or ast.unparse(node.func) in ("np.load", "Image.open"))
+    }
+    assert not found, "read by probe_kit._system.bounded_files, or say here why not"
+
+
+def test_the_list_above_names_files_that_exist() -> None:
+    assert not [name for name in ELSEWHERE if not (PACKAGE / name).is_file()]
+    assert stat.S_ISREG((PACKAGE / "doctor.py").stat().st_mode)
