@@ -247,9 +247,13 @@ def test_the_study_of_the_package_plays_and_every_table_of_it_has_numbers(tmp_pa
     groups = ["after"]
     [models.early]
     family = "pi0-tiny-early"
+    untrained = "untrained-early"
     groups = ["before"]
     [models.untrained]
     family = "pi0-tiny"
+    random_weights = true
+    [models.untrained-early]
+    family = "pi0-tiny-early"
     random_weights = true
     [models.reader]
     family = "vlm-tiny"
@@ -257,6 +261,7 @@ def test_the_study_of_the_package_plays_and_every_table_of_it_has_numbers(tmp_pa
     max_steps = 6
     [conditions.still]
     no_act = true
+    max_steps = 6
     [asks.p1]
     prompt = "p1"
     [[runs]]
@@ -265,7 +270,7 @@ def test_the_study_of_the_package_plays_and_every_table_of_it_has_numbers(tmp_pa
     conditions = ["short"]
     [[runs]]
     name = "controls"
-    models = ["untrained"]
+    models = ["untrained", "untrained-early"]
     conditions = ["still"]
     [[runs]]
     name = "vlms"
