@@ -8,14 +8,18 @@ import csv
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
+import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
+from urllib.request import HTTPCookieProcessor, build_opener
 
 from probe_kit.__main__ import main
 
@@ -106,6 +110,33 @@ def probe_kit_process(
     )
     answer = Answer(" ".join(typed), ended.returncode, ended.stdout, ended.stderr)
     return answer if code is None else answer.ended(code)
+
+
+def address_of(viewer: "subprocess.Popen[str]") -> str:
+    """Return the address that `probe-kit view` prints, with its token."""
+    assert viewer.stdout is not None
+    read = ""
+    while (address := re.search(r"http://[^\s]+", read)) is None:
+        line = viewer.stdout.readline()
+        assert line, f"the viewer ended: {read}"
+        read += line
+    return address.group()
+
+
+def served_page(address: str) -> str:
+    """Return the page of the viewer, which a browser reaches with the cookie of the first answer."""
+    browser, end = build_opener(HTTPCookieProcessor()), time.monotonic() + 60
+    while True:
+        try:
+            for page in (address, address.partition("?")[0]):
+                with browser.open(page, timeout=30) as answer:
+                    content = str(answer.read().decode("utf-8"))
+            return content
+        except HTTPError:
+            raise
+        except OSError:
+            assert time.monotonic() < end, "the viewer does not answer"
+            time.sleep(0.2)
 
 
 def lines_of(page: str, heading: str) -> list[str]:

@@ -5,17 +5,14 @@ import contextlib
 import json
 import re
 import signal
-import socket
 import subprocess
-import time
-import urllib.request
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import probe_kit as pk
-from tests.acceptance.product import ROOT, environment, lines_of, probe_kit
+from tests.acceptance.product import ROOT, address_of, environment, lines_of, probe_kit, served_page
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DEMO: dict[str, Any] = json.loads((ROOT / "docs" / "demo.json").read_text(encoding="utf-8"))
@@ -137,31 +134,20 @@ def test_the_lines_of_a_study_run_as_typed_and_the_viewer_answers_until_ctrl_c(t
     assert (tmp_path / "report.html").stat().st_size > 10_000
     assert list((tmp_path / "figures").glob("*.png"))
     assert view.startswith("probe-kit view")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
     viewer = subprocess.Popen(
-        [*view.split(), "--port", str(port), "--no-browser"],
+        [*view.split(), "--no-browser"],
         cwd=tmp_path,
-        env=environment(),
-        stderr=subprocess.PIPE,
+        env=environment(PYTHONUNBUFFERED="1"),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        encoding="utf-8",
     )
     try:
-        assert "<html" in page_of(port, viewer)
+        assert "<html" in served_page(address_of(viewer))
     finally:
         viewer.send_signal(signal.SIGINT)
         viewer.communicate(timeout=60)
     assert viewer.returncode in (0, 130)
-
-
-def page_of(port: int, viewer: "subprocess.Popen[bytes]") -> str:
-    """What the viewer serves, as soon as it does."""
-    for _ in range(240):
-        assert viewer.poll() is None, "the viewer ended"
-        with contextlib.suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=20) as page:
-            return str(page.read().decode("utf-8"))
-        time.sleep(0.5)
-    raise AssertionError("the viewer does not answer")
 
 
 def shell(line: str, folder: Path) -> str:
