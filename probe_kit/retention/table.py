@@ -236,8 +236,8 @@ def retention_table(
     lists by the name of a group, such as `{"vqa": [a], "no vqa": [b, c]}`; groups are compared with each other.
     against: the run or group that every other is compared with instead, by its name. views: those that were probed
     by default. iterations: which expert iterations take part. keys: which stored probe results of each run to use,
-    in order, the newest by default. epsilons: zone radii in metres at which SR is scored again, for the rule
-    `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.rules.RULES`; last_steps:
+    in order, the newest by default, and none for "". epsilons: zone radii in metres at which SR is scored again,
+    for the rule `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.rules.RULES`; last_steps:
     control steps at their end that count. absent_below: accuracy below which a stream without signal is called
     absent. A run that keeps no trajectories has no success rate by another rule than `disc`. A run without
     activations or probes shows success rates only. score: by which VLM runs are read, `text`, `logits` or
@@ -373,6 +373,10 @@ def _read_probes(
     results: dict[str, ProbeResults] = {}
     missing = []
     for run, key in zip(runs, keys, strict=True):
+        if key == "":
+            if run.streams:
+                missing.append(f"Success rates only: no probes of {run.location} belong to this table.")
+            continue
         try:
             found = load_results(run, key)
         except NoProbesError as error:
