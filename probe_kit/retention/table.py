@@ -237,9 +237,9 @@ def retention_table(
     against: the run or group that every other is compared with instead, by its name. views: those that were probed
     by default. iterations: which expert iterations take part. keys: which stored probe results of each run to use,
     in order, the newest by default, and none for "". epsilons: zone radii in metres at which SR is scored again,
-    for the rule `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.rules.RULES`; last_steps:
-    control steps at their end that count. absent_below: accuracy below which a stream without signal is called
-    absent. A run that keeps no trajectories has no success rate by another rule than `disc`. A run without
+    for the rule `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.rules.RULES`;
+    last_steps: control steps at their end that count. absent_below: accuracy below which a stream without signal is
+    called absent. A run that keeps no trajectories has no success rate by another rule than `disc`. A run without
     activations or probes shows success rates only. score: by which VLM runs are read, `text`, `logits` or
     `order-balanced`; they stand first. with_side_words: count their items in whose name a side stands. vlm_vla:
     compare every VLM run with every acting one, see `vlm_vla_differences`. labels: names of runs in tables and

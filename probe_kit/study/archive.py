@@ -152,7 +152,8 @@ def _unpack(archive: ZipFile, file: Path, folder: Path) -> None:
         )
     if unpacked > (free := shutil.disk_usage(folder).free):
         raise DiskSpaceError(
-            f"{file} unpacks to {unpacked:,} bytes, and {folder.parent} has {free:,} free. Set TMPDIR to another disk"
+            f"{file} unpacks to {unpacked:,} bytes, and {folder.parent} has {free:,} free. Set TMPDIR to another "
+            "disk"
         )
     for member in members:
         target = folder / member.filename
