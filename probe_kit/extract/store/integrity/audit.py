@@ -67,7 +67,8 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
     """Compare a run with what it says of itself.
 
     Structure, plan, metadata, commits, sizes, and what is derived; with `deep` every byte, columns against rows,
-    and every reader of the run and of its stored results. Problems are collected, not raised. Raises RunNotFoundError if there is no run at `path`.
+    and every reader of the run and of its stored results. Problems are collected, not raised.
+    Raises RunNotFoundError if there is no run at `path`.
     """
     location = locate(path)
     while True:
