@@ -47,6 +47,13 @@ def full_disk_in_words(path: Path) -> Iterator[None]:
     """Raise DiskSpaceError in place of the system's error where the disk of `path` takes no more."""
     try:
         yield
+    except DiskSpaceError as error:  # of a part of the same draft, whose name says nothing to the caller
+        if f".{path.name}." not in str(error):
+            raise
+        raise DiskSpaceError(
+            f"the disk of {path} is full; nothing was written there. Free some space or choose another disk, then "
+            "run the same command again"
+        ) from error
     except OSError as error:
         if error.errno not in FULL_DISK:
             raise
