@@ -1,4 +1,4 @@
-"""Exports and copies on a full disk: an error that names it, no signal, and nothing in the way of the next call."""
+"""Exports and copies on a full disk: an error that names it, no signal, and nothing that stops the next."""
 
 import subprocess
 import sys
