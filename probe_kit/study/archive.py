@@ -21,7 +21,7 @@ import zlib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, Self
+from typing import Any, Final, Literal, Self
 from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile, ZipInfo
 
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
@@ -31,7 +31,7 @@ from probe_kit.errors import DiskSpaceError, RunDamagedError, UsageError
 
 PACK_FILE, STUDY_FILE, SUMS_FILE = "pack.json", "study.toml", "SHA256SUMS"
 RUNS, TABLES = "runs", "tables"
-SCHEMA = 2
+SCHEMA: Final = 2
 MOST_FILES, MOST_BYTES, MOST_RECORD_BYTES = 1_000_000, 256 << 30, 64 << 20
 """Bounds of an archive: its files, their bytes together, and the bytes of `pack.json` and `SHA256SUMS`."""
 MOST_EXPANSION, FREE_EXPANSION = 200, 64 << 20
