@@ -47,7 +47,7 @@ def full_disk_in_words(path: Path) -> Iterator[None]:
     """Raise DiskSpaceError in place of the system's error where the disk of `path` takes no more."""
     try:
         yield
-    except DiskSpaceError as error:  # of a part of the same draft, whose name says nothing to the caller
+    except DiskSpaceError as error:  # of a part of the same draft, which the caller cannot know
         if f".{path.name}." not in str(error):
             raise
         raise DiskSpaceError(

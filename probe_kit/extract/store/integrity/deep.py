@@ -28,7 +28,7 @@ READERS = min(8, max(4, os.cpu_count() or 1))
 """Objects that are read and hashed at once: both let other threads work."""
 BATCH = 256
 RESULT_READERS: Mapping[str, str] = {
-    PROBES: "probe_kit.train.results.every_result:readers_of_results",
+    PROBES: "probe_kit.train.every_result:readers_of_results",
     INTERVENTIONS: "probe_kit.intervene.results.every_result:readers_of_results",
 }
 """By home of bundles, the function that gives a reader per stored result of a run. It lies in a folder above."""

@@ -13,10 +13,10 @@ from probe_kit.errors import DiskSpaceError
 
 @pytest.fixture
 def full_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 40 kB, less than any export needs."""
+    """A file system of 8 kB, less than any export needs."""
     disk = tmp_path / "disk"
     disk.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=40k", "none", str(disk)]
+    mount = ["mount", "-t", "tmpfs", "-o", "size=8k", "none", str(disk)]
     try:
         mounted = subprocess.run(mount, capture_output=True, encoding="utf-8", check=False)
     except FileNotFoundError:
