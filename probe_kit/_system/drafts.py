@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from probe_kit.errors import FULL_DISK, DiskSpaceError, UsageError
+
 _SUFFIX = ".tmp"
 
 
@@ -29,6 +31,36 @@ def write_whole(path: Path, text: str) -> None:
     with draft_of(path) as draft:
         draft.write_text(text, encoding="utf-8", newline="\n")
         draft.replace(path)
+
+
+def move_draft(draft: Path, path: Path) -> None:
+    """Give a whole draft its name. Raises UsageError where something lies there meanwhile."""
+    if path.is_dir() and not any(path.iterdir()):
+        path.rmdir()
+    if path.exists():
+        raise UsageError(f"{path} exists; choose another path or remove it")
+    draft.rename(path)
+
+
+@contextmanager
+def full_disk_in_words(path: Path) -> Iterator[None]:
+    """Raise DiskSpaceError in place of the system's error where the disk of `path` takes no more."""
+    try:
+        yield
+    except DiskSpaceError as error:  # of a part of the same draft, which the caller cannot know
+        if f".{path.name}." not in str(error):
+            raise
+        raise DiskSpaceError(
+            f"the disk of {path} is full; nothing was written there. Free some space or choose another disk, then "
+            "run the same command again"
+        ) from error
+    except OSError as error:
+        if error.errno not in FULL_DISK:
+            raise
+        raise DiskSpaceError(
+            f"the disk of {path} {FULL_DISK[error.errno]}; nothing was written there. Free some space or choose "
+            "another disk, then run the same command again"
+        ) from error
 
 
 @contextmanager

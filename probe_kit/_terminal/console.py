@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from errno import EPIPE
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -30,6 +31,9 @@ from rich.text import Text
 from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit._terminal.progress_log import Heartbeat
 
+for _stream in ("stdout", "stderr"):
+    if getattr(sys, _stream) is None:  # closed by the caller (`>&-`): its number must not go to the next file
+        setattr(sys, _stream, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - open until the end
 _NOT_ASCII = re.compile(r"[^\x00-\x7f]")
 PAGE = 120
 """Columns of a table that goes to a file or a pipe, where no terminal says how many there are."""

@@ -236,17 +236,17 @@ def retention_table(
     lists by the name of a group, such as `{"vqa": [a], "no vqa": [b, c]}`; groups are compared with each other.
     against: the run or group that every other is compared with instead, by its name. views: those that were probed
     by default. iterations: which expert iterations take part. keys: which stored probe results of each run to use,
-    in order, the newest by default. epsilons: zone radii in metres at which SR is scored again, for the rule
-    `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.rules.RULES`; last_steps:
-    control steps at their end that count. absent_below: accuracy below which a stream without signal is called
-    absent. A run that keeps no trajectories has no success rate by another rule than `disc`. A run without
-    activations or probes shows success rates only. score: by which VLM runs are read, `text`, `logits` or
+    in order, the newest by default, and none for "". epsilons: zone radii in metres at which SR is scored again,
+    for the rule `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.rules.RULES`;
+    last_steps: control steps at their end that count. absent_below: accuracy below which a stream without signal
+    is called absent. A run that keeps no trajectories has no success rate by another rule than `disc`. A run
+    without activations or probes shows success rates only. score: by which VLM runs are read, `text`, `logits` or
     `order-balanced`; they stand first. with_side_words: count their items in whose name a side stands. vlm_vla:
     compare every VLM run with every acting one, see `vlm_vla_differences`. labels: names of runs in tables and
     figures by their location, instead of their own. pairs: by location, the runs that are compared, each the first
-    minus the second, instead of the first run with every other; all of them are one family of tests.
-    categories: rows of these alone, and means over them; probes are those of the whole runs. with_behaviour: False
-    leaves empty what the rule `disc` does not need (other rules and behaviour), so that no trajectory is read.
+    minus the second, instead of the first run with every other; all of them are one family of tests. categories:
+    rows of these alone, and means over them; probes are those of the whole runs. with_behaviour: False leaves
+    empty what the rule `disc` does not need (other rules and behaviour), so that no trajectory is read.
     Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
     is not that of the runs, for a run that is given twice, or for `against` or `pairs` where they are none of the
     runs; SceneError for overlapping zones.
@@ -373,6 +373,10 @@ def _read_probes(
     results: dict[str, ProbeResults] = {}
     missing = []
     for run, key in zip(runs, keys, strict=True):
+        if key == "":
+            if run.streams:
+                missing.append(f"Success rates only: no probes of {run.location} belong to this table.")
+            continue
         try:
             found = load_results(run, key)
         except NoProbesError as error:

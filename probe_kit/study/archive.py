@@ -5,69 +5,105 @@ pack.json       a record of the study, its suite, its runs and their keys, and w
 runs/           runs as `copy_run` makes them
 tables/         every table as JSON, Markdown and LaTeX
 SHA256SUMS      of all other files, as `sha256sum --check` reads them
+
+An archive may come from anyone. Its sums name every file, and no other file is read. It holds no links. Sizes are
+read before content.
 """
 
 import atexit
 import hashlib
-import json
+import os
+import re
 import shutil
+import stat
 import tempfile
+import zlib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
 from functools import cache
-from pathlib import Path
-from typing import Any, Self
+from pathlib import Path, PurePosixPath
+from typing import Any, Final, Literal, Self
 from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile, ZipInfo
 
+from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
+
 from probe_kit._system.bounded_json import parse_json
-from probe_kit.errors import RunDamagedError, UsageError
+from probe_kit.errors import DiskSpaceError, RunDamagedError, UsageError
 
 PACK_FILE, STUDY_FILE, SUMS_FILE = "pack.json", "study.toml", "SHA256SUMS"
 RUNS, TABLES = "runs", "tables"
-SCHEMA = 1
+SCHEMA: Final = 2
+MOST_FILES, MOST_BYTES, MOST_RECORD_BYTES = 1_000_000, 256 << 30, 64 << 20
+"""Bounds of an archive: its files, their bytes together, and the bytes of `pack.json` and `SHA256SUMS`."""
+MOST_EXPANSION, FREE_EXPANSION = 200, 64 << 20
+"""Bytes that a byte of a zip file may unpack to, and bytes that are free of this bound. JSON gives 10 to 30."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 _RESTORE = "Fetch the archive again, or make it anew with `probe-kit study pack`"
+_LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
 
-@dataclass(frozen=True)
-class Pack:
-    """What `pack.json` says.
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    study: its name. suite: `identity` and `items` by category. keys: by name of a run, such as `base/plain`, the
-    key in its folder's name. missing: runs and tables that are not there, each with the reason. left_out: kinds of
-    files that were not packed. version: of probe_kit.
+
+class PackedSuite(_Part):
+    """The suite of an archive. identity: `name@version`. items: by category."""
+
+    identity: str
+    items: dict[str, NonNegativeInt]
+
+
+class PackedRun(_Part):
+    """A run of an archive. key: in its folder's name. settings_sha256: of its settings with the weights' hash."""
+
+    key: str = Field(pattern=r"^[0-9a-f]{8}$")
+    settings_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+
+
+class Pack(_Part):
+    """The content of `pack.json`.
+
+    study: its name. runs: by name, such as `base/plain`. missing: runs and tables that are not there, each with
+    the reason. left_out: kinds of files that were not packed. version: of probe_kit.
     """
 
     study: str
     version: str
-    suite: dict[str, Any]
-    keys: dict[str, str]
+    suite: PackedSuite
+    runs: dict[str, PackedRun]
     missing: dict[str, str]
     left_out: list[str]
-    schema: int = field(default=SCHEMA)
+    schema_version: Literal[2] = SCHEMA
 
     def to_json(self) -> str:
-        """As stored."""
-        return json.dumps(asdict(self), indent=1, ensure_ascii=False)
+        """The text of `pack.json`."""
+        return self.model_dump_json(indent=1)
 
     @classmethod
     def read(cls, folder: Path) -> Self:
         """The record in a folder. Raises RunDamagedError if it is none, UsageError if it is of another version."""
+        file = folder / PACK_FILE
         try:
-            found = parse_json((folder / PACK_FILE).read_bytes())
-            if (schema := found["schema"]) != SCHEMA:
-                raise UsageError(f"{folder} is an archive of schema {schema}; this version reads {SCHEMA}")
-            return cls(**found)
-        except (ValueError, TypeError, KeyError) as error:
+            content: Any = parse_json(_read_bounded(file))
+        except ValueError as error:
+            raise RunDamagedError(f"{file} is no record of an archive ({error}). {_RESTORE}") from error
+        schema = content.get("schema_version") if isinstance(content, dict) else None
+        if type(schema) is int and schema != SCHEMA:
+            raise UsageError(f"{folder} is an archive of schema {schema}; this version reads {SCHEMA}")
+        try:
+            return cls.model_validate(content)
+        except ValidationError as error:
+            (first, *_) = error.errors(include_url=False)
+            path = ".".join(map(str, first["loc"]))
             raise RunDamagedError(
-                f"{folder / PACK_FILE} is no record of an archive ({error!r}). {_RESTORE}"
+                f"{file} is no record of an archive ({path}: {first['msg']}). {_RESTORE}"
             ) from error
 
 
 def open_archive(name: str | Path) -> Path | None:
     """The folder of an archive, unpacked for this process if it is a zip file; None for what is no archive.
 
-    Raises RunDamagedError where a file is missing, was added, or has other bytes than were packed.
+    Raises RunDamagedError where a file is missing, was added, or has other bytes than were packed, and for a link
+    or a zip file beyond the bounds.
     """
     place = Path(name)
     if place.is_dir():
@@ -84,13 +120,69 @@ def _unpacked(file: Path) -> Path:
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     try:
         with ZipFile(file) as archive:
-            archive.extractall(folder)
-    except BadZipFile as error:
+            _unpack(archive, file, folder)
+    except (BadZipFile, zlib.error, EOFError, NotImplementedError, UnicodeDecodeError) as error:
         raise RunDamagedError(f"{file} is no whole zip file ({error}). {_RESTORE}") from error
+    except RuntimeError as error:  # a member that asks for a password
+        raise RunDamagedError(f"{file} cannot be read ({error}). {_RESTORE}") from error
     if not (folder / PACK_FILE).is_file():
         raise UsageError(f"{file} is no archive of a study: it has no {PACK_FILE}")
     check_sums(folder)
     return folder
+
+
+def _unpack(archive: ZipFile, file: Path, folder: Path) -> None:
+    """Write the members of a zip file, once names, kinds and sizes of all of them are found acceptable."""
+    members = [member for member in archive.infolist() if not member.is_dir()]
+    names = [member.filename for member in members]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise RunDamagedError(f"{file} has two files called {twice!r}. {_RESTORE}")
+    for member in members:
+        kind = stat.S_IFMT(member.external_attr >> 16)
+        if kind not in (0, stat.S_IFREG):
+            raise RunDamagedError(f"{file} has {member.filename!r}, which is no regular file. {_RESTORE}")
+        _check_name(member.filename, str(file))
+    _check_sizes(len(members), sum(member.file_size for member in members), str(file))
+    packed, unpacked = file.stat().st_size, sum(member.file_size for member in members)
+    if unpacked > FREE_EXPANSION and unpacked > MOST_EXPANSION * packed:
+        raise RunDamagedError(
+            f"{file} has {packed:,} bytes and unpacks to {unpacked:,}; expected at most {MOST_EXPANSION} times as "
+            f"many. {_RESTORE}"
+        )
+    if unpacked > (free := shutil.disk_usage(folder).free):
+        raise DiskSpaceError(
+            f"{file} unpacks to {unpacked:,} bytes, and {folder.parent} has {free:,} free. Set TMPDIR to another "
+            "disk"
+        )
+    for member in members:
+        target = folder / member.filename
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with archive.open(member) as source, target.open("xb") as unpacked_file:
+            shutil.copyfileobj(source, unpacked_file)  # zipfile ends at the size that the member declares
+
+
+def _check_name(name: str, where: str) -> None:
+    """Raise RunDamagedError for a name that is not the plain name of a file below a folder."""
+    path = PurePosixPath(name)
+    plain = path.as_posix() == name and not path.is_absolute() and ".." not in path.parts and "\\" not in name
+    if not plain or not name.isprintable():
+        raise RunDamagedError(f"{where} names {name!r}, which is no file below its folder. {_RESTORE}")
+
+
+def _check_sizes(files: int, size: int, where: str) -> None:
+    if files > MOST_FILES or size > MOST_BYTES:
+        raise RunDamagedError(
+            f"{where} has {files:,} files of {size:,} bytes; an archive has at most {MOST_FILES:,} of "
+            f"{MOST_BYTES:,}. {_RESTORE}"
+        )
+
+
+def _read_bounded(file: Path) -> bytes:
+    """The bytes of `pack.json` or of the sums. Raises RunDamagedError for more than such a file has."""
+    if (size := file.stat().st_size) > MOST_RECORD_BYTES:
+        raise RunDamagedError(f"{file} has {size:,} bytes; expected at most {MOST_RECORD_BYTES:,}. {_RESTORE}")
+    return file.read_bytes()
 
 
 def write_zip(folder: Path, out: Path) -> None:
@@ -98,13 +190,25 @@ def write_zip(folder: Path, out: Path) -> None:
     with ZipFile(out, "w", ZIP_DEFLATED) as archive:
         for file in files_of(folder):
             info = ZipInfo(file.relative_to(folder).as_posix(), _DATE)
-            info.compress_type, info.external_attr = ZIP_DEFLATED, 0o644 << 16
+            info.compress_type, info.external_attr = ZIP_DEFLATED, (stat.S_IFREG | 0o644) << 16
             archive.writestr(info, file.read_bytes())
 
 
 def files_of(folder: Path) -> Iterator[Path]:
-    """All files below a folder, in order."""
-    yield from sorted(file for file in folder.rglob("*") if file.is_file())
+    """All files below a folder, in order. Raises RunDamagedError for a link, pipe or device there."""
+    yield from sorted(_files_of(folder))
+
+
+def _files_of(folder: Path) -> Iterator[Path]:
+    for home, folders, names in os.walk(folder):
+        for path in (Path(home) / name for name in (*folders, *names)):
+            kind = path.lstat().st_mode
+            if stat.S_ISREG(kind):
+                yield path
+            elif not stat.S_ISDIR(kind):
+                raise RunDamagedError(
+                    f"{path} is a link or no regular file; an archive has regular files and folders. {_RESTORE}"
+                )
 
 
 def write_sums(folder: Path) -> None:
@@ -112,27 +216,48 @@ def write_sums(folder: Path) -> None:
     lines = [
         f"{_digest(file)}  {file.relative_to(folder).as_posix()}\n"
         for file in files_of(folder)
-        if file.name != SUMS_FILE
+        if file != folder / SUMS_FILE
     ]
     (folder / SUMS_FILE).write_text("".join(lines), encoding="utf-8")
 
 
 def check_sums(folder: Path) -> None:
     """Raise RunDamagedError, naming the file, where one is missing, has other bytes, or was added."""
-    if not (folder / SUMS_FILE).is_file():
+    sums = folder / SUMS_FILE
+    if not sums.is_file():
         raise RunDamagedError(f"{folder} has no {SUMS_FILE}. {_RESTORE}")
-    summed = set[Path]()
-    for line in (folder / SUMS_FILE).read_text(encoding="utf-8").splitlines():
-        digest, _, name = line.partition("  ")
-        file = folder / name
-        summed.add(file)
-        if not file.is_file():
-            raise RunDamagedError(f"{file} is missing. {_RESTORE}")
-        if _digest(file) != digest:
-            raise RunDamagedError(f"{file} has other bytes than were packed. {_RESTORE}")
-    for file in files_of(folder):
-        if file not in summed and file.name != SUMS_FILE:
-            raise RunDamagedError(f"{file} was not packed: {SUMS_FILE} does not have it. {_RESTORE}")
+    files = list(files_of(folder))  # first: no link is followed
+    _check_sizes(len(files), sum(file.stat().st_size for file in files), str(folder))
+    expected = _read_sums(sums)
+    there = {file.relative_to(folder).as_posix(): file for file in files if file != sums}
+    for name, digest in expected.items():
+        if name not in there:
+            raise RunDamagedError(f"{folder / name} is missing. {_RESTORE}")
+        if _digest(there[name]) != digest:
+            raise RunDamagedError(f"{folder / name} has other bytes than were packed. {_RESTORE}")
+    for name in there:
+        if name not in expected:
+            raise RunDamagedError(f"{folder / name} was not packed: {SUMS_FILE} does not have it. {_RESTORE}")
+
+
+def _read_sums(file: Path) -> dict[str, str]:
+    """Digests by name. Raises RunDamagedError for a wrong line, and for a name that leads out or stands twice."""
+    try:
+        lines = _read_bounded(file).decode("utf-8").split("\n")
+    except UnicodeDecodeError as error:
+        raise RunDamagedError(f"{file} is no UTF-8 text ({error}). {_RESTORE}") from error
+    if lines.pop():
+        raise RunDamagedError(f"{file} ends within a line. {_RESTORE}")
+    sums: dict[str, str] = {}
+    for number, line in enumerate(lines, start=1):
+        parts = _LINE.fullmatch(line)
+        if parts is None:
+            raise RunDamagedError(f"{file}, line {number}: {line[:80]!r} is no sha256 and name. {_RESTORE}")
+        _check_name(parts[2], f"{file}, line {number}")
+        if parts[2] in sums:
+            raise RunDamagedError(f"{file} names {parts[2]!r} twice. {_RESTORE}")
+        sums[parts[2]] = parts[1]
+    return sums
 
 
 def _digest(file: Path) -> str:

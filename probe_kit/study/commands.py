@@ -356,7 +356,7 @@ def pack(
         check_no_others(
             {"--directions": directions, "--pictures": pictures, "--trajectories": trajectories}, "a data set"
         )
-        _write_data_set(load_study(file), out_file, partial, licence)
+        _write_data_set(load_study(file), out_file, partial, licence, again=publish is not None)
         if publish is None:
             out.print(str(out_file), highlight=False, markup=False, soft_wrap=True)
             return
@@ -367,16 +367,16 @@ def pack(
     asked = dict(zip(EXTRAS, (pictures, trajectories, directions), strict=True))
     with err.status("packing"):
         made = pack_study(load_study(file), out_file, partial, [name for name in EXTRAS if asked[name]])
-    out.print(f"{out_file}: {len(made.keys)} runs, without {', '.join(made.left_out)}", soft_wrap=True)
+    out.print(f"{out_file}: {len(made.runs)} runs, without {', '.join(made.left_out)}", soft_wrap=True)
     for name, reason in made.missing.items():
         out.print(f"not packed: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
 
 
-def _write_data_set(study: "LoadedStudy", folder: Path, partial: bool, licence: str | None) -> None:
+def _write_data_set(study: "LoadedStudy", folder: Path, partial: bool, licence: str | None, again: bool) -> None:
     from probe_kit.study import write_data_set
 
     with err.status("packing"):
-        made = write_data_set(study, folder, partial, licence)
+        made = write_data_set(study, folder, partial, licence, again)
     for name, reason in made.missing.items():
         out.print(f"not in it: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
 

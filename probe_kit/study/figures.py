@@ -1,12 +1,11 @@
 """Making of a study's named figures, with the figures of the retention table."""
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.errors import UsageError
 from probe_kit.intervene.results.site_maps import stored_steering
 from probe_kit.retention.displays import curves_side_by_side, dose_response, layer_curve
 from probe_kit.retention.displays.base.report_figure import ONLY_FILLED, ReportFigure, figure_of
@@ -18,8 +17,7 @@ from probe_kit.study.planned_suite import slugs
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import FigureKind, FigureTable
 from probe_kit.study.tables.rates import domain_scores
-from probe_kit.study.tables.stored_runs import StoredRuns, of_blocks, stored_runs
-from probe_kit.train.results.store import load_results
+from probe_kit.study.tables.stored_runs import StoredRuns, of_blocks, stored_runs, study_probes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,31 +39,38 @@ def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> l
         raise UsageError(
             f"no run of the figure {name!r} is stored. Play them with `probe-kit study run {study.file}`"
         )
-    return _MAKERS[figure.kind](_Source(name, figure, runs, chosen, runs.labels(study)))
+    return _MAKERS[figure.kind](_Source(study, name, figure, runs, chosen, runs.labels(study), partial_runs))
 
 
 @dataclass(frozen=True)
 class _Source:
-    """What a figure is made of. categories: slugs, None for all. labels: of the runs by location."""
+    """The parts of a figure. categories: slugs, None for all. labels: of the runs by location.
 
+    partial: whether runs that are missing are accepted.
+    """
+
+    study: LoadedStudy
     name: str
     figure: FigureTable
     runs: StoredRuns
     categories: tuple[str, ...] | None
     labels: Mapping[str, str]
+    partial: bool
 
     @property
     def table(self) -> RetentionTable:
         """Of all runs, nothing compared."""
-        return retention_table([one.run for one in self.runs.found], labels=self.labels, pairs=())
+        runs = [one.run for one in self.runs.found]
+        return retention_table(runs, labels=self.labels, pairs=(), keys=[""] * len(runs))
 
 
 def _curves(source: _Source) -> list[ReportFigure]:
     """A panel per category and part of the model, a line per system; of one system a line per iteration."""
-    found = []
-    for one in source.runs.found:
-        with suppress(NoProbesError):
-            found.append((source.labels[one.place], load_results(one.probed.in_wording())))
+    probes = {
+        source.labels[one.place]: study_probes(source.study, one, one.probed.in_wording(), source.partial)
+        for one in source.runs.found
+    }
+    found = [(label, own) for label, own in probes.items() if own is not None]
     if not found:
         raise UsageError(
             f"no run of the figure {source.name!r} has probes; name its block in a table [probes.NAME]"

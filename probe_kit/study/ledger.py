@@ -3,7 +3,9 @@
     OUT/ledger/<model>+<condition or ask>-<key>.json     a record per run, written by the process that conducts
     OUT/ledger/speeds/<digits>.json                      a record per machine: what `--calibrate` measured there
 
-No number of a table comes from it. Without it, failed models are tried again and probes are looked up anew.
+Every record carries its own hash. No number of a table comes from the ledger: a run that it leads to is compared
+with its cell. Without it, failed models are tried again, equal runs elsewhere are looked up again, and the weights
+of a run are not compared with those that were first loaded.
 """
 
 import os
@@ -18,12 +20,14 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.rollout.events import traceback_of
 from probe_kit.extract.settings import flat_settings
+from probe_kit.extract.store.format.hashes import HASH, as_record, read_record
 from probe_kit.extract.store.locations.locate import locate
-from probe_kit.hashing import sha256_text
-from probe_kit.study.cells import Cell
+from probe_kit.hashing import sha256_json, sha256_text
+from probe_kit.study.cells import KEY_DIGITS, Cell
 
 FOLDER = "ledger"
 Stage = Literal["checking", "playing", "episodes", "probes", "waiting"]
+_ADVICE = "Delete it; no number comes from it, and `probe-kit study run` writes it again"
 NOT_TRIED_AGAIN: tuple[Stage, ...] = ("playing", "episodes")
 """What takes long to fail, and so is tried again only on request."""
 
@@ -138,24 +142,19 @@ class Ledger:
         self._location = locate(out)
 
     def entries(self) -> dict[str, Entry]:
-        """All records by name, those of former settings too. Raises RunDamagedError for one that is no record."""
-        found = self._location.read_all(FOLDER, ".json")
-        return {
-            name.removesuffix(".json"): self._parsed(f"{FOLDER}/{name}", content, Entry)
-            for name, content in found.items()
-        }
+        """All records by name, those of former settings too.
+
+        Raises RunDamagedError for one that was changed, or is of another cell than its name says.
+        """
+        records = self._location.read_all(FOLDER, ".json")
+        return {name.removesuffix(".json"): self._entry(name, content) for name, content in records.items()}
 
     def of(self, cell: Cell) -> Entry:
-        """The record of a cell, empty if there is none."""
-        key = f"{FOLDER}/{name_of(cell)}.json"
-        if not self._location.exists(key):
+        """The record of a cell, empty if there is none. Raises RunDamagedError as `entries` does."""
+        name = f"{name_of(cell)}.json"
+        if not self._location.exists(f"{FOLDER}/{name}"):
             return Entry(cell=cell.name, settings=cell.known)
-        return self._parsed(key, self._location.read(key), Entry)
-
-    def location(self, cell: Cell, out: str) -> str:
-        """Where the run of a cell lies: its own place below `out`, or that of an equal run that serves it."""
-        played = self.of(cell).played
-        return played.served_by if played is not None and played.served_by else cell.location(out)
+        return self._entry(name, self._location.read(f"{FOLDER}/{name}"))
 
     def note(self, cell: Cell, **changes: Any) -> None:
         """Change fields of the record of a cell; one that stays as it is, is not written."""
@@ -163,8 +162,8 @@ class Ledger:
             before = self.of(cell)
             after = before.model_copy(update=changes)
             if after != before:
-                content = after.model_dump_json(indent=1).encode()
-                self._location.write_record(f"{FOLDER}/{name_of(cell)}.json", content)
+                record = as_record(after.model_dump(mode="json"))
+                self._location.write_record(f"{FOLDER}/{name_of(cell)}.json", record)
 
     def speeds(self) -> dict[str, Speed]:
         """What was measured on this machine."""
@@ -177,7 +176,7 @@ class Ledger:
         """Keep what was measured on this machine."""
         with self.opened():
             record = Speeds(machine=machine_name(), models={**self.speeds(), name: speed})
-            self._location.write_record(_speeds_key(), record.model_dump_json(indent=1).encode())
+            self._location.write_record(_speeds_key(), as_record(record.model_dump(mode="json")))
 
     @contextmanager
     def opened(self) -> Iterator[None]:
@@ -185,14 +184,30 @@ class Ledger:
         with self._location.in_words(), self._location.tended(FOLDER):
             yield
 
-    def _parsed[Kind: _Record](self, key: str, content: bytes, kind: type[Kind]) -> Kind:
-        try:
-            return kind.model_validate_json(content)
-        except ValidationError as error:
-            said = error.errors(include_url=False)[0]["msg"]
+    def _entry(self, name: str, content: bytes) -> Entry:
+        """The record in the file `name`, found to be of the cell and the settings that the file's name says."""
+        entry = self._parsed(f"{FOLDER}/{name}", content, Entry)
+        if name != f"{_file_stem(entry)}.json":
             raise RunDamagedError(
-                f"{self._location}/{key} is no record of a ledger ({said}). Delete it; no number comes from it"
-            ) from error
+                f"{self._location}/{FOLDER}/{name} is the record of {entry.cell} and belongs into "
+                f"{_file_stem(entry)}.json. {_ADVICE}"
+            )
+        return entry
+
+    def _parsed[Kind: _Record](self, key: str, content: bytes, kind: type[Kind]) -> Kind:
+        name = f"{self._location}/{key}"
+        record = read_record(content, name, _ADVICE)
+        try:
+            return kind.model_validate({part: value for part, value in record.items() if part != HASH})
+        except ValidationError as error:
+            message = error.errors(include_url=False)[0]["msg"]
+            raise RunDamagedError(f"{name} is no record of a ledger ({message}). {_ADVICE}") from error
+
+
+def _file_stem(entry: Entry) -> str:
+    """The name that `name_of` gives the cell of a record."""
+    folder = entry.cell.replace("/seed ", "-seed").replace("/", "+")
+    return f"{folder}-{sha256_json(entry.settings)[:KEY_DIGITS]}"
 
 
 def name_of(cell: Cell) -> str:

@@ -1,7 +1,7 @@
 """The suite of a study as far as a plan needs it: categories and items, without drawing a picture."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -15,7 +15,7 @@ class PlannedSuite:
     """identity: `name@version`; when a run grows, items are compared by content. items: by category.
 
     folder: None for the embedded suite. source: where the numbers of items are from. here: whether the suite can
-    be played from.
+    be played from. contents: hash of every item's content by its id, of a suite in a folder; empty for others.
     """
 
     identity: str
@@ -23,6 +23,7 @@ class PlannedSuite:
     folder: Path | None
     source: str
     here: bool = True
+    contents: Mapping[str, str] = field(default_factory=dict)
 
 
 def planned_suite(table: SuiteTable) -> tuple[PlannedSuite, list[Mistake]]:
@@ -80,4 +81,6 @@ def _from_folder(folder: Path, counts: Mapping[str, int]) -> tuple[PlannedSuite,
         for name, count in counts.items()
         if items.get(slug(name)) != count
     ]
-    return PlannedSuite(f"{suite.name}@{suite.version}", items, folder, str(folder)), wrong
+    contents = {item.item_id: item.content_sha256 for item in suite.items}
+    identity = f"{suite.name}@{suite.version}"
+    return PlannedSuite(identity, items, folder, str(folder), contents=contents), wrong

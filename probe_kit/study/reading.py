@@ -27,7 +27,8 @@ _NAME_PATTERN = "'^[a-z0-9][a-z0-9._-]{0,59}$'"
 class LoadedStudy:
     """A study file without mistakes. file: where it lies. cells: the runs that it needs.
 
-    archive: the folder of an archive that it was read from, whose runs hold no activations; else None.
+    archive: the folder of an archive that it was read from, whose runs hold no activations; else None. pack: its
+    record.
     """
 
     file: Path
@@ -35,6 +36,7 @@ class LoadedStudy:
     suite: PlannedSuite
     cells: tuple[Cell, ...]
     archive: Path | None = None
+    pack: Pack | None = None
 
 
 def find_study(name: str) -> Path:
@@ -77,21 +79,21 @@ def load_study(name: str | Path) -> LoadedStudy:
         raise StudyFileError(str(file), content, [*_mistakes(error, content), *_further(error, content)]) from None
     if archive is not None:  # its runs are all it has
         study = study.model_copy(update={"reuse": schema.ReuseTable()})
-    suite, mistakes = planned_suite(study.suite) if archive is None else (_packed_suite(archive), [])
+    pack = None if archive is None else Pack.read(archive)
+    suite, mistakes = planned_suite(study.suite) if pack is None else (_packed_suite(pack), [])
     cells, found = _checked(study, suite)
     if mistakes := [*mistakes, *found]:
         raise StudyFileError(str(file), content, mistakes)
-    if archive is None:
+    if archive is None or pack is None:
         return LoadedStudy(file, study, suite, tuple(cells))
-    keys, home = Pack.read(archive).keys, str(archive / RUNS)
+    keys, home = {name: run.key for name, run in pack.runs.items()}, str(archive / RUNS)
     packed = tuple(replace(cell, packed_key=keys.get(cell.name, "")) for cell in cells)
-    return LoadedStudy(file, study.model_copy(update={"out": home}), suite, packed, archive)
+    return LoadedStudy(file, study.model_copy(update={"out": home}), suite, packed, archive, pack)
 
 
-def _packed_suite(archive: Path) -> PlannedSuite:
+def _packed_suite(pack: Pack) -> PlannedSuite:
     """The suite as it was when the study was packed; its items are not in the archive."""
-    suite = Pack.read(archive).suite
-    return PlannedSuite(str(suite["identity"]), dict(suite["items"]), None, "the archive", here=False)
+    return PlannedSuite(pack.suite.identity, dict(pack.suite.items), None, "the archive", here=False)
 
 
 def _parsed(file: Path) -> dict[str, Any]:

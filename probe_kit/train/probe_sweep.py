@@ -30,6 +30,8 @@ from probe_kit.train.results.store import is_stored, load_results, save_results,
 from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.solver.backend import check_device
 
+TOKEN_PERMUTATIONS = 59
+"""Label permutations of token views by default."""
 Progress = Callable[[int, int, str], None]
 """Called with (sites done, sites in all, what was just done)."""
 
@@ -62,7 +64,7 @@ def train_probes(
     views: Sequence[str] = ("mean",),
     *,
     permutations: int = 200,
-    token_permutations: int = 59,
+    token_permutations: int = TOKEN_PERMUTATIONS,
     target: Target = "correct",
     labels: None = None,
     call: int = 0,
@@ -85,7 +87,7 @@ def train_probes(
     views: Sequence[str] = ("mean",),
     *,
     permutations: int = 200,
-    token_permutations: int = 59,
+    token_permutations: int = TOKEN_PERMUTATIONS,
     target: Target = "correct",
     labels: Labels | None = None,
     window: int | None = None,
@@ -269,6 +271,17 @@ def _categories(run: RunReader, asked: Sequence[str] | None) -> Sequence[str]:
         if category not in (*known, POOLED):
             raise UnknownCategoryError(f"{run.location} has no category {category!r}; it has: {', '.join(known)}")
     return asked or known
+
+
+def probe_settings(
+    run: RunReader, *, views: Sequence[str], permutations: int, target: Target, seed: int
+) -> ProbeSettings:
+    """The settings of the probes that `train_probes` fits with these options and all others at their default.
+
+    Their key is that of the stored results. Nothing is fitted. Raises NoProbesError for a run without activations.
+    """
+    categories = _categories(run, None)
+    return _settings(run, categories, views, target, "groups", "keep", permutations, TOKEN_PERMUTATIONS, seed, 0)
 
 
 def _settings(

@@ -10,6 +10,7 @@ from probe_kit.errors import RunDamagedError
 from probe_kit.study import Failure, Ledger, load_study, plan_study
 from probe_kit.study.cells import Cell
 from probe_kit.study.ledger import Played, Speed, settings_changed
+from probe_kit.study.tables.stored_runs import noted_run
 from tests.study.broken_files import BASE
 
 PLAYED = Played(episodes=4, settings_sha256="a", weights_sha256=None, provenance=[{"device": "cpu"}], seconds=0.5)
@@ -55,7 +56,7 @@ def test_a_record_that_is_none_is_named(cell: Cell, tmp_path: Path, content: str
     ledger.note(cell, played=PLAYED)
     (file,) = (tmp_path / "out" / "ledger").iterdir()
     file.write_text(content, encoding="utf-8")
-    with pytest.raises(RunDamagedError, match=rf"{re.escape(file.name)} is no record .* Delete it; no number"):
+    with pytest.raises(RunDamagedError, match=rf"{re.escape(file.name)} .*Delete it; no number"):
         ledger.entries()
 
 
@@ -118,13 +119,35 @@ def test_a_plan_names_failures_and_what_waits_for_them(study_file: Path, cell: C
     assert whys(study_file)["base/plain"] == "new"
 
 
-def test_a_run_is_found_where_an_equal_one_serves_it(cell: Cell, tmp_path: Path) -> None:
+def test_a_run_is_found_where_an_equal_one_serves_it(study_file: Path, cell: Cell, tmp_path: Path) -> None:
+    study = load_study(study_file)
     out = str(tmp_path / "out")
-    ledger = Ledger(out)
-    assert ledger.location(cell, out) == cell.location(out)
-    ledger.note(cell, played=PLAYED.model_copy(update={"served_by": "elsewhere"}))
-    assert ledger.location(cell, out) == "elsewhere"
-    assert ledger.location(replace(cell, seed=1), out).startswith(f"{out}/base/dark-seed1-")
+    assert str(noted_run(study, cell)[0]) == cell.location(out)
+    Ledger(out).note(cell, played=PLAYED.model_copy(update={"served_by": "elsewhere"}))
+    assert str(noted_run(study, cell)[0]) == "elsewhere"
+    assert str(noted_run(study, replace(cell, seed=1))[0]).startswith(f"{out}/base/dark-seed1-")
+
+
+@pytest.mark.parametrize("change", ["served_by", "renamed", "exchanged"])
+def test_a_record_that_was_changed_or_is_another_cells_leads_nowhere(
+    study_file: Path, cell: Cell, tmp_path: Path, change: str
+) -> None:
+    ledger = Ledger(str(tmp_path / "out"))
+    ledger.note(cell, played=PLAYED)
+    other = next(one for one in load_study(study_file).cells if one.name == "base/plain")
+    ledger.note(other, played=PLAYED)
+    folder = tmp_path / "out" / "ledger"
+    file, theirs = folder / f"base+dark-{cell.key}.json", folder / f"base+plain-{other.key}.json"
+    if change == "served_by":
+        file.write_bytes(file.read_bytes().replace(b'"served_by": ""', b'"served_by": "/elsewhere"'))
+    elif change == "renamed":
+        theirs.replace(file)
+    else:
+        ours = file.read_bytes()
+        file.write_bytes(theirs.read_bytes())
+        theirs.write_bytes(ours)
+    with pytest.raises(RunDamagedError, match=rf"{re.escape(file.name)} .*Delete it; no number comes from it"):
+        ledger.of(cell)
 
 
 def test_speeds_are_kept_per_machine(tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
 """Copies of runs without their activations, to be published or sent."""
 
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
+from probe_kit._system.drafts import draft_of, full_disk_in_words, move_draft
 from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import (
     DATA,
@@ -14,6 +16,7 @@ from probe_kit.extract.run_layout import (
 )
 from probe_kit.extract.store.format.left_out import is_left_out, left_out_record
 from probe_kit.extract.store.integrity.orphans import known_keys
+from probe_kit.extract.store.locations.folder import Folder
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run, open_run
@@ -34,22 +37,42 @@ def copy_run(
     ActivationsLeftOutError, and nothing can be added to it. pictures: copy frames and videos too. directions: copy
     the weights of probes, without which `ProbeResults.direction` raises RunDamagedError. trajectories: copy what
     happened step by step, without which only the rule `disc` judges the last step.
-    Raises UsageError if anything lies at `out`, and what `open_run` raises.
+    The copy appears whole or not at all. Raises UsageError if anything lies at `out`, DiskSpaceError, and what
+    `open_run` raises.
     """
-    run, there = open_run(path, allow_partial), locate(out)
-    if there.keys(""):
-        raise UsageError(f"{there} is not empty; choose another place for the copy")
+    run, target = open_run(path, allow_partial), locate(out)
     arrays = {*run.root.arrays, *(() if trajectories else (TRAJECTORY,))}
+    keys = [key for key in _copied_keys(run, arrays, pictures, directions) if run.location.exists(key)]
+    strange = set(target.keys("")) - {*keys, LEFT_OUT_FILE}
+    if target.exists(RUN_FILE) or strange or (isinstance(target, Folder) and target.keys("")):
+        raise UsageError(f"{target} is not empty; choose another place for the copy")
+    if isinstance(target, Folder):
+        folder = Path(target.address)
+        with full_disk_in_words(target.path), draft_of(folder) as draft:
+            draft.mkdir()
+            _write_copy(run, Folder(draft), keys, arrays)
+            move_draft(draft, folder)
+    else:  # a killed copy leaves objects and no root, and the next one writes them again
+        with target.in_words():
+            _write_copy(run, target, keys, arrays)
+    return open_run(target, allow_partial)
+
+
+def _copied_keys(run: Run, arrays: Collection[str], pictures: bool, directions: bool) -> Iterator[str]:
+    """The keys of all objects of a copy but its root, in order. arrays: those that are left out."""
     commits = {commit["episode"]: commit for commit in run.commits()}
     for key in sorted({*known_keys(run.root, commits, None, run.stamp)} - {RUN_FILE}):
         inside = key.removeprefix(f"{DATA}/")
-        unwanted = inside != key and is_left_out(inside, arrays)
-        if unwanted or (not pictures and key.partition("/")[0] in ILLUSTRATIONS):
+        left_out = inside != key and is_left_out(inside, arrays)
+        if left_out or (not pictures and key.partition("/")[0] in ILLUSTRATIONS):
             continue
         if not directions and key.startswith(f"{PROBES}/") and key.rpartition("/")[2] == PROBE_DIRECTIONS:
             continue
-        if run.location.exists(key):
-            there.write_record(key, run.location.read(key))
-    there.write_record(LEFT_OUT_FILE, left_out_record(run.root.identity, arrays))
-    there.write_record(RUN_FILE, run.location.read(RUN_FILE))  # last: without it there is no run
-    return open_run(there, allow_partial)
+        yield key
+
+
+def _write_copy(run: Run, target: Location, keys: Sequence[str], arrays: Collection[str]) -> None:
+    for key in keys:
+        target.write_record(key, run.location.read(key))
+    target.write_record(LEFT_OUT_FILE, left_out_record(run.root.identity, arrays))
+    target.write_record(RUN_FILE, run.location.read(RUN_FILE))  # last: without it there is no run

@@ -1,6 +1,6 @@
 """Drift of every category from one run to another: transfer, own probes, directions, likeness, and a verdict."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -20,6 +20,7 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.study.drift.letter_lens import lens_accuracy
 from probe_kit.study.drift.transfer import Agreement, ProbedRun, Transfer, agreement, transfer
 from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results
 
 FRAME = "first_frame_sha256"
@@ -93,19 +94,28 @@ class CategoryDrift:
 
 
 def measure_drift(
-    before: RunReader, after: RunReader, view: str = "mean", labels: Mapping[str, str] | None = None
+    before: RunReader,
+    after: RunReader,
+    view: str = "mean",
+    labels: Mapping[str, str] | None = None,
+    probes: Sequence[ProbeResults | None] = (None, None),
 ) -> list[CategoryDrift]:
     """Drift of every category that both runs were probed in, in one view.
 
     Probes are the stored ones of the first captured inference. Frames and words must be the same for a transfer:
-    otherwise only own accuracies are given. labels: names of the runs by location.
+    otherwise only own accuracies are given. labels: names of the runs by location. probes: of both runs, the
+    newest stored ones where None.
     Raises NoProbesError, UnknownSiteError for a view that was not probed, and UsageError where the backbones have
     no site of one name and width in common.
     """
-    sides = [ProbedRun(run, load_results(run)) for run in (before, after)]
+    sides = [
+        ProbedRun(run, load_results(run) if results is None else results)
+        for run, results in zip((before, after), probes, strict=True)
+    ]
     places = str(before.location), str(after.location)
     runs, pairs = ([before, after], [places]) if places[0] != places[1] else ([before], [])
-    table = retention_table(runs, [view], labels=labels, pairs=pairs)
+    keys = [side.results.key for side in sides[: len(runs)]]
+    table = retention_table(runs, [view], labels=labels, pairs=pairs, keys=keys)
     rows = {(row.run.location, row.category): row for row in table.rows if row.view == view}
     gaps = {row.category: row for row in table.differences if row.view == view}
     names = dict.fromkeys(row.category for row in table.rows)

@@ -5,10 +5,20 @@ from collections.abc import Hashable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from probe_kit._system.drafts import draft_of, full_disk_in_words, move_draft
 from probe_kit._system.markdown_text import markdown_safe
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import UsageError
-from probe_kit.study.archive import PACK_FILE, SUMS_FILE, TABLES, Pack, files_of, open_archive, write_sums
+from probe_kit.study.archive import (
+    PACK_FILE,
+    SUMS_FILE,
+    TABLES,
+    Pack,
+    check_sums,
+    files_of,
+    open_archive,
+    write_sums,
+)
 from probe_kit.study.packing.pack import pack_study
 from probe_kit.study.reading import LoadedStudy, load_study
 from probe_kit.study.tables.stored_runs import open_cell
@@ -26,15 +36,34 @@ _COLUMNS = {
 """Of the episodes of a run, those that are published, as far as a run has them: no text of an item."""
 
 
-def write_data_set(study: LoadedStudy, folder: Path, partial: bool = False, licence: str | None = None) -> Pack:
-    """Write the data set of a study to `folder`, which must not exist.
+def write_data_set(
+    study: LoadedStudy, folder: Path, partial: bool = False, licence: str | None = None, again: bool = False
+) -> Pack:
+    """Write the data set of a study to `folder`, whole or not at all.
 
     partial: leave out what is missing. licence: as the hub spells it, such as `cc-by-4.0`; named in the card.
-    Raises UsageError where anything lies there, MissingExtraError without pyarrow, and what `pack_study` raises.
+    again: accept a folder that holds this very data set, such as after an upload that failed.
+    Raises UsageError where anything else lies there, DiskSpaceError, MissingExtraError without pyarrow, and what
+    `pack_study` raises.
     """
-    parquet = require("pyarrow.parquet", "export")
-    if folder.exists():
+    require("pyarrow.parquet", "export")
+    if folder.exists() and not again:
         raise UsageError(f"{folder} exists; choose another --out or remove it")
+    with full_disk_in_words(folder), draft_of(folder) as draft:
+        draft.mkdir()
+        pack = _write(study, draft, partial, licence)
+        if not folder.exists():
+            move_draft(draft, folder)
+            return pack
+        sums = folder / SUMS_FILE
+        if not sums.is_file() or data_set_version(folder) != data_set_version(draft):
+            raise UsageError(f"{folder} exists and holds something else; choose another --out or remove it")
+        check_sums(folder)
+    return pack
+
+
+def _write(study: LoadedStudy, folder: Path, partial: bool, licence: str | None) -> Pack:
+    parquet = require("pyarrow.parquet", "export")
     pack = pack_study(study, folder / ARCHIVE, partial)
     packed = load_study(folder / ARCHIVE)
     table = _episodes(packed)
@@ -98,8 +127,8 @@ def _card(study: LoadedStudy, pack: Pack, table: "pd.DataFrame", licence: str | 
 def _words(study: LoadedStudy, pack: Pack, episodes: int) -> Iterator[str]:
     yield f"# {markdown_safe(study.study.name)}"
     yield ""
-    yield f"A study made with probe_kit {pack.version}: {len(pack.keys)} runs, {episodes:,} episodes."
-    yield markdown_safe(f"Suite: {pack.suite['identity']}. Left out: {', '.join(pack.left_out)}.")
+    yield f"A study made with probe_kit {pack.version}: {len(pack.runs)} runs, {episodes:,} episodes."
+    yield markdown_safe(f"Suite: {pack.suite.identity}. Left out: {', '.join(pack.left_out)}.")
     yield ""
     yield f"* `{EPISODES}`: a row per episode of every run"
     yield f"* `{TABLES}/`: every table as JSON, Markdown and LaTeX"

@@ -1,20 +1,36 @@
 """Packing of a study: its runs without activations, its tables, and their sums."""
 
 import json
-import tempfile
 from collections.abc import Collection
 from pathlib import Path
 from typing import Literal, get_args
 
 import probe_kit.version
-from probe_kit.errors import ProbeKitError, RunIncompleteError, UsageError
+from probe_kit._system.drafts import draft_of, full_disk_in_words, move_draft
+from probe_kit.errors import (
+    DiskSpaceError,
+    ProbeKitError,
+    RunIncompleteError,
+    SettingsMismatchError,
+    UsageError,
+)
 from probe_kit.extract import copy_run
 from probe_kit.retention.formats.latex import latex_table
-from probe_kit.study.archive import PACK_FILE, RUNS, STUDY_FILE, TABLES, Pack, write_sums, write_zip
+from probe_kit.study.archive import (
+    PACK_FILE,
+    RUNS,
+    STUDY_FILE,
+    TABLES,
+    Pack,
+    PackedRun,
+    PackedSuite,
+    write_sums,
+    write_zip,
+)
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.tables.formats import markdown_text, table_record
 from probe_kit.study.tables.make import make_table
-from probe_kit.study.tables.stored_runs import stored_location
+from probe_kit.study.tables.stored_runs import open_stored
 
 Extra = Literal["pictures", "trajectories", "directions"]
 EXTRAS: tuple[Extra, ...] = get_args(Extra)
@@ -30,32 +46,32 @@ def pack_study(study: LoadedStudy, out: Path, partial: bool = False, extras: Col
     """
     if out.exists():
         raise UsageError(f"{out} exists; choose another --out or remove it")
-    if out.suffix != ".zip":
-        return _pack(study, out, partial, extras)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.stem}-") as draft:
-        folder = Path(draft) / "pack"
-        found = _pack(study, folder, partial, extras)
-        whole = Path(draft) / out.name
-        write_zip(folder, whole)
-        whole.rename(out)
-    return found
+    with full_disk_in_words(out), draft_of(out) as draft:
+        folder = draft if out.suffix != ".zip" else draft.with_name("pack")
+        pack = _pack(study, folder, partial, extras)
+        if folder != draft:
+            write_zip(folder, draft)
+        move_draft(draft, out)
+    return pack
 
 
 def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Extra]) -> Pack:
     missing = {cell.name: cell.unavailable for cell in study.cells if cell.unavailable}
-    keys: dict[str, str] = {}
+    runs: dict[str, PackedRun] = {}
     for cell in study.cells:
         if cell.unavailable:
             continue
         try:
+            run = open_stored(study, cell, partial)
             copy_run(
-                stored_location(study, cell),
+                run.location,
                 cell.location(str(folder / RUNS)),
                 allow_partial=partial,
                 **{extra: extra in extras for extra in EXTRAS},
             )
-            keys[cell.name] = cell.key
+            runs[cell.name] = PackedRun(key=cell.key, settings_sha256=run.settings_sha256)
+        except (SettingsMismatchError, DiskSpaceError):
+            raise
         except ProbeKitError as error:
             if not partial:
                 raise RunIncompleteError(
@@ -64,9 +80,14 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Ex
                 ) from error
             missing[cell.name] = str(error)
     missing |= _write_tables(study, folder / TABLES, partial)
-    suite = {"identity": study.suite.identity, "items": dict(study.suite.items)}
-    left_out = ["activations", *(extra for extra in EXTRAS if extra not in extras)]
-    pack = Pack(study.study.name, probe_kit.version.__version__, suite, keys, missing, left_out)
+    pack = Pack(
+        study=study.study.name,
+        version=probe_kit.version.__version__,
+        suite=PackedSuite(identity=study.suite.identity, items=dict(study.suite.items)),
+        runs=runs,
+        missing=missing,
+        left_out=["activations", *(extra for extra in EXTRAS if extra not in extras)],
+    )
     (folder / STUDY_FILE).write_bytes(study.file.read_bytes())
     (folder / PACK_FILE).write_text(pack.to_json(), encoding="utf-8")
     write_sums(folder)

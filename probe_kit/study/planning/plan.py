@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, UsageError
 from probe_kit.extract import open_run
-from probe_kit.extract.store.locations.locate import locate
 from probe_kit.study.cells import Cell
 from probe_kit.study.ledger import NOT_TRIED_AGAIN, Entry, Failure, Ledger, name_of, settings_changed
+from probe_kit.study.matching import check_run_of_cell
 from probe_kit.study.mistakes import unknown
 from probe_kit.study.planning.cost import Cost, Work, cost_of
 from probe_kit.study.planning.planned_probes import (
@@ -19,6 +19,7 @@ from probe_kit.study.planning.planned_probes import (
     what_decides,
 )
 from probe_kit.study.reading import LoadedStudy
+from probe_kit.study.tables.stored_runs import noted_run
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
@@ -167,7 +168,10 @@ class _Stored:
     def _look(self, cell: Cell) -> "Run | ProbeKitError":
         if cell.name not in self._runs:
             try:
-                self._runs[cell.name] = open_run(locate(self._location(cell)), allow_partial=True)
+                location, settings_sha256 = noted_run(self._study, cell)
+                run = open_run(location, allow_partial=True)
+                check_run_of_cell(run, cell, self._study.cells, settings_sha256, self._study.file)
+                self._runs[cell.name] = run
             except ProbeKitError as error:
                 self._runs[cell.name] = error
         return self._runs[cell.name]
@@ -175,13 +179,9 @@ class _Stored:
     def _entry(self, cell: Cell) -> Entry:
         return self._entries.get(name_of(cell)) or Entry(cell=cell.name, settings=cell.known)
 
-    def _location(self, cell: Cell) -> str:
-        played = self._entry(cell).played
-        return (played.served_by if played else "") or cell.location(self._study.study.folder)
-
     def planned(self, cell: Cell) -> PlannedCell:
         """A cell with what is stored of it."""
-        location, entry = self._location(cell), self._entry(cell)
+        location, entry = str(noted_run(self._study, cell)[0]), self._entry(cell)
         if cell.unavailable:
             return PlannedCell(cell, location, "skipped", 0, f"skipped: {cell.unavailable}")
         run = self._look(cell)

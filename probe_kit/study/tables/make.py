@@ -1,14 +1,14 @@
 """Making of a study's named tables."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from probe_kit.errors import NoProbesError, UsageError
+from probe_kit._system.bounded_json import parse_json
+from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.extract.store.provenance import differences
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
@@ -34,12 +34,14 @@ from probe_kit.study.tables.rates import (
     success_table,
     vlm_table,
 )
-from probe_kit.study.tables.stored_runs import StoredRun, StoredRuns, of_blocks, stored_runs
-from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.results.store import load_results
-
-if TYPE_CHECKING:
-    from probe_kit.extract import Run
+from probe_kit.study.tables.stored_runs import (
+    StoredRun,
+    StoredRuns,
+    of_blocks,
+    probe_keys,
+    stored_runs,
+    study_probes,
+)
 
 _OF_RUNS: Mapping[str, Callable[[RetentionTable], NamedTable]] = {
     "success": success_table,
@@ -62,13 +64,13 @@ def make_table(study: LoadedStudy, name: str, partial: bool = False) -> NamedTab
         raise UsageError(unknown("table", name, list(study.study.tables)))
     table = study.study.tables[name]
     if study.archive is not None and table.kind == "drift":
-        return _packed(study.archive, name)
+        return _packed(study.archive, study.pack, name)
     runs = stored_runs(study, _wanted(study, table), partial, _categories(table))
     if not runs.found:
         raise UsageError(
             f"no run of the table {name!r} is stored. Play them with `probe-kit study run {study.file}`"
         )
-    made = _made(study, table, runs, name).with_note([*runs.missing, *runs.unfinished, *_versions(runs)])
+    made = _made(study, table, runs, name, partial).with_note([*runs.missing, *runs.unfinished, *_versions(runs)])
     return replace(made, is_partial=bool(runs.unfinished), numbers=_named_runs(made.numbers, runs))
 
 
@@ -92,12 +94,15 @@ def _categories(table: TableTable) -> tuple[str, ...] | None:
     return None if table.categories is None else slugs(table.categories)
 
 
-def _packed(archive: Path, name: str) -> NamedTable:
+def _packed(archive: Path, pack: Pack | None, name: str) -> NamedTable:
     """A table as it was packed, because it is made of activations."""
+    file = archive / TABLES / f"{name}.json"
     try:
-        return table_of_record(json.loads((archive / TABLES / f"{name}.json").read_text(encoding="utf-8")))
+        return table_of_record(parse_json(file.read_bytes()))
+    except (ValueError, KeyError, TypeError) as error:
+        raise RunDamagedError(f"{file} is no record of a table ({error!r}). Fetch the archive again") from error
     except FileNotFoundError:
-        why = Pack.read(archive).missing.get(f"table {name}", "it was not made")
+        why = ({} if pack is None else pack.missing).get(f"table {name}", "it was not made")
         raise UsageError(f"the archive holds no table {name!r}: {why}") from None
 
 
@@ -108,33 +113,40 @@ def _versions(runs: StoredRuns) -> list[str]:
     return [f"runs were made with different {different}"] if different else []
 
 
-def _made(study: LoadedStudy, table: TableTable, runs: StoredRuns, name: str) -> NamedTable:
+def _made(study: LoadedStudy, table: TableTable, runs: StoredRuns, name: str, partial: bool) -> NamedTable:
     labels, opened = runs.labels(study), [one.run for one in runs.found]
+    none = [""] * len(opened)
     if table.kind in _OF_RUNS:
-        return _OF_RUNS[table.kind](retention_table(opened, labels=labels, pairs=()))
+        return _OF_RUNS[table.kind](retention_table(opened, labels=labels, pairs=(), keys=none))
     if table.kind == "score":
-        found, further = retention_table(opened, labels=labels, pairs=()), table.elsewhere
+        scores, further = retention_table(opened, labels=labels, pairs=(), keys=none), table.elsewhere
         if further is None:
-            return score_table(found)
+            return score_table(scores)
         named = {one.place: one.cell.model for one in runs.found}
         values = {place: further.values[name] for place, name in named.items() if name in further.values}
-        return score_table(found, further.title, further.source, values)
+        return score_table(scores, further.title, further.source, values)
     if table.kind == "vlm-vla":
         read = [scored(run, "text") for run in opened]
         return vlm_vla_table(vlm_vla_differences(read, labels, _sources(study, runs.found)))
     if table.kind in _OF_PROBED_RUNS:
-        probed, chosen = [one.probed.in_wording() for one in runs.found], _categories(table)
-        return _OF_PROBED_RUNS[table.kind](retention_table(probed, labels=labels, pairs=(), categories=chosen))
+        probed = [(one, one.probed.in_wording()) for one in runs.found]
+        keys, categories = probe_keys(study, probed, partial), _categories(table)
+        return _OF_PROBED_RUNS[table.kind](
+            retention_table([run for _, run in probed], labels=labels, pairs=(), categories=categories, keys=keys)
+        )
     if table.kind == "drift":
-        return _drift(study, study.study.drift[table.drift or ""], runs, labels, name)
+        return _drift(study, study.study.drift[table.drift or ""], runs, labels, name, partial)
     if table.kind == "stages":
-        return stages_table(_joins(study, runs, labels))
+        return stages_table(_joins(study, runs, labels, partial))
     comparison = study.study.comparisons[table.comparison or ""]
     if comparison.groups is not None:
-        found = retention_table(_groups(study, comparison.groups, runs), labels=labels)
-        return group_table(found, f"Groups of models: {name}")
+        groups = _groups(study, comparison.groups, runs)
+        keys = probe_keys(study, [(one, one.run) for own in groups.values() for one in own], partial)
+        grouped = {group: [one.run for one in own] for group, own in groups.items()}
+        return group_table(retention_table(grouped, labels=labels, keys=keys), f"Groups of models: {name}")
     pairs, what = _pairs(comparison, runs.found), "Ablation" if comparison.chain is None else "Chain"
-    return difference_table(retention_table(opened, labels=labels, pairs=pairs), f"{what}: {name}")
+    keys = probe_keys(study, [(one, one.run) for one in runs.found], partial)
+    return difference_table(retention_table(opened, labels=labels, pairs=pairs, keys=keys), f"{what}: {name}")
 
 
 def _wanted(study: LoadedStudy, table: TableTable) -> Callable[[Cell], Selection | None]:
@@ -204,7 +216,12 @@ def _sources(study: LoadedStudy, found: tuple[StoredRun, ...]) -> list[tuple[str
 
 
 def _drift(
-    study: LoadedStudy, table: DriftTable, runs: StoredRuns, labels: Mapping[str, str], name: str
+    study: LoadedStudy,
+    table: DriftTable,
+    runs: StoredRuns,
+    labels: Mapping[str, str],
+    name: str,
+    partial: bool,
 ) -> NamedTable:
     """Every pair of the file whose runs are both stored."""
     there = {one.cell.name: one for one in runs.found}
@@ -212,10 +229,12 @@ def _drift(
     for cells in ([_side(study.cells, side) for side in pair] for pair in table.pairs):
         for before, after in ((there.get(one.name), there.get(other.name)) for one, other in product(*cells)):
             if before is not None and after is not None and before.cell.seed == after.cell.seed:
-                sides = (before.probed.in_wording(), after.probed.in_wording())
+                sides = [study_probes(study, one, one.probed.in_wording(), partial) for one in (before, after)]
                 shown = set(before.run.items["category"])
                 named = {one.place: labels[one.place] for one in (before, after)}
-                each = measure_drift(*sides, table.view, named)
+                each = measure_drift(
+                    before.probed.in_wording(), after.probed.in_wording(), table.view, named, sides
+                )
                 found[labels[before.place], labels[after.place]] = [one for one in each if one.category in shown]
     return drift_table(found, name, table.view)
 
@@ -227,12 +246,13 @@ def _side(cells: Sequence[Cell], side: str) -> list[Cell]:
     return [cell for cell in own if cell.way == own[0].way]
 
 
-def _joins(study: LoadedStudy, runs: StoredRuns, labels: Mapping[str, str]) -> list[KnownUsedTable]:
+def _joins(study: LoadedStudy, runs: StoredRuns, labels: Mapping[str, str], partial: bool) -> list[KnownUsedTable]:
     """Every policy run joined with the run of its VLM, with the probes of the policy where there are any."""
     opened = {one.place: one for one in runs.found}
+    probes = {place: study_probes(study, one, one.probed, partial) for place, one in opened.items()}
     joins = [
         replace(
-            match_runs(scored(opened[vlm].run, "text"), opened[policy].run, _probes(opened[policy].probed)),
+            match_runs(scored(opened[vlm].run, "text"), opened[policy].run, probes[policy]),
             asked=labels[vlm],
             acted=labels[policy],
         )
@@ -241,13 +261,6 @@ def _joins(study: LoadedStudy, runs: StoredRuns, labels: Mapping[str, str]) -> l
     return correct_joins(joins)
 
 
-def _probes(run: "Run") -> ProbeResults | None:
-    try:
-        return load_results(run)
-    except NoProbesError:
-        return None
-
-
-def _groups(study: LoadedStudy, names: list[str], runs: StoredRuns) -> "dict[str, list[Run]]":
+def _groups(study: LoadedStudy, names: list[str], runs: StoredRuns) -> dict[str, list[StoredRun]]:
     models = study.study.models
-    return {name: [one.run for one in runs.found if name in models[one.cell.model].groups] for name in names}
+    return {name: [one for one in runs.found if name in models[one.cell.model].groups] for name in names}

@@ -6,12 +6,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit._terminal.console import say
-from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, UsageError
+from probe_kit.errors import (
+    ProbeKitError,
+    RunIncompleteError,
+    RunNotFoundError,
+    SettingsMismatchError,
+    UsageError,
+)
 from probe_kit.extract import open_run
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.ledger import Ledger
+from probe_kit.study.matching import check_run_of_cell, check_same_items
 from probe_kit.study.reading import LoadedStudy, load_study, shipped_studies
+from probe_kit.study.schema import ProbesTable
+from probe_kit.train.probe_sweep import probe_settings
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.store import is_ours, is_stored, load_results, read_probes
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
@@ -62,7 +73,8 @@ def stored_runs(
     """Open what is stored of a study. wanted: of a cell, what of it a table shows; None leaves it out.
 
     partial: accept runs that are missing or unfinished; they are named. categories: slugs, all by default.
-    Raises RunIncompleteError for a run that is missing, unfinished or damaged, unless `partial`.
+    Raises RunIncompleteError for a run that is missing, unfinished or damaged, unless `partial`, and
+    SettingsMismatchError for a run that is not its cell's, and RunDamagedError for a damaged ledger.
     """
     found, missing, unfinished, models = [], [], [], []
     for cell in study.cells:
@@ -74,11 +86,14 @@ def stored_runs(
         if cell.unavailable:
             missing.append(f"{label} is missing: {cell.unavailable}")
             continue
+        noted_run(study, cell)  # a damaged record is no missing run, and has an advice of its own
         try:
             own = open_cell(study, cell, selection, partial, categories)
             found.append(own)
             if done := _part_done(own.run):
                 unfinished.append(f"{label} has {done} episodes")
+        except SettingsMismatchError:
+            raise
         except ProbeKitError as error:
             if not partial:
                 raise RunIncompleteError(
@@ -86,6 +101,7 @@ def stored_runs(
                     " or accept what is there (--partial)"
                 ) from error
             unfinished.append(f"{label} is missing: {_why_missing(study, cell, error)}")
+    check_same_items([one.run for one in found])
     return StoredRuns(tuple(found), tuple(missing), tuple(unfinished), tuple(models))
 
 
@@ -108,10 +124,37 @@ def _seen(error: ProbeKitError) -> str:
     return str(error).partition(". ")[0].removesuffix(".")
 
 
-def stored_location(study: LoadedStudy, cell: Cell) -> "Location":
-    """Where the run of a cell lies: in its own place, or where an equal run serves it."""
-    out = study.study.folder
-    return locate(Ledger(out).location(cell, out))
+def noted_run(study: LoadedStudy, cell: Cell) -> tuple["Location", str | None]:
+    """The location of a cell's run, and the hash of its settings and weights, by ledger or archive.
+
+    The hash is None without a record. Raises RunDamagedError for a record that was changed.
+    """
+    home = locate(cell.location(study.study.folder))
+    if study.pack is not None:
+        packed = study.pack.runs.get(cell.name)
+        return home, None if packed is None else packed.settings_sha256
+    played = Ledger(study.study.folder).of(cell).played
+    if played is None:
+        return home, None
+    return locate(played.served_by) if played.served_by else home, played.settings_sha256
+
+
+def open_stored(study: LoadedStudy, cell: Cell, partial: bool = False) -> "Run":
+    """The run of a cell, found to be of its settings, weights and suite, and to hold all items of its blocks.
+
+    partial: accept missing episodes. Raises what `open_run` raises, RunIncompleteError for a run of fewer items,
+    and SettingsMismatchError for the run of another cell.
+    """
+    location, settings_sha256 = noted_run(study, cell)
+    run = open_run(location, allow_partial=partial)
+    check_run_of_cell(run, cell, study.cells, settings_sha256, study.file)
+    planned = run.items["category"].value_counts().to_dict()
+    expected = cell.selection.counts(cell.suite)
+    fewer = [name for name, count in expected.items() if planned.get(name, 0) < count]
+    if fewer and not partial:
+        name = fewer[0]
+        raise RunIncompleteError(f"{run.location} has {planned.get(name, 0)} of {expected[name]} items of {name}")
+    return run
 
 
 def open_cell(
@@ -121,12 +164,61 @@ def open_cell(
     partial: bool = False,
     categories: Sequence[str] | None = None,
 ) -> StoredRun:
-    """The stored run of a cell, restricted to a selection. Raises what `open_run` raises."""
-    run = open_run(stored_location(study, cell), allow_partial=partial)
+    """The stored run of a cell, restricted to a selection. Raises what `open_stored` raises."""
+    run = open_stored(study, cell, partial)
     of_probes = (of_blocks(table.runs)(cell) for table in study.study.probes.values())
     fitted = next((one for one in of_probes if one is not None), None)
     shown = _part(run, cell, selection, categories)
     return StoredRun(cell, shown, shown if fitted is None else _part(run, cell, fitted, None))
+
+
+def probe_keys(study: LoadedStudy, runs: Sequence[tuple[StoredRun, "Run"]], partial: bool) -> list[str]:
+    """Of each run the key of the probes that the file's tables fit to it; empty for none.
+
+    runs: what is stored of a cell, and the part of it that is shown. Probes that were fitted otherwise, by hand or
+    for a former state of the file, give no number.
+    Raises RunIncompleteError for a run without the probes of the file, unless `partial`.
+    """
+    return [_probe_key(study, stored, run, partial) for stored, run in runs]
+
+
+def study_probes(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> ProbeResults | None:
+    """The probes of the file that are stored of a run, None without any. Raises as `probe_keys`."""
+    (key,) = probe_keys(study, [(stored, run)], partial)
+    return load_results(run, key) if key else None
+
+
+def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> str:
+    tables = [
+        (name, table)
+        for name, table in study.study.probes.items()
+        if table.target == "correct" and of_blocks(table.runs)(stored.cell) is not None
+    ]
+    if not tables or not run.streams:
+        return ""
+    if stored_keys := _stored_keys(tables, run):
+        return stored_keys[-1]
+    if partial or _stored_keys(tables, stored.probed.in_wording()):  # then other items are shown than were fitted
+        return ""
+    others = [key for key, bundle in read_probes(run.location).items() if is_ours(bundle)]
+    also = f" It has those of other settings: {', '.join(others)}." if others else ""
+    names = ", ".join(f"[probes.{name}]" for name, _ in tables)
+    raise RunIncompleteError(
+        f"{stored.cell.name} has no probes of {names}.{also} Fit them with `probe-kit study run {study.file}`, or "
+        "accept what is there (--partial)"
+    )
+
+
+def _stored_keys(tables: Sequence[tuple[str, ProbesTable]], run: "Run") -> list[str]:
+    """The keys of those probes of the tables that are stored of a run."""
+    return [key for _, table in tables if is_stored(run.location, key := _key_of(table, run))]
+
+
+def _key_of(table: ProbesTable, run: "Run") -> str:
+    """The key of the probes that a table of the file fits to a run."""
+    return probe_settings(
+        run, views=table.views, permutations=table.permutations, target=table.target, seed=table.seed
+    ).key
 
 
 def _part(run: "Run", cell: Cell, selection: Selection, categories: Sequence[str] | None) -> "Run":

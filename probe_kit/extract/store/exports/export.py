@@ -10,7 +10,7 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from probe_kit._system.drafts import draft_of, write_whole
+from probe_kit._system.drafts import draft_of, full_disk_in_words, write_whole
 from probe_kit.errors import UsageError
 from probe_kit.extract.run_layout import MEAN_VIEW, ExportFormat, SaeDtype
 from probe_kit.extract.store.exports.lerobot_dataset import write_lerobot
@@ -50,7 +50,7 @@ def export_run(
     Default are all sites, and all pooled views in Parquet, `mean` in matrices. dtype, seed: of `sae` alone.
 
     Raises UsageError for another format, an option that a format does not have, or a file that exists;
-    UnknownSiteError, MissingExtraError, RunDamagedError.
+    UnknownSiteError, MissingExtraError, RunDamagedError, DiskSpaceError.
     """
     check_format(style)
     if style not in OF_VECTORS and (sites is not None or view is not None):
@@ -65,7 +65,7 @@ def export_run(
     run = open_run(path, allow_partial)
     if not run.streams and style != LEROBOT:
         raise UsageError(f"{path} has no activations to export; its episodes are in `open_run(...).episodes`")
-    with draft_of(out) as draft:
+    with full_disk_in_words(out), draft_of(out) as draft:
         if style in OF_VECTORS:
             choices = choose(run, sites, view or (MEAN_VIEW if style == SAE else None))
             if style == SAE:

@@ -1,6 +1,7 @@
 """A shuffled memory map per site with a vector per row, to train sparse autoencoders on."""
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,6 +90,8 @@ def _write_matrices(
         site: open_memmap(file, "w+", dtype, shape)  # type: ignore[no-untyped-call]
         for site, file in files.items()
     }
+    for file in files.values():
+        _reserve(file)
     rows, done = RowOrigins.of(count), 0
     for block in blocks(run, [choice]):
         end = done + block.tokens.size
@@ -100,6 +103,14 @@ def _write_matrices(
     for one in maps.values():
         one.flush()
     return rows, files
+
+
+def _reserve(file: Path) -> None:
+    """Give a file its blocks now: on a full disk, writing into a mapped file would end the process by SIGBUS."""
+    reserve = getattr(os, "posix_fallocate", None)
+    if reserve is not None:
+        with file.open("r+b") as opened:
+            reserve(opened.fileno(), 0, file.stat().st_size)
 
 
 def _as_stored(values: NDArray[np.float32], dtype: np.dtype[Any], site: Site, run: Run) -> NDArray[Any]:

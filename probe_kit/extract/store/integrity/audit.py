@@ -24,7 +24,7 @@ from probe_kit.extract.store.format.commits import (
 from probe_kit.extract.store.format.left_out import is_left_out
 from probe_kit.extract.store.format.plans import RESTORE, count_plans
 from probe_kit.extract.store.format.root import Root, read_root
-from probe_kit.extract.store.integrity.deep import content_problems
+from probe_kit.extract.store.integrity.deep import content_problems, reading_problems
 from probe_kit.extract.store.integrity.orphans import stray_keys
 from probe_kit.extract.store.label import read_label
 from probe_kit.extract.store.locations.locate import locate
@@ -66,8 +66,9 @@ class Audit:
 def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
     """Compare a run with what it says of itself.
 
-    Structure, plan, metadata, commits, sizes, and what is derived; with `deep` every byte, and columns against
-    rows. Problems are collected, not raised. Raises RunNotFoundError if there is no run at `path`.
+    Structure, plan, metadata, commits, sizes, and what is derived; with `deep` every byte, columns against rows,
+    and every reader of the run and of its stored results. Problems are collected, not raised.
+    Raises RunNotFoundError if there is no run at `path`.
     """
     location = locate(path)
     while True:
@@ -109,6 +110,7 @@ def _audit(location: Location, deep: bool) -> Audit:
     problems += bundle_problems(location, deep)
     if deep:
         problems += content_problems(root, commits, columns, sound=not problems)
+        problems += [] if problems else reading_problems(root)
     return Audit(
         path=str(location),
         committed=len(commits),

@@ -1,17 +1,24 @@
-"""Deep verification of a run: every byte against its hash, and the columns against the rows."""
+"""Deep verification of a run: every byte against its hash, the columns against the rows, and every reader.
+
+Reading refuses more than other bytes, such as probes in the folder of interventions. So verification calls the
+functions that read: it says no wherever one of them would.
+"""
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from importlib import import_module
 from itertools import islice
 
 import numpy as np
 
-from probe_kit.errors import RunDamagedError
-from probe_kit.extract.run_layout import DATA
+from probe_kit.errors import MissingExtraError, ProbeKitError, RunDamagedError
+from probe_kit.extract.run_layout import DATA, INTERVENTIONS, PROBES
 from probe_kit.extract.store.format.columns import Columns
 from probe_kit.extract.store.format.commits import Commit, pictures_of, redo, redo_picture
 from probe_kit.extract.store.format.hashes import digest_of
+from probe_kit.extract.store.format.plans import RESTORE
 from probe_kit.extract.store.format.root import Root
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run
@@ -20,6 +27,11 @@ from probe_kit.extract.store.sealing import columns_of_rows
 READERS = min(8, max(4, os.cpu_count() or 1))
 """Objects that are read and hashed at once: both let other threads work."""
 BATCH = 256
+RESULT_READERS: Mapping[str, str] = {
+    PROBES: "probe_kit.train.every_result:readers_of_results",
+    INTERVENTIONS: "probe_kit.intervene.results.every_result:readers_of_results",
+}
+"""By home of bundles, the function that gives a reader per stored result of a run. It lies in a folder above."""
 
 Job = tuple[str, int, str, str, str]
 """Key, length, checksum, whose it is, and what to do."""
@@ -37,6 +49,37 @@ def content_problems(
     yield from found
     if sound and not found and columns is not None:
         yield from _differences(Run(root.location))
+
+
+def reading_problems(root: Root) -> Iterator[str]:
+    """The complaints of all readers of a run and of the results that are stored with it."""
+    run = Run(root.location)
+    yield from _complaints(run.check_records)
+    yield from _complaints(lambda: (run.episodes, run.items, run.failed))
+    if not run.commits():
+        return
+    if run.has_trajectories:
+        for row in range(len(run.episodes)):
+            yield from _complaints(partial(run.trajectory, row))
+    for name in RESULT_READERS.values():
+        module, _, function = name.partition(":")
+        listing = getattr(import_module(module), function)
+        readers = list[Callable[[], object]]()
+        yield from _complaints(lambda listing=listing, readers=readers: readers.extend(listing(run)))
+        for reader in readers:
+            yield from _complaints(reader)
+
+
+def _complaints(reader: Callable[[], object]) -> Iterator[str]:
+    """The error of a reader, if it raises one. A library that is not installed is none of the run's."""
+    try:
+        reader()
+    except MissingExtraError:
+        return
+    except ProbeKitError as error:
+        yield str(error)
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, OSError) as error:
+        yield f"a stored result cannot be read ({type(error).__name__}: {error}). {RESTORE}"
 
 
 def _committed(commits: Mapping[int, Commit]) -> Iterator[Job]:
