@@ -7,6 +7,8 @@ from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.capabilities import MERGED
 from probe_kit.hooks.family import Family
 
+RESIZES = ("nvidia", "lerobot")
+"""Code that brings pictures to their size in two ways."""
 BRIDGE = ("residual", "attention", "mlp")
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "bridge": BRIDGE, "expert": QUANTITIES},
@@ -51,6 +53,8 @@ FAMILIES = (
         packages=(("diffusers", "groot"),),
         options=(
             Option("embodiment", str, "Tag in NVIDIA's layout, such as libero_sim.", "the only one"),
+            Option("letterbox", bool, "Black bars make pictures square first.", "as the files say, or false"),
+            Option("resize", str, "Whose code resizes pictures.", "as the layout", RESIZES),
             Option("vlm", str, "Folder or hub id of its Qwen3-VL; no weights.", "as config.json says"),
         ),
         interventions=INTERVENTIONS,

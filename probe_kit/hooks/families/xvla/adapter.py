@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from lerobot.utils.constants import IMAGENET_STATS
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
@@ -108,6 +109,10 @@ class Xvla(LerobotPolicy):
         domain = evaluation.domain if isinstance(evaluation, XvlaChoice) else None
         config.steps = read_steps(folder, domain, tuple(config.image_features))
         config.tokenizer_max_length = config.steps.length or config.tokenizer_max_length
+        config.picture = evaluation.picture or ("padded" if config.resize_imgs_with_padding else None)
+        if config.picture and config.resize_imgs_with_padding is None:
+            height, width = next(iter(config.image_features.values())).shape[-2:]
+            config.resize_imgs_with_padding = (width, height)
         return config
 
     @classmethod
@@ -138,8 +143,25 @@ class Xvla(LerobotPolicy):
         return found
 
     def further_settings(self) -> dict[str, str]:
-        """Whose soft prompts are read."""
-        return {"domain": str(self.steps.domain)}
+        """Whose soft prompts are read, and how pictures come to their size."""
+        return {"domain": str(self.steps.domain), "picture": str(self.config.picture)}
+
+    def _notes(self) -> tuple[str, ...]:
+        if self.config.picture is None:
+            how = "are read at the size that they have; X-VLA's authors squash them (-M picture=squashed)"
+        else:
+            size = " x ".join(map(str, self.config.resize_imgs_with_padding))
+            squashed = f"squashed to {size}, bicubic, as X-VLA's authors; lerobot pads"
+            padded = f"padded to {size}, as lerobot; X-VLA's authors squash them (-M picture=squashed)"
+            how = f"are {squashed if self.config.picture == 'squashed' else padded}"
+        return (*super()._notes(), f"pictures {how}")
+
+    def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:
+        """(B, 3, H, W) in [0, 1]: squashed where that is chosen; lerobot's network pads any other."""
+        if self.config.picture == "squashed":
+            size = tuple(self.config.resize_imgs_with_padding)
+            images = [np.asarray(Image.fromarray(own).resize(size, Image.Resampling.BICUBIC)) for own in images]
+        return super().look(camera, images)
 
     def side_files(self) -> dict[str, Path]:
         """Also the tokenizer, where it is another folder's."""
