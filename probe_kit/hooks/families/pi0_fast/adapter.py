@@ -47,7 +47,7 @@ _LAST = slice(-1, None)
 class Decoding(Evaluation):
     """How action tokens are put out. captured: those that are sites. temperature: None for the checkpoint's.
 
-    lowercase: the instruction in lower case, as openpi has it; lerobot, which wrote the checkpoint, keeps its case.
+    lowercase: the instruction in lower case, as openpi has it; lerobot keeps its case.
     """
 
     captured: int = CAPTURED
@@ -263,14 +263,13 @@ def load_pi0_fast(
     """Load a lerobot pi0-FAST checkpoint; see `LerobotPolicy.load`.
 
     captured_tokens: how many of the action tokens are sites. temperature: 0 for the likeliest token; above, drawn
-    by each row's seed; None for the checkpoint's. lowercase: the instruction in lower case, as openpi has it. Raises UsageError for values outside of these.
+    by each row's seed; None for the checkpoint's. lowercase: the instruction in lower case, as openpi has it.
+    Raises UsageError for values outside of these.
     """
     decoding = Decoding(captured=captured_tokens, temperature=temperature, lowercase=lowercase)
     return Pi0Fast.load(checkpoint, device, dtype, random_weights, weights_seed, decoding)
 
 
-def check_pi0_fast_words(
-    checkpoint: str, instructions: Sequence[str], lowercase: bool = False, **_: Any
-) -> None:
+def check_pi0_fast_words(checkpoint: str, instructions: Sequence[str], lowercase: bool = False, **_: Any) -> None:
     """See `Family.words`."""
     Pi0Fast.check_words(checkpoint, instructions, Decoding(lowercase=lowercase))

@@ -35,8 +35,8 @@ FAMILIES = (
         notes=(
             "A checkpoint in lerobot's layout. Its configuration holds Florence-2's; the tokenizer "
             "facebook/bart-large is fetched where no tokenizer.json lies beside it. -M domain=N chooses the soft "
-            "prompts of another robot. Absolute poses cannot act here: --no-act. Pictures are padded as config.json says; the authors squash them "
-            "to 224 x 224, bicubic (-M picture=squashed)"
+            "prompts of another robot. Pictures are padded as config.json says; the authors squash them to 224 x "
+            "224, bicubic (-M picture=squashed). Absolute poses cannot act here: --no-act"
         ),
         verifier="probe_kit.hooks.families.xvla.verify:verify_xvla",
         config_types=("xvla",),

@@ -28,7 +28,7 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.views import PADDING
-from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
+from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation, Picture
 from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE, LerobotPolicy
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
@@ -305,15 +305,18 @@ def load_xvla(
     random_weights: bool = False,
     *,
     domain: int | None = None,
+    picture: Picture | None = None,
     weights_seed: int = 0,
 ) -> Xvla:
     """Load a lerobot X-VLA checkpoint; see `LerobotPolicy.load`.
 
-    domain: number of the robot's soft prompts; None for the one that the processor files name.
+    domain: number of the robot's soft prompts; None for the one that the processor files name. picture: `padded`
+    as lerobot or `squashed` as the authors; None for what `config.json` says.
     """
-    return Xvla.load(checkpoint, device, dtype, random_weights, weights_seed, XvlaChoice(domain=domain))
+    chosen = XvlaChoice(domain=domain, picture=picture)
+    return Xvla.load(checkpoint, device, dtype, random_weights, weights_seed, chosen)
 
 
-def check_xvla_words(checkpoint: str, instructions: Sequence[str], domain: int | None = None) -> None:
+def check_xvla_words(checkpoint: str, instructions: Sequence[str], domain: int | None = None, **_: Any) -> None:
     """See `Family.words`."""
     Xvla.check_words(checkpoint, instructions, XvlaChoice(domain=domain) if domain is not None else AS_STORED)
