@@ -26,6 +26,8 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     hub_name,
     is_on_hub,
     missing_weights,
+    pinned,
+    without_revision,
 )
 from probe_kit.hooks.checkpoints.file_checks import check_files
 from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
@@ -74,7 +76,8 @@ class Family:
     units: `module:function(checkpoint, **options)` that says whose units the actions get, and where they stand,
     from the small files; it raises UsageError where that has to be chosen. of_default: options that belong to the
     default checkpoint, and to no other; they count where they are not given.
-    files: patterns of the files of a hub repository that are needed.
+    files: patterns of the files of a hub repository that are needed. bare_adapters: whether a LoRA adapter needs
+    no config.json of its own, as the family reads its base's.
     home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
     `words_in`, of a family whose default checkpoint knows few words; empty for one that reads any text.
     Raises UsageError if an option is not declared as an `Option`.
@@ -109,6 +112,7 @@ class Family:
     units: str | None = None
     of_default: Mapping[str, Any] = MappingProxyType({})
     files: tuple[str, ...] = PATTERNS
+    bare_adapters: bool = False
     home: DefaultScene = RELEASED
     vocabulary: str = ""
 
@@ -181,6 +185,7 @@ class Family:
         merged = model.card.audit.get("adapter")
         model.card = replace(
             model.card,
+            checkpoint=pinned(model.card.checkpoint),
             settings={**said, **model.card.settings},
             notes=tuple(dict.fromkeys((*model.card.notes, *([merged] if merged else [])))),
             **self._source_of(model.card, place),
@@ -191,7 +196,7 @@ class Family:
         """What the card says of the source: a untrained network has none, a foreign checkpoint an unknown one."""
         if card.random_weights:
             return {"source": None, "source_weights": None}
-        own = place in (
+        own = without_revision(place) in (
             self.default_checkpoint,
             *(row.checkpoint for first in self.protocols.values() for row in first.rows),
         )
@@ -233,12 +238,18 @@ class Family:
         if place is not None and self.config_types and (fetch or not is_on_hub(place)):
             with naming_checkpoint(self.name, place):
                 weights = fetch and not random_weights
-                check_files(checkpoint_folder(place, self.files), self.config_types, weights, self.instead)
+                check_files(
+                    checkpoint_folder(place, self.files),
+                    self.config_types,
+                    weights,
+                    self.instead,
+                    self.bare_adapters,
+                )
         return self._with_own(chosen, place)
 
     def _with_own(self, chosen: Mapping[str, Any], place: str | None) -> dict[str, Any]:
         """The options with those that belong to the default checkpoint, where it is the one."""
-        own = self.of_default if place is not None and place == self.default_checkpoint else {}
+        own = self.of_default if place is not None and without_revision(place) == self.default_checkpoint else {}
         return {**own, **chosen}
 
     def declared_streams(self, options: Mapping[str, Any]) -> tuple[DeclaredStream, ...] | None:
@@ -337,7 +348,7 @@ class Family:
         """Whether the hub's cache lacks a file, or the weights beside the default checkpoint's config."""
         from huggingface_hub import try_to_load_from_cache
 
-        name, inside = hub_name(repository) or (repository, "")
+        name, inside, _ = hub_name(repository) or (repository, "", "")
         found = try_to_load_from_cache(name, f"{inside}/{file}" if inside else file)
         whole = repository == self.default_checkpoint and bool(self.config_types)
         return not isinstance(found, str) or (whole and bool(missing_weights(Path(found).parent)))

@@ -163,11 +163,17 @@ def check_values(values: Mapping[str, Any], known: Mapping[str, tuple[Any, ...] 
             )
 
 
-def tokenizer_folder(folder: Path) -> Path | None:
-    """The folder of the tokenizer that lerobot saved into the checkpoint; None where the step names none there."""
+def tokenizer_name(folder: Path) -> str | None:
+    """What the saved step names as its tokenizer; None where no step does."""
     step = next((step for step in saved_steps(folder, PREPROCESSOR) if step.name == TOKENIZER), None)
     named = None if step is None else step.config.get("tokenizer_name")
-    if not isinstance(named, str) or not named or Path(named).is_absolute() or ".." in Path(named).parts:
+    return named if isinstance(named, str) and named else None
+
+
+def tokenizer_folder(folder: Path) -> Path | None:
+    """The folder of the tokenizer that lerobot saved into the checkpoint; None where the step names none there."""
+    named = tokenizer_name(folder)
+    if named is None or Path(named).is_absolute() or ".." in Path(named).parts:
         return None
     return folder / named if (folder / named / "tokenizer.json").is_file() else None
 
