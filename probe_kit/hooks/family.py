@@ -22,6 +22,7 @@ from probe_kit.errors import (
 from probe_kit.hooks.checkpoints.checkpoint import (
     CONFIG_FILE,
     PATTERNS,
+    cached_folder,
     checkpoint_folder,
     hub_name,
     is_on_hub,
@@ -77,7 +78,8 @@ class Family:
     from the small files; it raises UsageError where that has to be chosen. of_default: options that belong to the
     default checkpoint, and to no other; they count where they are not given.
     files: patterns of the files of a hub repository that are needed. bare_adapters: whether a LoRA adapter needs
-    no config.json of its own, as the family reads its base's.
+    no config.json of its own, as the family reads its base's. parameters: count of the released sizes, by name.
+    not_acting: released checkpoints whose actions no arm here can execute.
     home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
     `words_in`, of a family whose default checkpoint knows few words; empty for one that reads any text.
     Raises UsageError if an option is not declared as an `Option`.
@@ -113,6 +115,8 @@ class Family:
     of_default: Mapping[str, Any] = MappingProxyType({})
     files: tuple[str, ...] = PATTERNS
     bare_adapters: bool = False
+    parameters: Mapping[str, int] = MappingProxyType({})
+    not_acting: tuple[str, ...] = ()
     home: DefaultScene = RELEASED
     vocabulary: str = ""
 
@@ -256,6 +260,28 @@ class Family:
         """The streams of the size that `options` choose; None for a family that declares none."""
         size = check_options(self.name, self.options, options).get(SIZE)
         return self.declared.get(size or next(iter(self.declared), ""))
+
+    def weights_bytes(self, options: Mapping[str, Any], dtype: Dtype = "float32") -> int | None:
+        """Bytes of the weights of the released size that `options` choose; None where it is not declared."""
+        size = check_options(self.name, self.options, options).get(SIZE)
+        count = self.parameters.get(size or next(iter(self.parameters), ""))
+        return None if count is None else count * {"float32": 4, "bfloat16": 2}[dtype]
+
+    def is_here(self, checkpoint: str | None, options: Mapping[str, Any]) -> bool:
+        """Whether a checkpoint with its weights is in a folder or in the hub's cache. Asks no network."""
+        place = self.place(checkpoint, options.get(SIZE))
+        if place is None or not is_on_hub(place):
+            return True
+        folder = cached_folder(place)
+        return folder is not None and not missing_weights(folder)
+
+    def check_acting(self, checkpoint: str | None) -> None:
+        """Raise UsageError for a released checkpoint whose actions no arm here can execute."""
+        if (place := without_revision(self.place(checkpoint))) in self.not_acting:
+            raise UsageError(
+                f"{place} puts out numbers that no arm here can execute. Plan and capture it with --no-act, or "
+                "pass a fine-tune as --checkpoint"
+            )
 
     def check_instructions(
         self, checkpoint: str | None, instructions: Sequence[str], options: Mapping[str, Any], fetch: bool = True

@@ -41,6 +41,7 @@ FAMILIES = (
         config_types=("groot", "Gr00tN1d7"),
         words="probe_kit.hooks.families.groot.adapter:check_groot_words",
         full_size="probe_kit.models.lerobot.groot:full_size_groot",
+        parameters={"": 3_144_016_000},
         declared={
             "": (
                 backbone(17, 2048, 110, camera="image", sums=False),

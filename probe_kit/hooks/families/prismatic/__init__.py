@@ -34,6 +34,7 @@ FAMILIES = (
         ),
         declared={"": answering(33, 4096, 290)},
         full_size="probe_kit.models.prismatic:full_size_prismatic",
+        parameters={"": 7_541_237_184},
         options=(TOKENIZER, BITS, Option("steps", int, "Greedy tokens per inference.", "1")),
         acts=False,
         reads=True,

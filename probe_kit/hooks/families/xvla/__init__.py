@@ -42,6 +42,7 @@ FAMILIES = (
         config_types=("xvla",),
         words="probe_kit.hooks.families.xvla.adapter:check_xvla_words",
         full_size="probe_kit.models.lerobot.xvla:full_size_xvla",
+        parameters={"": 879_851_096},
         declared={
             "": (
                 DeclaredStream(
