@@ -55,7 +55,11 @@ def weights_needed(model: str, checkpoint: str | None, options: Mapping[str, Any
     if family is None or family.weights_bytes(options) is None:
         return ""
     sizes = {name: in_units(family.weights_bytes(options, name) or 0) for name in DTYPES}
-    memory = sizes[dtype] if dtype in sizes else " or ".join(f"{size} in {name}" for name, size in sizes.items())
+    held = {name: in_units(family.memory_bytes(options, name) or 0) for name in DTYPES}
+    every = (
+        held["float32"] if family.always_float32 else " or ".join(f"{own} in {name}" for name, own in held.items())
+    )
+    memory = held[dtype] if dtype in DTYPES else every
     download = "nothing to download"
     if not family.is_here(checkpoint, options):
         download = f"download {sizes['bfloat16']} or {sizes['float32']}, as stored"

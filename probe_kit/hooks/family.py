@@ -79,6 +79,7 @@ class Family:
     default checkpoint, and to no other; they count where they are not given.
     files: patterns of the files of a hub repository that are needed. bare_adapters: whether a LoRA adapter needs
     no config.json of its own, as the family reads its base's. parameters: count of the released sizes, by name.
+    always_float32: whether weights stay in float32 whatever dtype is chosen.
     not_acting: released checkpoints whose actions no arm here can execute.
     home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
     `words_in`, of a family whose default checkpoint knows few words; empty for one that reads any text.
@@ -116,6 +117,7 @@ class Family:
     files: tuple[str, ...] = PATTERNS
     bare_adapters: bool = False
     parameters: Mapping[str, int] = MappingProxyType({})
+    always_float32: bool = False
     not_acting: tuple[str, ...] = ()
     home: DefaultScene = RELEASED
     vocabulary: str = ""
@@ -266,6 +268,10 @@ class Family:
         size = check_options(self.name, self.options, options).get(SIZE)
         count = self.parameters.get(size or next(iter(self.parameters), ""))
         return None if count is None else count * {"float32": 4, "bfloat16": 2}[dtype]
+
+    def memory_bytes(self, options: Mapping[str, Any], dtype: Dtype) -> int | None:
+        """Bytes of these weights in memory when `dtype` is chosen."""
+        return self.weights_bytes(options, "float32" if self.always_float32 else dtype)
 
     def is_here(self, checkpoint: str | None, options: Mapping[str, Any]) -> bool:
         """Whether a checkpoint with its weights is in a folder or in the hub's cache. Asks no network."""

@@ -41,6 +41,7 @@ FAMILIES = (
         config_types=("groot", "Gr00tN1d7"),
         words="probe_kit.hooks.families.groot.adapter:check_groot_words",
         full_size="probe_kit.models.lerobot.groot:full_size_groot",
+        always_float32=True,
         parameters={"": 3_144_016_000},
         declared={
             "": (
