@@ -118,10 +118,9 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
 
     why, (repository, inside, revision) = unreachable(), named
     wanted = [f"{inside}/{pattern}" if inside else pattern for pattern in patterns]
-    of_revision = {"revision": revision} if revision else {}
     try:
-        folder = Path(
-            snapshot_download(repository, allow_patterns=wanted, local_files_only=bool(why), **of_revision)
+        place = snapshot_download(
+            repository, revision=revision or None, allow_patterns=wanted, local_files_only=bool(why)
         )
     except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError, ValueError) as error:
         reason = f"{why}; the cache has no copy" if why else hub_reason(error)
@@ -129,7 +128,7 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
             f"cannot fetch {checkpoint!r} from the hub ({reason}). {way_out(error, bool(why))}; or pass a local "
             "folder as --checkpoint"
         ) from error
-    folder /= inside
+    folder = Path(place) / inside
     if not folder.is_dir():
         raise CheckpointError(
             f"the repository {repository} has no folder {inside!r}; look its folders up on its page"
