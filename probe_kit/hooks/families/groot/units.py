@@ -128,7 +128,7 @@ class StateUnits:
             own = values[..., begin:end]
             parts += [mapped[..., done:begin], np.sin(own), np.cos(own)]
             done = end
-        return np.concatenate([*parts, mapped[..., done:]], -1).astype(np.float32)
+        return np.asarray(np.concatenate([*parts, mapped[..., done:]], -1), np.float32)
 
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Raise CheckpointError for numbers that have no way back to a state."""
@@ -149,7 +149,7 @@ class StateUnits:
         beyond = self.bounded.unusual(values)
         for begin, end in self.angles:
             beyond[..., begin:end] = False
-        return beyond & (not self.excluded)
+        return np.zeros_like(beyond) if self.excluded else beyond
 
 
 def state_units(
