@@ -129,7 +129,9 @@ ModelName = Annotated[str, typer.Option("--model", metavar="NAME", help="Model; 
 Checkpoint = Annotated[
     str | None,
     typer.Option(
-        "--checkpoint", help="Checkpoint folder or Hugging Face id. Default: the family's released checkpoint."
+        "--checkpoint",
+        help="Checkpoint folder or Hugging Face id, OWNER/NAME[@REVISION]. "
+        "Default: the family's released checkpoint.",
     ),
 ]
 ModelOptions = Annotated[

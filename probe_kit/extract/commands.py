@@ -128,6 +128,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     declared = " (of the released size; the weights were not read)" if extraction.declared and plan.streams else ""
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
+        **_weights_row(extraction.settings),
         **_units_row(extraction.settings),
         **_protocol_row(identity),
         **_rows_of_plan(extraction),
@@ -146,6 +147,14 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     for name, value in rows.items():
         table.add_row(marked("[dim]{}[/]", name), value)
     err.print(table)
+
+
+def _weights_row(settings: "RunSettings") -> dict[str, str]:
+    """Memory and download of a model whose released size is declared."""
+    from probe_kit.extract.needs import weights_needed
+
+    words = weights_needed(settings.model, settings.checkpoint, settings.options, settings.dtype)
+    return {"weights": words} if words else {}
 
 
 def _units_row(settings: "RunSettings") -> dict[str, str]:

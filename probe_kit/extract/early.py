@@ -11,7 +11,7 @@ from probe_kit._system.installing import install_command
 from probe_kit.errors import DiskSpaceError, MissingExtraError, UsageError
 from probe_kit.extract.plan import plan_episodes, plan_rows, suite_name
 from probe_kit.extract.run_layout import RUN_FILE
-from probe_kit.extract.settings import AskSettings, RunSettings, check_other_settings
+from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, check_other_settings
 from probe_kit.extract.store.growth import further_rows
 from probe_kit.extract.vqa.phrases import phrases
 from probe_kit.hashing import canonical_json
@@ -44,6 +44,8 @@ def check_model(settings: RunSettings, scripted: tuple[str, ...], fetch: bool = 
     family = find_family(settings.model, scripted)
     if not asked and not family.acts:
         raise UsageError(f"{settings.model} answers and does not act; use `probe-kit ask`, or a model that acts")
+    if isinstance(settings, ExtractSettings) and settings.source is None and not settings.capture_only:
+        family.check_acting(settings.checkpoint)
     # Elsewhere there may be other devices than here.
     device = "cpu" if settings.workers or settings.ray else settings.device
     family.check(

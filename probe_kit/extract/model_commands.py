@@ -46,7 +46,7 @@ def models(
         return
     for row in rows:
         out.print(marked("[bold]{}[/]  {}", row["model"], row["description"]))
-        for key in ("checkpoint", "streams", "embodiment", "scene", "does", "ready", "notes"):
+        for key in ("checkpoint", "streams", "embodiment", "scene", "does", "ready", "weights", "notes"):
             if row[key]:
                 out.print(marked("  [dim]{}[/] {}", f"{key:10}", row[key]), soft_wrap=True)
         for protocol, settings in row["protocols"].items():
@@ -108,6 +108,7 @@ def _ready(family: "Family") -> str:
 
 
 def _model_rows(name: str | None) -> list[dict[str, Any]]:
+    from probe_kit.extract.needs import weights_needed
     from probe_kit.extract.rollout.controllers import SCRIPTED
     from probe_kit.hooks.registry import find_family, own_families, third_party_families
 
@@ -123,6 +124,7 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
             "embodiment": family.embodiment,
             "scene": str(family.home),
             "ready": _ready(family),
+            "weights": weights_needed(family.name, None, {}, None),
             "notes": family.notes,
             "does": " and ".join(verb for verb, can in (("acts", family.acts), ("answers", family.reads)) if can),
             "protocols": {
@@ -139,7 +141,7 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
         for family in chosen
     ]
     scripted = dict.fromkeys(("checkpoint", "streams", "embodiment", "scene"), "")
-    scripted |= {"ready": "yes", "notes": "no activations"}
+    scripted |= {"weights": "", "ready": "yes", "notes": "no activations"}
     nothing: dict[str, Any] = {"protocols": {}, "interventions": None, "options": []}
     rows += [
         {"model": model, "description": text, **scripted, "does": "acts", **nothing}

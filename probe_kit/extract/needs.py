@@ -1,11 +1,13 @@
 """Estimated disk space of a run before compression, including probes, figures and report."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from probe_kit.extract.plan import RowPlan
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import RunSettings
 from probe_kit.hooks.contract.views import view_names
+from probe_kit.hooks.family import DTYPES
 
 EPISODE = 40_000
 """Bytes of an episode's commit, trajectory and files of the file system (measured: 12 to 30 kB)."""
@@ -39,6 +41,29 @@ def space_of(streams: Sequence[StoredStream], episodes: int, settings: RunSettin
         "probes": sites * episodes * DECISION,
         "report": REPORT if streams else 0,
     }
+
+
+def weights_needed(model: str, checkpoint: str | None, options: Mapping[str, Any], dtype: str | None) -> str:
+    """Memory for the weights and the size of a download, in words; empty for a model that declares no size.
+
+    Of the released size. dtype: None for both. No network is asked, so the stored precision is not known.
+    """
+    from probe_kit.extract.store.locations.disk import in_units
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(model)
+    if family is None or family.weights_bytes(options) is None:
+        return ""
+    sizes = {name: in_units(family.weights_bytes(options, name) or 0) for name in DTYPES}
+    held = {name: in_units(family.memory_bytes(options, name) or 0) for name in DTYPES}
+    every = (
+        held["float32"] if family.always_float32 else " or ".join(f"{own} in {name}" for name, own in held.items())
+    )
+    memory = held[dtype] if dtype in DTYPES else every
+    download = "nothing to download"
+    if not family.is_here(checkpoint, options):
+        download = f"download {sizes['bfloat16']} or {sizes['float32']}, as stored"
+    return f"memory {memory} for weights, more for activations; {download}"
 
 
 def declared_streams(settings: RunSettings) -> list[StoredStream] | None:

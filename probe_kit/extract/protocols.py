@@ -171,6 +171,7 @@ def _defaults(settings: ProtocolSettings, row: ProtocolRow) -> dict[str, str]:
 
     family = find_family(settings.model)
     known = {f"-M {option.name}": option.default for option in family.options}
+    known |= {f"-M {name}": as_text(value) for name, value in family.of_default.items()}
     known |= {
         "checkpoint": family.default_checkpoint or EMBEDDED,
         "execute": "the checkpoint's",

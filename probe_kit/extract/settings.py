@@ -23,6 +23,7 @@ from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.extract.vqa.templates import P1, Template, find_template
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.capturing.edits import Edit, Vectors
+from probe_kit.hooks.checkpoints.checkpoint import is_on_hub
 from probe_kit.hooks.contract.options import read_pairs
 from probe_kit.hooks.contract.protocol import PLAIN, ROTATIONS, Rotation
 from probe_kit.scene_names import SceneName
@@ -525,6 +526,13 @@ def check_label(label: str) -> None:
         raise UsageError(f"label is {label[:LONGEST_LABEL]!r}; expected 1 to {LONGEST_LABEL} printable characters")
 
 
+def _short(checkpoint: str) -> str:
+    """The last part of a checkpoint's name; a revision may have slashes of its own."""
+    name, at, revision = checkpoint.partition("@")
+    on_hub = bool(at) and is_on_hub(checkpoint)
+    return f"{Path(name).name}@{revision.replace('/', '-')}" if on_hub else Path(checkpoint).name
+
+
 def run_label(settings: RunSettings) -> str:
     """What tables call the run: checkpoints and options of one family differ in it."""
     asks = isinstance(settings, AskSettings)  # whose runs come in several, all of one label
@@ -538,7 +546,7 @@ def run_label(settings: RunSettings) -> str:
         differing = (f"{name}={run}" for name, (_, run) in said["deviations"].items())
         parts += [settings.protocol, *variant, *differing]
     else:
-        parts += [] if settings.checkpoint is None else [Path(settings.checkpoint).name]
+        parts += [] if settings.checkpoint is None else [_short(settings.checkpoint)]
         parts += [] if source is None else [f"{'in' if isinstance(source, EnvSource) else 'on'} {source.name}"]
         parts += [f"{name}={value}" for name, value in sorted(settings.options.items())]
     if settings.random_weights and settings.weights_seed:

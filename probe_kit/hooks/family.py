@@ -22,10 +22,13 @@ from probe_kit.errors import (
 from probe_kit.hooks.checkpoints.checkpoint import (
     CONFIG_FILE,
     PATTERNS,
+    cached_folder,
     checkpoint_folder,
     hub_name,
     is_on_hub,
     missing_weights,
+    pinned,
+    without_revision,
 )
 from probe_kit.hooks.checkpoints.file_checks import check_files
 from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
@@ -74,7 +77,10 @@ class Family:
     units: `module:function(checkpoint, **options)` that says whose units the actions get, and where they stand,
     from the small files; it raises UsageError where that has to be chosen. of_default: options that belong to the
     default checkpoint, and to no other; they count where they are not given.
-    files: patterns of the files of a hub repository that are needed.
+    files: patterns of the files of a hub repository that are needed. bare_adapters: whether a LoRA adapter needs
+    no config.json of its own, as the family reads its base's. parameters: count of the released sizes, by name.
+    always_float32: whether weights stay in float32 whatever dtype is chosen.
+    not_acting: released checkpoints whose actions no arm here can execute.
     home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
     `words_in`, of a family whose default checkpoint knows few words; empty for one that reads any text.
     Raises UsageError if an option is not declared as an `Option`.
@@ -109,6 +115,10 @@ class Family:
     units: str | None = None
     of_default: Mapping[str, Any] = MappingProxyType({})
     files: tuple[str, ...] = PATTERNS
+    bare_adapters: bool = False
+    parameters: Mapping[str, int] = MappingProxyType({})
+    always_float32: bool = False
+    not_acting: tuple[str, ...] = ()
     home: DefaultScene = RELEASED
     vocabulary: str = ""
 
@@ -181,6 +191,7 @@ class Family:
         merged = model.card.audit.get("adapter")
         model.card = replace(
             model.card,
+            checkpoint=pinned(model.card.checkpoint),
             settings={**said, **model.card.settings},
             notes=tuple(dict.fromkeys((*model.card.notes, *([merged] if merged else [])))),
             **self._source_of(model.card, place),
@@ -191,7 +202,7 @@ class Family:
         """What the card says of the source: a untrained network has none, a foreign checkpoint an unknown one."""
         if card.random_weights:
             return {"source": None, "source_weights": None}
-        own = place in (
+        own = without_revision(place) in (
             self.default_checkpoint,
             *(row.checkpoint for first in self.protocols.values() for row in first.rows),
         )
@@ -233,18 +244,50 @@ class Family:
         if place is not None and self.config_types and (fetch or not is_on_hub(place)):
             with naming_checkpoint(self.name, place):
                 weights = fetch and not random_weights
-                check_files(checkpoint_folder(place, self.files), self.config_types, weights, self.instead)
+                check_files(
+                    checkpoint_folder(place, self.files),
+                    self.config_types,
+                    weights,
+                    self.instead,
+                    self.bare_adapters,
+                )
         return self._with_own(chosen, place)
 
     def _with_own(self, chosen: Mapping[str, Any], place: str | None) -> dict[str, Any]:
         """The options with those that belong to the default checkpoint, where it is the one."""
-        own = self.of_default if place is not None and place == self.default_checkpoint else {}
+        own = self.of_default if place is not None and without_revision(place) == self.default_checkpoint else {}
         return {**own, **chosen}
 
     def declared_streams(self, options: Mapping[str, Any]) -> tuple[DeclaredStream, ...] | None:
         """The streams of the size that `options` choose; None for a family that declares none."""
         size = check_options(self.name, self.options, options).get(SIZE)
         return self.declared.get(size or next(iter(self.declared), ""))
+
+    def weights_bytes(self, options: Mapping[str, Any], dtype: Dtype = "float32") -> int | None:
+        """Bytes of the weights of the released size that `options` choose; None where it is not declared."""
+        size = check_options(self.name, self.options, options).get(SIZE)
+        count = self.parameters.get(size or next(iter(self.parameters), ""))
+        return None if count is None else count * {"float32": 4, "bfloat16": 2}[dtype]
+
+    def memory_bytes(self, options: Mapping[str, Any], dtype: Dtype) -> int | None:
+        """Bytes of these weights in memory when `dtype` is chosen."""
+        return self.weights_bytes(options, "float32" if self.always_float32 else dtype)
+
+    def is_here(self, checkpoint: str | None, options: Mapping[str, Any]) -> bool:
+        """Whether a checkpoint with its weights is in a folder or in the hub's cache. Asks no network."""
+        place = self.place(checkpoint, options.get(SIZE))
+        if place is None or not is_on_hub(place):
+            return True
+        folder = cached_folder(place)
+        return folder is not None and not missing_weights(folder)
+
+    def check_acting(self, checkpoint: str | None) -> None:
+        """Raise UsageError for a released checkpoint whose actions no arm here can execute."""
+        if (place := without_revision(self.place(checkpoint))) in self.not_acting:
+            raise UsageError(
+                f"{place} puts out numbers that no arm here can execute. Plan and capture it with --no-act, or "
+                "pass a fine-tune as --checkpoint"
+            )
 
     def check_instructions(
         self, checkpoint: str | None, instructions: Sequence[str], options: Mapping[str, Any], fetch: bool = True
@@ -337,7 +380,7 @@ class Family:
         """Whether the hub's cache lacks a file, or the weights beside the default checkpoint's config."""
         from huggingface_hub import try_to_load_from_cache
 
-        name, inside = hub_name(repository) or (repository, "")
+        name, inside, _ = hub_name(repository) or (repository, "", "")
         found = try_to_load_from_cache(name, f"{inside}/{file}" if inside else file)
         whole = repository == self.default_checkpoint and bool(self.config_types)
         return not isinstance(found, str) or (whole and bool(missing_weights(Path(found).parent)))

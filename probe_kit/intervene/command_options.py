@@ -36,7 +36,9 @@ KindName = Annotated[
 ]
 Checkpoint = Annotated[
     str | None,
-    typer.Option("--checkpoint", help="Checkpoint folder or Hugging Face id. Default: the folder of the run."),
+    typer.Option(
+        "--checkpoint", help="Checkpoint folder or Hugging Face id, OWNER/NAME[@REVISION]. Default: the run's."
+    ),
 ]
 Sites = Annotated[
     Names | None,

@@ -12,7 +12,7 @@ def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
     """Return `loader.from_pretrained(source, **options)` of a class of transformers.
 
     A configuration can name Python code in its `auto_map`; transformers asks on the terminal whether to run it
-    unless it is told not to. source: a folder or a hub id.
+    unless the caller forbids it. source: a folder or a hub id.
     Raises CheckpointError where the object needs such code, OSError for missing files, ValueError for others.
     """
     try:

@@ -12,6 +12,7 @@ from torch import nn
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, prepare
 from probe_kit.extract.extraction import prepare_asks
+from probe_kit.extract.needs import weights_needed
 from probe_kit.hooks import load_model
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.registry import own_families
@@ -57,10 +58,35 @@ def test_a_plan_needs_no_weights_no_network_and_no_gpu(name: str, size: str, sma
         planned.run("anywhere")
 
 
+@pytest.mark.parametrize(("name", "size"), RELEASED)
+def test_memory_and_download_of_every_released_size_are_named(name: str, size: str) -> None:
+    options = {"size": size} if size else {}
+    family = own_families()[name]
+    count = family.parameters[size]
+    words = weights_needed(name, None, options, "bfloat16")
+    assert f"memory {(4 if family.always_float32 else 2) * count / 1e9:,.1f} GB" in words
+    assert f"or {4 * count / 1e9:,.1f} GB" in words or "nothing to download" in words
+    assert weights_needed("pi0-tiny", None, {}, None) == ""
+
+
+def test_a_checkpoint_in_a_folder_is_nothing_to_download(tmp_path: Path) -> None:
+    words = weights_needed("pi0", str(write_intact(tmp_path / "pi0")), {}, None)
+    assert words.endswith("nothing to download")
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_checkpoint_that_cannot_act_here_is_planned_with_no_act_alone(small_suite: Suite) -> None:
+    base = {"checkpoint": "lerobot/pi0_base"}
+    with pytest.raises(UsageError, match="Plan and capture it with --no-act"):
+        prepare(settings_of("pi0", small_suite, **base), fetch=False)
+    assert prepare(settings_of("pi0", small_suite, capture_only=True, **base), fetch=False).plan.bytes > 0
+
+
 def test_every_family_of_the_hub_declares_its_sizes() -> None:
     for name, family in own_families().items():
         on_the_hub = family.default_checkpoint is not None
         assert bool(family.declared) == on_the_hub, name
+        assert family.parameters.keys() == family.declared.keys(), name
         assert family.sizes == () or [size for size, _ in family.sizes] == list(family.declared)
 
 
@@ -81,6 +107,7 @@ def test_declared_sizes_are_those_of_the_released_network(name: str, size: str) 
     """Of every stream there is a list of so many blocks whose weights have its width; on the meta device."""
     family = own_families()[name]
     network = family.function("full_size")(*([size] if size else []))
+    assert sum(own.numel() for own in network.parameters()) == family.parameters[size]
     lists = [
         (len(module), {side for parameter in module[0].parameters() for side in parameter.shape})
         for module in network.modules()

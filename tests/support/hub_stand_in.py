@@ -1,6 +1,7 @@
-"""A local server that answers as the hub does when a data set is uploaded, and records what it gets."""
+"""A local server that answers as the hub does to uploads and downloads, and records what it gets."""
 
 import base64
+import hashlib
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,6 +9,7 @@ from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 from typing import Any
+from urllib.parse import unquote
 
 _PULL_REQUEST = {
     "num": 1, "title": "study", "createdAt": "2026-01-01T00:00:00.000Z", "status": "draft", "events": [],
@@ -18,13 +20,48 @@ _PULL_REQUEST = {
 
 @dataclass
 class Hub:
-    """failures: first answers to commits, a status or 0 for a cut connection. files: of commits, by path."""
+    """failures: first answers to commits, a status or 0 for a cut connection. files: of commits, by path.
+
+    models: files of a model's commits, by repository and commit. names: commits of branches and tags. refusals: of
+    a repository, the status and the code of an error.
+    """
 
     failures: list[int] = field(default_factory=list)
     requests: list[tuple[str, str, str]] = field(default_factory=list)
     files: dict[str, bytes] = field(default_factory=dict)
     commits: int = 0
     address: str = ""
+    models: dict[str, dict[str, dict[str, bytes]]] = field(default_factory=dict)
+    names: dict[str, dict[str, str]] = field(default_factory=dict)
+    refusals: dict[str, tuple[int, str]] = field(default_factory=dict)
+
+    def download(self, path: str) -> tuple[int, dict[str, str], bytes]:
+        """Status, headers and body of what is asked of a model."""
+        api = path.startswith("/api/models/")
+        parts = unquote(path.removeprefix("/api/models")).strip("/").split("/")
+        repository, asked = "/".join(parts[:2]), parts[3] if len(parts) > 3 else "main"
+        if repository in self.refusals and not (api and self.refusals[repository][1] == "GatedRepo"):
+            status, code = self.refusals[repository]
+            return status, {"x-error-code": code, "x-error-message": "refused"}, b""
+        commits = self.models.get(repository)
+        if commits is None:
+            return 404, {"x-error-code": "RepoNotFound", "x-error-message": "Repository not found"}, b""
+        commit = asked if asked in commits else self.names[repository].get(asked)
+        if commit is None:
+            return 404, {"x-error-code": "RevisionNotFound", "x-error-message": f"Invalid rev id: {asked}"}, b""
+        if api:
+            if "tree" in parts[2:3]:
+                rows = [{"type": "file", "path": name, "oid": "0", "size": len(own)}
+                        for name, own in commits[commit].items()]  # fmt: skip
+                return 200, {"content-type": "application/json"}, json.dumps(rows).encode()
+            listed = [{"rfilename": name, "size": len(own)} for name, own in commits[commit].items()]
+            body = {"id": repository, "modelId": repository, "sha": commit, "siblings": listed}
+            return 200, {"content-type": "application/json"}, json.dumps(body).encode()
+        content = commits[commit].get("/".join(parts[4:]))
+        if content is None:
+            return 404, {"x-error-code": "EntryNotFound", "x-error-message": "Entry not found"}, b""
+        etag = hashlib.sha1(content).hexdigest()
+        return 200, {"etag": f'"{etag}"', "x-repo-commit": commit}, content
 
     def answer(self, path: str, body: bytes) -> Any:
         """What the hub says to a request."""
@@ -80,7 +117,20 @@ def hub() -> Iterator[Hub]:
             self.wfile.write(content)
 
         def do_GET(self) -> None:
-            self.do_POST()
+            if not self.path.startswith("/api/models/") and "/resolve/" not in self.path:
+                self.do_POST()
+                return
+            found.requests.append((self.command, self.path, str(self.headers.get("authorization"))))
+            status, headers, body = found.download(self.path.partition("?")[0])
+            self.send_response(status)
+            for name, value in ({"content-length": str(len(body))} | headers).items():
+                self.send_header(name, value)
+            self.end_headers()
+            if self.command != "HEAD":
+                self.wfile.write(body)
+
+        def do_HEAD(self) -> None:
+            self.do_GET()
 
         def log_message(self, *_: object) -> None:
             """Nothing is printed."""

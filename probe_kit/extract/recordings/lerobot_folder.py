@@ -16,7 +16,7 @@ from probe_kit.errors import RecordingError, UsageError
 from probe_kit.extract.recordings.hashed_files import HashedFiles
 from probe_kit.extract.recordings.lerobot_meta import IMAGE, KEYS, NUMERIC, EpisodeMeta, LeRobotMeta
 from probe_kit.extract.recordings.lerobot_source import LeRobotSource
-from probe_kit.hooks.checkpoints.hub import unreachable
+from probe_kit.hooks.checkpoints.hub import hub_reason, unreachable, way_out
 
 MOST_FRAMES = 64
 """Chosen frames that one row holds."""
@@ -192,7 +192,9 @@ def resolved_commit(repo: str, revision: str) -> str:
     try:
         found = HfApi().dataset_info(repo, revision=revision or None).sha
     except HfHubHTTPError as error:
-        raise UsageError(f"the hub has no data set {repo} at {revision or 'main'}: {error}") from error
+        raise UsageError(
+            f"the hub gives no data set {repo} at {revision or 'main'} ({hub_reason(error)}). {way_out(error)}"
+        ) from error
     if found is None:
         raise UsageError(f"the hub names no commit of {repo}; give {repo}@COMMIT with 40 digits")
     return str(found)
@@ -219,4 +221,7 @@ def _download(repo: str, commit: str, patterns: list[str]) -> Path:
             )
         )
     except (HfHubHTTPError, LocalEntryNotFoundError, OSError) as error:
-        raise UsageError(f"{repo}@{commit} cannot be fetched: {error}. Give a folder that exists") from error
+        raise UsageError(
+            f"{repo}@{commit} cannot be fetched ({hub_reason(error)}). {way_out(error, offline)}; or give a "
+            "folder that exists"
+        ) from error

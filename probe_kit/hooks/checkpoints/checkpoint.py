@@ -3,13 +3,13 @@
 import hashlib
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from probe_kit._system.bounded_files import MOST_BYTES, check_regular, read_regular
 from probe_kit._system.bounded_json import load_json
 from probe_kit._system.bounded_yaml import load_yaml
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
-from probe_kit.hooks.checkpoints.hub import unreachable
+from probe_kit.hooks.checkpoints.hub import hub_reason, unreachable, way_out
 from probe_kit.models.bounds import check_sizes
 
 CONFIG_FILE, ADAPTER_FILE = "config.json", "adapter_config.json"
@@ -23,16 +23,73 @@ _CONFIGURATIONS = ("*config*.json", "dims.json", "*.yaml", "*.yml")
 PATTERNS = ("*.json", "*.safetensors", "*.model", "*.txt", "*.jinja")
 SMALL_FILES = ("*.json", "*.model", "*.txt", "*.jinja", "adapter_model.safetensors")
 """Those of them that hold no weights, but for an adapter's."""
+COMMIT_DIGITS = 40
+"""Of a commit's full name."""
 RUN_WEIGHTS = "checkpoints/latest-checkpoint.pt"
 """Where a folder of a training run of Prismatic keeps its weights."""
 
 
-def hub_name(checkpoint: str) -> tuple[str, str] | None:
-    """Repository and folder of a hub id `owner/repo` or `owner/repo/folder`; None for what is none of both."""
-    parts = checkpoint.split("/")
-    if len(parts) not in (2, 3) or checkpoint.startswith((".", "/", "~")) or not all(parts):
+class HubName(NamedTuple):
+    """A checkpoint on the hub. folder: inside the repository; revision: branch, tag or commit; empty for none."""
+
+    repository: str
+    folder: str = ""
+    revision: str = ""
+
+
+def hub_name(checkpoint: str) -> HubName | None:
+    """The parts of `owner/repo`, `owner/repo/folder` and either with `@revision`; None for what is no hub id."""
+    name, at, revision = checkpoint.partition("@")
+    parts = name.split("/")
+    if (
+        len(parts) not in (2, 3)
+        or name.startswith((".", "/", "~"))
+        or not all(parts)
+        or bool(at) != bool(revision)
+    ):
         return None
-    return "/".join(parts[:2]), "/".join(parts[2:])
+    return HubName("/".join(parts[:2]), "/".join(parts[2:]), revision)
+
+
+def without_revision(checkpoint: str | None) -> str | None:
+    """A hub id without its revision; anything else as it is."""
+    if checkpoint is None or not is_on_hub(checkpoint):
+        return checkpoint
+    return checkpoint.partition("@")[0]
+
+
+def pinned(checkpoint: str) -> str:
+    """A hub id with the commit that the cache has of its revision; anything else as it is. Asks no network."""
+    named = hub_name(checkpoint) if is_on_hub(checkpoint) else None
+    if named is None:
+        return checkpoint
+    commit = _cached_commit(named)
+    return checkpoint if commit is None else f"{checkpoint.partition('@')[0]}@{commit}"
+
+
+def cached_folder(checkpoint: str) -> Path | None:
+    """Where the cache of the hub has a hub id; None where it has nothing of it. Asks no network."""
+    named = hub_name(checkpoint) if is_on_hub(checkpoint) else None
+    if named is None or (commit := _cached_commit(named)) is None:
+        return None
+    folder = _cache_of(named.repository) / "snapshots" / commit / named.folder
+    return folder if folder.is_dir() else None
+
+
+def _cached_commit(named: HubName) -> str | None:
+    """The commit of a revision as the cache has it; None where it has none."""
+    cache, revision = _cache_of(named.repository), named.revision or "main"
+    if (cache / "snapshots" / revision).is_dir() and len(revision) == COMMIT_DIGITS:
+        return revision
+    ref = cache / "refs" / revision
+    return ref.read_text(encoding="utf-8").strip() if ref.is_file() else None
+
+
+def _cache_of(repository: str) -> Path:
+    from huggingface_hub import constants
+    from huggingface_hub.file_download import repo_folder_name
+
+    return Path(constants.HF_HUB_CACHE) / repo_folder_name(repo_id=repository, repo_type="model")
 
 
 def is_on_hub(checkpoint: str) -> bool:
@@ -42,7 +99,7 @@ def is_on_hub(checkpoint: str) -> bool:
 
 def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
     """The local folder of a folder path or hub id such as `lerobot/pi0_base`, or `owner/repo/folder` for one model
-    of a repository that holds several.
+    of a repository that holds several; `@revision` behind it names a branch, a tag or a commit.
 
     patterns: which files of a hub repository, or of its folder, are needed; no others are downloaded.
     Raises CheckpointError if the folder is not there or the hub cannot deliver it.
@@ -59,16 +116,19 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 
-    why, (repository, inside) = unreachable(), named
+    why, (repository, inside, revision) = unreachable(), named
     wanted = [f"{inside}/{pattern}" if inside else pattern for pattern in patterns]
     try:
-        folder = Path(snapshot_download(repository, allow_patterns=wanted, local_files_only=bool(why))) / inside
+        place = snapshot_download(
+            repository, revision=revision or None, allow_patterns=wanted, local_files_only=bool(why)
+        )
     except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError, ValueError) as error:
-        reason = f"{why}; the cache has no copy" if why else str(error).strip().splitlines()[0]
+        reason = f"{why}; the cache has no copy" if why else hub_reason(error)
         raise CheckpointError(
-            f"cannot fetch {checkpoint!r} from the hub ({reason}). Check the name, your network and, for gated "
-            "models, `hf auth login`; or pass a local folder as --checkpoint"
+            f"cannot fetch {checkpoint!r} from the hub ({reason}). {way_out(error, bool(why))}; or pass a local "
+            "folder as --checkpoint"
         ) from error
+    folder = Path(place) / inside
     if not folder.is_dir():
         raise CheckpointError(
             f"the repository {repository} has no folder {inside!r}; look its folders up on its page"
@@ -85,7 +145,7 @@ def hub_files(checkpoint: str) -> list[str]:
     named = hub_name(checkpoint)
     if named is None:
         raise CheckpointError(f"{checkpoint!r} is no hub id; expected owner/repo or owner/repo/folder")
-    repository, inside = named
+    repository, inside, revision = named
     begin = f"{inside}/" if inside else ""
     if unreachable():
         folder = checkpoint_folder(checkpoint, ())
@@ -95,10 +155,11 @@ def hub_files(checkpoint: str) -> list[str]:
     from huggingface_hub.errors import HfHubHTTPError
 
     try:
-        listed = HfApi().list_repo_files(repository)
+        listed = HfApi().list_repo_files(repository, revision=revision or None)
     except (HfHubHTTPError, OSError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise CheckpointError(f"cannot list the files of {repository!r} on the hub ({reason})") from error
+        raise CheckpointError(
+            f"cannot list the files of {checkpoint!r} on the hub ({hub_reason(error)}). {way_out(error)}"
+        ) from error
     return sorted(name.removeprefix(begin) for name in listed if name.startswith(begin))
 
 

@@ -1,4 +1,4 @@
-"""A quick test whether the hub can be reached, because its client retries for minutes. Imports no torch."""
+"""Whether the hub can be reached, because its client retries for minutes, and why it refuses. Imports no torch."""
 
 from threading import Thread
 from urllib.error import HTTPError
@@ -37,3 +37,60 @@ def _ask(address: str) -> str:
 
 def _silence(address: str) -> str:
     return f"{address} did not answer within {PATIENCE:g} s"
+
+
+def hub_reason(error: Exception) -> str:
+    """Why the hub delivers nothing, in words: its client reports several reasons by one exception."""
+    from huggingface_hub import errors, get_token
+
+    cause = _cause(error)
+    status = _status(cause)
+    said = str(getattr(cause, "server_message", None) or error)  # the hub's own words, where it answered
+    first = (said.strip().splitlines() or [type(error).__name__])[0]
+    if isinstance(cause, errors.GatedRepoError):
+        return "its authors give access on request (gated), and yours is not granted"
+    if isinstance(cause, errors.DisabledRepoError):
+        return "the hub has disabled it"
+    if isinstance(cause, errors.RevisionNotFoundError):
+        return f"it has no such revision: {first}"
+    if status == 401 and get_token():
+        return "the hub refuses your token (401): it is expired, revoked or mistyped"
+    if isinstance(cause, errors.RepositoryNotFoundError):
+        hidden = "your token does not open it" if get_token() else "no token is set"
+        return f"there is no such repository, or it is private and {hidden}"
+    if isinstance(cause, errors.EntryNotFoundError) and not isinstance(cause, errors.LocalEntryNotFoundError):
+        return f"the repository lacks a file: {first}"
+    return f"the hub answers {status}: {first}" if status else first
+
+
+def way_out(error: Exception, offline: bool = False) -> str:
+    """What to do about a refusal of the hub."""
+    from huggingface_hub import errors, get_token
+
+    cause = _cause(error)
+    if offline:
+        return "Connect to the network once, or fill the cache with `hf download`"
+    if isinstance(cause, errors.GatedRepoError):
+        asked = "ask for access on the model's page" if get_token() else "run `hf auth login`"
+        return f"{asked[0].upper()}{asked[1:]}"
+    if isinstance(cause, errors.RevisionNotFoundError):
+        return "Look the branches, tags and commits up on its page"
+    if _status(cause) == 401 and get_token():
+        return "Run `hf auth login` with a new token, or `hf auth logout` for a public model"
+    if isinstance(cause, errors.RepositoryNotFoundError):
+        return "Check the name, and run `hf auth login` for a private model"
+    return "Check the name, your network and, for gated models, `hf auth login`"
+
+
+def _cause(error: BaseException) -> BaseException:
+    """The refusal behind an error of the cache: the client looks there when the hub refuses."""
+    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError
+
+    cause = error.__cause__
+    return cause if isinstance(error, LocalEntryNotFoundError) and isinstance(cause, HfHubHTTPError) else error
+
+
+def _status(error: BaseException) -> int | None:
+    """The status of an answer; None for an error without one."""
+    status: int | None = getattr(getattr(error, "response", None), "status_code", None)
+    return status

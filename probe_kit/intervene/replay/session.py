@@ -23,6 +23,7 @@ from probe_kit.extract.rollout.stage import Seen, Stage
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
+from probe_kit.hooks.checkpoints.checkpoint import cached_folder
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.card import EMBEDDED
@@ -241,8 +242,13 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
 
 
 def _folder_of(run: Run) -> str | None:
-    """The checkpoint folder from which the run was made, if it exists here. A hub id of a run is never fetched."""
+    """The checkpoint from which the run was made, if its folder, or its commit of the hub, is here.
+
+    A hub id of a run is never fetched.
+    """
     made = _checkpoint_of(run)
+    if cached_folder(made) is not None:
+        return made
     is_folder = made not in ("", EMBEDDED) and Path(made).expanduser().is_dir()
     return made if is_folder else None
 

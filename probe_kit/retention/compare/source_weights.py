@@ -12,7 +12,7 @@ def grew_from(policy: RunReader, vlm: RunReader) -> Relation:
     """Compares hash, hub id and number of parameters on both cards; `unknown` where they are too little.
 
     A family's name says which network it is and not which weights: another name is another source, the same name
-    is no evidence.
+    is no evidence. A card names its commit behind an @; the source of a family is known by repository only.
     """
     grown, asked = _card(policy), _card(vlm)
     if grown.get("random_weights") or asked.get("random_weights"):
@@ -20,7 +20,7 @@ def grew_from(policy: RunReader, vlm: RunReader) -> Relation:
     source = grown.get("source_weights") or {}
     if source.get("sha256"):
         return "yes" if source["sha256"] == asked.get("weights_sha256") else "no"
-    if source.get("checkpoint") and source["checkpoint"] == asked.get("checkpoint"):
+    if source.get("checkpoint") and source["checkpoint"] == str(asked.get("checkpoint")).partition("@")[0]:
         return "yes"
     sizes = source.get("parameters"), asked.get("parameters")
     told_apart_by = sizes if None not in sizes else (grown.get("source"), asked.get("family"))

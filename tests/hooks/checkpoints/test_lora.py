@@ -259,3 +259,15 @@ def test_an_adapter_in_a_folder_below_is_pointed_to(folders: tuple[Path, Path]) 
 
 def test_a_folder_without_an_adapter_has_none(folders: tuple[Path, Path]) -> None:
     assert adapter_in(folders[0]) is None
+
+
+@pytest.mark.parametrize("family", ["pi0", "xvla", "magma", "spatialvla"])
+@pytest.mark.parametrize("untrained", [False, True])
+def test_an_adapter_without_a_configuration_is_named_with_what_to_copy(
+    family: str, untrained: bool, tmp_path: Path
+) -> None:
+    alone = tmp_path / "tuned"
+    alone.mkdir()
+    write_adapter(alone, factors("q_proj", torch.zeros(4, 4)), "lab/base")
+    with pytest.raises(CheckpointError, match=r"LoRA adapter of lab/base without config\.json.*Copy config\.json"):
+        load_model(family, str(alone), random_weights=untrained)

@@ -7,6 +7,8 @@ from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.capabilities import MERGED
 from probe_kit.hooks.family import Family
 
+RESIZES = ("nvidia", "lerobot")
+"""Code that brings pictures to their size in two ways."""
 BRIDGE = ("residual", "attention", "mlp")
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "bridge": BRIDGE, "expert": QUANTITIES},
@@ -39,6 +41,8 @@ FAMILIES = (
         config_types=("groot", "Gr00tN1d7"),
         words="probe_kit.hooks.families.groot.adapter:check_groot_words",
         full_size="probe_kit.models.lerobot.groot:full_size_groot",
+        always_float32=True,
+        parameters={"": 3_144_016_000},
         declared={
             "": (
                 backbone(17, 2048, 110, camera="image", sums=False),
@@ -51,6 +55,8 @@ FAMILIES = (
         packages=(("diffusers", "groot"),),
         options=(
             Option("embodiment", str, "Tag in NVIDIA's layout, such as libero_sim.", "the only one"),
+            Option("letterbox", bool, "Black bars make pictures square first.", "as the files say, or false"),
+            Option("resize", str, "Whose code resizes pictures.", "as the layout", RESIZES),
             Option("vlm", str, "Folder or hub id of its Qwen3-VL; no weights.", "as config.json says"),
         ),
         interventions=INTERVENTIONS,

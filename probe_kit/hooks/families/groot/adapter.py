@@ -28,8 +28,9 @@ from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.groot import BRIDGE, INTERVENTIONS
 from probe_kit.hooks.families.groot.checkpoint import GrootChoice, Places, is_nvidias, nvidias_config
-from probe_kit.hooks.families.groot.packing import PackedRow, Packing, padded_labels, read_steps
-from probe_kit.hooks.families.groot.units import BoundedUnits, action_units, state_units
+from probe_kit.hooks.families.groot.packing import PackedRow, Packing, Steps, padded_labels, read_steps
+from probe_kit.hooks.families.groot.pictures import NvidiasPictures, lerobots_rule
+from probe_kit.hooks.families.groot.units import BoundedUnits, StateUnits, action_units, state_units
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, LerobotPolicy
@@ -146,7 +147,7 @@ class Groot(LerobotPolicy):
             )
         else:
             config = super().parse_config(folder, evaluation)
-        config.vlm = chosen.vlm
+        config.vlm, config.resize, config.letterbox = chosen.vlm, chosen.resize, chosen.letterbox
         return config
 
     @classmethod
@@ -178,19 +179,25 @@ class Groot(LerobotPolicy):
         return {**super().side_files(), **side_files(places.base, "base/"), **side_files(places.vlm, "vlm/")}
 
     def further_settings(self) -> dict[str, str]:
-        """Whose statistics and weights are read."""
-        return {"embodiment": str(self.config.embodiment_tag)}
+        """Whose statistics and weights are read, and how pictures are resized."""
+        encode = self._steps.encode
+        return {
+            "embodiment": str(self.config.embodiment_tag),
+            "resize": "nvidia" if isinstance(encode, NvidiasPictures) else "lerobot",
+            "letterbox": str(bool(encode.letter_box_transform)),
+        }
 
     @cached_property
-    def _steps(self) -> Any:
-        return read_steps(self.folder, self.config)
+    def _steps(self) -> Steps:
+        return read_steps(self.folder, self.config, self.config.resize, self.config.letterbox)
 
-    def own_units(self, feature: str, kind: str) -> BoundedUnits:
-        """As lerobot's steps have them. Raises CheckpointError."""
+    def own_units(self, feature: str, kind: str) -> BoundedUnits | StateUnits:
+        """As the processors have them. Raises CheckpointError."""
         del feature
+        steps = self._steps
         if kind == "STATE":
-            return state_units(self._steps.pack, self._state_numbers, self._steps.source)
-        return action_units(self._steps.decode, self._action_numbers, self._steps.source)
+            return state_units(steps.pack, self._state_numbers, steps.source, steps.fields)
+        return action_units(steps.decode, self._action_numbers, steps.source, steps.fields)
 
     @property
     def predicts_relative(self) -> bool:
@@ -200,7 +207,10 @@ class Groot(LerobotPolicy):
     def _notes(self) -> tuple[str, ...]:
         frames = int(self._steps.pack.video_horizon or 1)
         video = f"reads {frames} frames of a video: the one picture is given {frames} times, as lerobot does"
-        return (*super()._notes(), *((video,) if frames > 1 else ()))
+        encode = self._steps.encode
+        rule = encode.rule if isinstance(encode, NvidiasPictures) else lerobots_rule(encode)
+        bars = "with black bars to a square first" if encode.letter_box_transform else "without letterbox"
+        return (*super()._notes(), *((video,) if frames > 1 else ()), f"pictures: {bars}, {rule}")
 
     # -- acting ------------------------------------------------------------------------------------------
 
@@ -350,19 +360,27 @@ def load_groot(
     *,
     embodiment: str | None = None,
     vlm: str | None = None,
+    resize: str | None = None,
+    letterbox: bool | None = None,
     weights_seed: int = 0,
 ) -> Groot:
     """Load a GR00T N1.7 checkpoint of lerobot, or in NVIDIA's own layout; see `LerobotPolicy.load`.
 
     embodiment: tag of NVIDIA's layout; None where there is one only. vlm: folder or hub id of the vision-language
-    model's configuration, tokenizer and processor, where not the one that the checkpoint names.
+    model's configuration, tokenizer and processor, where not the one that the checkpoint names. resize: `nvidia`
+    or `lerobot`, whose code resizes pictures; None for the layout's own. letterbox: whether black bars make
+    pictures square first; None for what the files say.
     """
-    chosen = GrootChoice(embodiment=embodiment, vlm=vlm)
+    chosen = GrootChoice(embodiment=embodiment, vlm=vlm, resize=resize, letterbox=letterbox)
     return Groot.load(checkpoint, device, dtype, random_weights, weights_seed, chosen)
 
 
 def check_groot_words(
-    checkpoint: str, instructions: Sequence[str], embodiment: str | None = None, vlm: str | None = None
+    checkpoint: str,
+    instructions: Sequence[str],
+    embodiment: str | None = None,
+    vlm: str | None = None,
+    **_: Any,
 ) -> None:
     """See `Family.words`."""
     Groot.check_words(checkpoint, instructions, GrootChoice(embodiment=embodiment, vlm=vlm))

@@ -12,6 +12,7 @@ from lerobot.policies.groot.utils import stat_dim_from_entry
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES, checkpoint_folder
+from probe_kit.hooks.families.groot.processor_fields import check_widths, processor_settings, read_state_fields
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
 from probe_kit.models.lerobot.groot import VLM
@@ -22,10 +23,15 @@ _NEEDED = ("processor_config.json", "statistics.json", "embodiment_id.json")
 
 @dataclass(frozen=True)
 class GrootChoice(Evaluation):
-    """What the files of GR00T do not say. embodiment: of NVIDIA's layout. vlm: folder or hub id."""
+    """What the files of GR00T do not say. embodiment: of NVIDIA's layout. vlm: folder or hub id.
+
+    resize: whose code brings pictures to their size. letterbox: whether they are made square with bars first.
+    """
 
     embodiment: str | None = None
     vlm: str | None = None
+    resize: str | None = None
+    letterbox: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -71,7 +77,7 @@ def nvidias_config(folder: Path, embodiment: str | None) -> GrootConfig:
     for a tag that they do not have.
     """
     content = {name: read_json_object(folder / name, CheckpointError, _AGAIN) for name in _NEEDED}
-    modalities = content["processor_config.json"].get("processor_kwargs", {}).get("modality_configs", {})
+    modalities = processor_settings(folder).get("modality_configs", {})
     statistics = content["statistics.json"]
     tags = sorted(set(modalities) & set(statistics) & set(content["embodiment_id.json"]))
     tag = tags[0] if embodiment is None and len(tags) == 1 else embodiment
@@ -79,6 +85,8 @@ def nvidias_config(folder: Path, embodiment: str | None) -> GrootConfig:
         asked = "no embodiment was chosen" if embodiment is None else f"there is no embodiment {embodiment!r}"
         raise UsageError(f"{folder}: {asked}. Choose with -M embodiment=TAG; it has {', '.join(tags) or 'none'}")
     network = read_json_object(folder / CONFIG_FILE, CheckpointError, _AGAIN)
+    read_state_fields(folder, tag)
+    check_widths(folder, network)
     widths = {
         feature: sum(stat_dim_from_entry(statistics[tag].get(feature, {}).get(key, {})) for key in own)
         for feature in ("state", "action")

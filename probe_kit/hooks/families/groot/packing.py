@@ -28,6 +28,8 @@ from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.groot.pictures import nvidias_pictures
+from probe_kit.hooks.families.groot.processor_fields import StateFields, processor_settings, read_state_fields
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
 from probe_kit.models.pretrained import load_pretrained
 
@@ -46,12 +48,16 @@ _HARMLESS = ("rename_observations_processor", "to_batch_processor", "device_proc
 
 @dataclass(frozen=True)
 class Steps:
-    """lerobot's steps of one checkpoint: packing, pictures and words, actions. source: where they come from."""
+    """lerobot's steps of one checkpoint: packing, pictures and words, actions. source: where they come from.
+
+    fields: what NVIDIA's processor file says of the state; None in lerobot's layout.
+    """
 
     pack: GrootN17PackInputsStep
     encode: GrootN17VLMEncodeStep
     decode: GrootN17ActionDecodeStep | GrootActionUnpackUnnormalizeStep
     source: str
+    fields: StateFields | None = None
 
     def __post_init__(self) -> None:
         if (tag := self.pack.embodiment_tag) not in self.pack.embodiment_mapping:
@@ -59,14 +65,31 @@ class Steps:
             raise CheckpointError(f"{self.source} gives {tag!r} no number; it has {known}")
 
 
-def read_steps(folder: Path, config: GrootConfig) -> Steps:
+def read_steps(
+    folder: Path, config: GrootConfig, resize: str | None = None, letterbox: bool | None = None
+) -> Steps:
     """The steps that lerobot makes of NVIDIA's files, or of the pipelines that it saved.
 
-    Raises CheckpointError for files that are missing, and for a step that is not known here.
+    resize: `nvidia` or `lerobot`, whose code brings pictures to their size; None for the layout's own. letterbox:
+    whether pictures are made square with bars first; None for what the files say.
+    Raises CheckpointError for files that are missing, and for a step or field that is not known here.
     """
-    if is_raw_groot_n1_7_checkpoint(folder):
-        before, behind = make_groot_pre_post_processors(config)
-        return _chosen([*before.steps, *behind.steps], "processor_config.json and statistics.json")
+    raw = is_raw_groot_n1_7_checkpoint(folder)
+    steps = _nvidias_steps(folder, config) if raw else _lerobots_steps(folder, config)
+    encode = steps.encode if letterbox is None else replace(steps.encode, letter_box_transform=letterbox)
+    if (resize or ("nvidia" if raw else "lerobot")) == "nvidia":
+        encode = nvidias_pictures(encode, processor_settings(folder) if raw else None)
+    return replace(steps, encode=encode)
+
+
+def _nvidias_steps(folder: Path, config: GrootConfig) -> Steps:
+    fields = read_state_fields(folder, str(config.embodiment_tag))
+    before, behind = make_groot_pre_post_processors(config)
+    found = _chosen([*before.steps, *behind.steps], "processor_config.json and statistics.json")
+    return replace(found, fields=fields)
+
+
+def _lerobots_steps(folder: Path, config: GrootConfig) -> Steps:
     steps = []
     for name in ("policy_preprocessor", "policy_postprocessor"):
         path = folder / f"{name}.json"

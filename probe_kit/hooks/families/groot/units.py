@@ -1,6 +1,6 @@
-"""Physical units of GR00T, as lerobot's processor steps map them to numbers between −1 and 1."""
+"""Physical units of GR00T, as the processors of lerobot and of NVIDIA map them to the network's numbers."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +14,9 @@ from lerobot.policies.groot.utils import config_value
 from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.families.shared.lerobot.normaliser import outside
-from probe_kit.models.bounds import check_bounds
+from probe_kit.hooks.families.groot.processor_fields import StateFields
+from probe_kit.hooks.families.shared.lerobot.normaliser import USUAL_DEVIATIONS, outside
+from probe_kit.models.bounds import check_bounds, check_deviations
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,8 @@ class BoundedUnits:
     """Numbers between −1 and 1. low, high: (D,) float32, what these stand for.
 
     clamp: whether values outside are moved to the bounds. sign: the number that becomes −1 or 1, as LIBERO's
-    gripper; None where there is none.
+    gripper; None where there is none. deviations: (D,) numbers that are mapped by mean and deviation, which stand
+    in `low` and `high`, and never clamped; None for none.
     """
 
     low: NDArray[np.float32]
@@ -32,43 +34,133 @@ class BoundedUnits:
     source: str
     clamp: bool = True
     sign: int | None = None
+    deviations: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
-        check_bounds(self.low, self.high, self.source)
+        check_bounds(self.low[~self._scored], self.high[~self._scored], self.source)
+        if self._scored.any():
+            check_deviations(self.low[self._scored], self.high[self._scored], self.source)
+
+    @property
+    def _scored(self) -> NDArray[np.bool_]:
+        return np.zeros(len(self.low), bool) if self.deviations is None else self.deviations
 
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Physical units to the numbers the network reads; (..., D). A number without a range becomes 0."""
         span = self.high - self.low
         mapped = np.where(span == 0, 0, 2 * (values - self.low) / np.where(span == 0, 1, span) - 1)
-        return np.asarray(mapped.clip(-1, 1) if self.clamp else mapped, np.float32)
+        mapped = mapped.clip(-1, 1) if self.clamp else mapped
+        if self._scored.any():
+            still = self.high == 0  # NVIDIA leaves a number without deviation as it is
+            scores = np.where(still, values, (values - self.low) / np.where(still, 1, self.high))
+            mapped = np.where(self._scored, scores, mapped)
+        return np.asarray(mapped, np.float32)
 
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Network output to physical units; (..., D)."""
         inside = values.clip(-1, 1) if self.clamp else values
         restored = np.asarray((inside + 1) * 0.5 * (self.high - self.low) + self.low, np.float32)
+        if self._scored.any():
+            scores = np.where(self.high == 0, values, values * self.high + self.low)
+            restored = np.asarray(np.where(self._scored, scores, restored), np.float32)
         if self.sign is not None:
             restored[..., self.sign] = -np.sign(2 * restored[..., self.sign] - 1)
         return restored
 
     def slope(self, numbers: int) -> NDArray[np.float32]:
         """(D,) of `restore`, where it does not clamp; 0 for a number that jumps."""
-        own = np.asarray((self.high - self.low) / 2, np.float32)[:numbers].copy()
+        scores = np.where(self.high == 0, 1, self.high)
+        own = np.where(self._scored, scores, (self.high - self.low) / 2).astype(np.float32)[:numbers]
         if self.sign is not None:
             own[self.sign] = 0
         return own
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(..., D) of `restore` at these outputs of the network; 0 where it clamps."""
-        inside = np.abs(values) <= 1 if self.clamp else np.ones(values.shape, bool)
+        inside = (np.abs(values) <= 1) | self._scored if self.clamp else np.ones(values.shape, bool)
         return np.asarray(inside * self.slope(values.shape[-1]), np.float32)
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D): outside the bounds."""
-        return outside(values, self.low, self.high)
+        """(..., D): outside the bounds, or far from the mean."""
+        beyond = outside(values, self.low, self.high)
+        if not self._scored.any():
+            return beyond
+        far = np.abs(values - self.low) > USUAL_DEVIATIONS * self.high
+        return np.asarray(np.where(self._scored, far, beyond))
 
 
-def state_units(step: GrootN17PackInputsStep, numbers: int, source: str) -> BoundedUnits:
-    """Of lerobot's packing step. Raises CheckpointError where it would let the state pass unchanged."""
+@dataclass(frozen=True)
+class StateUnits:
+    """The state as NVIDIA's processor gives it to the network. bounded: of every physical number.
+
+    angles: (begin, end) of the groups in which the sines of all numbers, then their cosines stand for the numbers.
+    excluded: whether the network reads zeros in their place.
+    """
+
+    bounded: BoundedUnits
+    angles: tuple[tuple[int, int], ...] = ()
+    excluded: bool = False
+
+    @property
+    def mode(self) -> str:
+        """The kinds of map."""
+        if self.excluded:
+            return "EXCLUDED (zeros)"
+        return f"{self.bounded.mode} and SIN_COS" if self.angles else self.bounded.mode
+
+    @property
+    def source(self) -> str:
+        """The files the statistics come from."""
+        return self.bounded.source
+
+    @property
+    def numbers(self) -> int:
+        """How many the network reads."""
+        return len(self.bounded.low) + sum(end - begin for begin, end in self.angles)
+
+    def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Physical units to the numbers the network reads; (..., D) to (..., numbers)."""
+        if self.excluded:
+            return np.zeros((*values.shape[:-1], self.numbers), np.float32)
+        mapped, done = self.bounded.normalise(values), 0
+        parts = []
+        for begin, end in self.angles:
+            own = values[..., begin:end]
+            parts += [mapped[..., done:begin], np.sin(own), np.cos(own)]
+            done = end
+        return np.asarray(np.concatenate([*parts, mapped[..., done:]], -1), np.float32)
+
+    def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Raise CheckpointError for numbers that have no way back to a state."""
+        if self.angles or self.excluded:
+            raise CheckpointError(f"{self.source}: a state that is {self.mode} has no way back to physical units")
+        return self.bounded.restore(values)
+
+    def slope(self, numbers: int) -> NDArray[np.float32]:
+        """(D,) of `restore`."""
+        return self.bounded.slope(numbers)
+
+    def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(..., D) of `restore`."""
+        return self.bounded.slopes(values)
+
+    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(..., D): outside the bounds, or far from the mean; never of an angle or of what is not read."""
+        beyond = self.bounded.unusual(values)
+        for begin, end in self.angles:
+            beyond[..., begin:end] = False
+        return np.zeros_like(beyond) if self.excluded else beyond
+
+
+def state_units(
+    step: GrootN17PackInputsStep, numbers: int, source: str, fields: StateFields | None = None
+) -> BoundedUnits | StateUnits:
+    """Of lerobot's packing step; as NVIDIA's processor has them where its `fields` are there.
+
+    Raises CheckpointError where it would let the state pass unchanged.
+    """
+    if fields is not None:
+        return _nvidias_state(step, numbers, source, fields)
     if not step.normalize_min_max:
         raise CheckpointError(f"{source} does not normalise the state: its units are unknown")
     low, high = _bounds((step.stats or {}).get("observation.state", {}), numbers, "observation.state", source)
@@ -76,15 +168,18 @@ def state_units(step: GrootN17PackInputsStep, numbers: int, source: str) -> Boun
 
 
 def action_units(
-    step: GrootN17ActionDecodeStep | GrootActionUnpackUnnormalizeStep, numbers: int, source: str
+    step: GrootN17ActionDecodeStep | GrootActionUnpackUnnormalizeStep,
+    numbers: int,
+    source: str,
+    fields: StateFields | None = None,
 ) -> BoundedUnits:
-    """Of lerobot's step that decodes actions.
+    """Of lerobot's step that decodes actions. fields: of NVIDIA's processor file, where it is there.
 
     Raises CheckpointError for statistics that are missing, and for actions relative to the state: they have no
     unit of their own.
     """
     if isinstance(step, GrootN17ActionDecodeStep):
-        return _grouped(step, numbers, source)
+        return _grouped(step, numbers, source, () if fields is None else fields.action_deviations)
     if not step.normalize_min_max:
         raise CheckpointError(f"{source} does not normalise actions: their units are unknown")
     low, high = _bounds((step.stats or {}).get("action", {}), numbers, "action", source)
@@ -96,14 +191,69 @@ def action_units(
     )
 
 
-def _grouped(step: GrootN17ActionDecodeStep, numbers: int, source: str) -> BoundedUnits:
-    """The groups of NVIDIA's statistics side by side, in the order of the configuration."""
+def _nvidias_state(step: GrootN17PackInputsStep, numbers: int, source: str, fields: StateFields) -> StateUnits:
+    """The groups of the state side by side, each mapped in its own way."""
+    keys = (step.modality_config or {}).get("state", {}).get("modality_keys", [])
+    statistics = (step.raw_stats or {}).get("state", {})
+    names = ("q01", "q99") if step.use_percentiles else ("min", "max")
+    low, high, scored, ends = _side_by_side(keys, statistics, names, fields.deviations, f"{source}: the state")
+    if len(low) != numbers:
+        raise CheckpointError(f"{source} has statistics of {len(low)} numbers; the state has {numbers}")
+    mode = _mode(names, scored)
+    bounded = BoundedUnits(low, high, mode, source, step.clip_outliers, deviations=scored)
+    units = StateUnits(bounded, tuple(ends[key] for key in keys if key in fields.angles), fields.excluded)
+    if units.numbers > step.max_state_dim:
+        raise CheckpointError(
+            f"{source}: the state with its sines and cosines has {units.numbers} numbers; the network reads "
+            f"{step.max_state_dim}. Take the original files"
+        )
+    return units
+
+
+def _side_by_side(
+    keys: Sequence[str],
+    statistics: Mapping[str, Any],
+    names: tuple[str, str],
+    scored: Collection[str],
+    subject: str,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], dict[str, tuple[int, int]]]:
+    """Two statistics of groups as vectors, which numbers are means and deviations, and where each group stands.
+
+    names: the statistics of groups that are not in `scored`. Raises CheckpointError for one that is missing.
+    """
+    parts: tuple[list[NDArray[np.float32]], ...] = ([], [])
+    flags: list[bool] = []
+    ends: dict[str, tuple[int, int]] = {}
+    for key in keys:
+        entry, own = statistics.get(key, {}), ("mean", "std") if key in scored else names
+        if missing := [name for name in own if name not in entry]:
+            raise CheckpointError(f"{subject} {key!r} has no statistics {', '.join(missing)}")
+        low, high = (np.atleast_1d(np.asarray(entry[name], np.float32)) for name in own)
+        for part, side in zip(parts, (low, high), strict=True):
+            part.append(side)
+        ends[key] = (len(flags), len(flags) + len(low))
+        flags += [key in scored] * len(low)
+    nothing = np.zeros(0, np.float32)
+    below, above = (np.concatenate([nothing, *part]) for part in parts)
+    return below, above, np.array(flags, bool), ends
+
+
+def _mode(names: tuple[str, str], scored: NDArray[np.bool_]) -> str:
+    own = "QUANTILES" if names[0] == "q01" else "MIN_MAX"
+    return own if not scored.any() else "MEAN_STD" if scored.all() else f"{own} and MEAN_STD"
+
+
+def _grouped(
+    step: GrootN17ActionDecodeStep, numbers: int, source: str, scored: Collection[str] = ()
+) -> BoundedUnits:
+    """The groups of NVIDIA's statistics side by side, in the order of the configuration.
+
+    scored: groups that are mapped by mean and deviation.
+    """
     own = (step.modality_config or {}).get("action", {})
     keys, kinds = own.get("modality_keys", []), own.get("action_configs", [])
     statistics = (step.raw_stats or {}).get("action", {})
     names = ("q01", "q99") if step.use_percentiles else ("min", "max")
-    parts: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
-    where: dict[str, int] = {}
     for index, key in enumerate(keys):
         kind = kinds[index] if index < len(kinds) else {}
         if step.use_relative_action and config_value(kind.get("rep")) == "relative":
@@ -111,20 +261,15 @@ def _grouped(step: GrootN17ActionDecodeStep, numbers: int, source: str) -> Bound
                 f"{source}: the actions of {key!r} are relative to the state in which the chunk was predicted; "
                 "probe_kit does not add it. Capture with --no-act"
             )
-        entry = statistics.get(key, {})
-        if missing := [name for name in names if name not in entry]:
-            raise CheckpointError(f"{source} has no statistics {', '.join(missing)} of the action {key!r}")
-        where[key] = sum(len(low) for low, _ in parts)
-        parts.append(tuple(np.atleast_1d(np.asarray(entry[name], np.float32)) for name in names))  # type: ignore[arg-type]
-    nothing = np.zeros(0, np.float32)
-    low, high = (np.concatenate([nothing, *(part[side] for part in parts)])[:numbers] for side in (0, 1))
-    if len(low) != numbers:
+    low, high, flags, ends = _side_by_side(keys, statistics, names, scored, f"{source}: the action")
+    if len(low) < numbers:
         raise CheckpointError(f"{source} has statistics of {len(low)} numbers; an action has {numbers}")
-    if step.action_decode_transform is not None and where.get("gripper", numbers) >= numbers:
+    begin = ends["gripper"][0] if "gripper" in ends else numbers
+    if step.action_decode_transform is not None and begin >= numbers:
         raise CheckpointError(f"{source} has no action 'gripper', which LIBERO's convention is about")
-    sign = where["gripper"] if step.action_decode_transform is not None else None
-    mode = "QUANTILES" if step.use_percentiles else "MIN_MAX"
-    return BoundedUnits(low, high, mode, source, sign=sign)
+    sign = begin if step.action_decode_transform is not None else None
+    low, high, flags = low[:numbers], high[:numbers], flags[:numbers]
+    return BoundedUnits(low, high, _mode(names, flags), source, sign=sign, deviations=flags)
 
 
 def _bounds(

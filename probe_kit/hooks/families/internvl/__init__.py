@@ -23,6 +23,7 @@ FAMILIES = (
         ),
         declared={"8B": answering(37, 4096, 300), "38B": answering(65, 5120, 300)},
         full_size="probe_kit.models.internvl:full_size_internvl",
+        parameters={"8B": 8_528_318_464, "38B": 38_390_405_504},
         stored_names="probe_kit.models.internvl:FILE_NAMES",
         sizes=(
             ("8B", "OpenGVLab/InternVL3_5-8B-HF"),

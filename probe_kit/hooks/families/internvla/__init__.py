@@ -48,6 +48,7 @@ FAMILIES = (
             )
         },
         full_size="probe_kit.models.internvla:full_size_internvla",
+        parameters={"": 3_872_703_111},
         hub=(
             ("InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge", "config.yaml"),
             ("Qwen/Qwen2.5-VL-3B-Instruct", "tokenizer.json"),

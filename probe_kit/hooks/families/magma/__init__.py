@@ -22,6 +22,7 @@ FAMILIES = (
         of_default={"unnorm_key": "bridge_orig"},
         declared={"": (backbone(33, 4096, 320, "separator"), chosen_tokens("action", 33, 4096, 7))},
         full_size="probe_kit.models.magma:full_size_magma",
+        parameters={"": 8_903_549_824},
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
             Option("statistics", str, "File with action statistics, instead of the checkpoint's.", "none"),

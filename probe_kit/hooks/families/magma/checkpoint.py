@@ -11,6 +11,7 @@ from torch import Tensor
 
 from probe_kit.errors import UsageError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype
+from probe_kit.hooks.checkpoints.file_checks import check_own_config
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.magma import UNUSED_WEIGHTS, MagmaConfig, MagmaNetwork, build_magma, shipped_statistics
@@ -62,6 +63,7 @@ def load_checkpoint(
     Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
     """
     folder = checkpoint_folder(checkpoint)
+    check_own_config(folder)
     config = MagmaConfig.from_folder(folder)
     name = chosen_dtype(dtype, config.dtype, _DTYPES)
     if random_weights:

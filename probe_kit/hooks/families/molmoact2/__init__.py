@@ -34,6 +34,7 @@ FAMILIES = (
         config_types=("molmoact2",),
         words="probe_kit.hooks.families.molmoact2.adapter:check_molmoact2_words",
         full_size="probe_kit.models.lerobot.molmoact2:full_size_molmoact2",
+        parameters={"": 5_442_196_208},
         declared={
             "": (
                 backbone(37, 2560, 310, "state", camera="image"),

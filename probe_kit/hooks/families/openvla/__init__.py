@@ -36,6 +36,7 @@ FAMILIES = (
         packages=(("timm", "openvla"),),
         notes="MIT, Llama 2 licence; extra openvla; about 16 GB in bfloat16",
         verifier="probe_kit.hooks.families.openvla.verify:verify_openvla",
+        bare_adapters=True,
         config_types=("openvla", "prismatic"),
         source="prismatic",
         words="probe_kit.hooks.families.openvla.adapter:check_openvla_words",
@@ -43,6 +44,7 @@ FAMILIES = (
         of_default={"unnorm_key": BRIDGE},
         declared={"": (backbone(33, 4096, 275), chosen_tokens("action", 33, 4096, 7))},
         full_size="probe_kit.models.prismatic:full_size_openvla",
+        parameters={"": 7_541_237_184},
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
             Option(

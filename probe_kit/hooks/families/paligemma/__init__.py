@@ -33,6 +33,7 @@ FAMILIES = (
         config_types=("paligemma",),
         declared={"": answering(19, 2048, 290)},
         full_size="probe_kit.models.paligemma:full_size_paligemma",
+        parameters={"": 2_923_466_480},
         stored_names="probe_kit.models.paligemma:FILE_NAMES",
         options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),),
         acts=False,

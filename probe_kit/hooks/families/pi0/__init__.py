@@ -74,6 +74,8 @@ FAMILIES = (
             )
         },
         full_size="probe_kit.models.lerobot.pi0:full_size_pi0",
+        parameters={"": 4_028_019_472},
+        not_acting=("lerobot/pi0_base",),
         options=(
             *EVALUATION_OPTIONS,
             Option("unread", str, "Settings of config.json that change nothing, comma-separated.", "none"),

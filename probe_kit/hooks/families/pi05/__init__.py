@@ -32,6 +32,7 @@ FAMILIES = (
             )
         },
         full_size="probe_kit.models.lerobot.pi05:full_size_pi05",
+        parameters={"": 4_143_404_816},
         options=EVALUATION_OPTIONS,
         interventions=FLOW,
     ),

@@ -29,7 +29,7 @@ from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.families.pi0_fast import CAPTURED, FAST
 from probe_kit.hooks.families.pi0_fast.actions import ActionText, DecodedChunk, FastTokenizer, fast_folder
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
-from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
+from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.paligemma import PaliGemmaPolicy, sizes_file
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
@@ -45,10 +45,14 @@ _LAST = slice(-1, None)
 
 @dataclass(frozen=True)
 class Decoding(Evaluation):
-    """How action tokens are put out. captured: those that are sites. temperature: None for the checkpoint's."""
+    """How action tokens are put out. captured: those that are sites. temperature: None for the checkpoint's.
+
+    lowercase: the instruction in lower case, as openpi has it; lerobot keeps its case.
+    """
 
     captured: int = CAPTURED
     temperature: float | None = None
+    lowercase: bool = False
 
 
 class Pi0Fast(StatePrompt, PaliGemmaPolicy):
@@ -59,6 +63,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     family = "pi0-fast"
     config_type = "pi0_fast"
+    decoding = Decoding()
     known_steps = (CROP, "pi0_fast_prepare_state_tokenizer_processor_step", "action_tokenizer_processor")
     interventions = FAST
 
@@ -103,8 +108,23 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         return float(self.config.temperature if asked is None else asked)
 
     def further_settings(self) -> dict[str, str]:
-        """How tokens are put out."""
-        return {"captured_tokens": str(self.decoding.captured), "temperature": repr(self.temperature)}
+        """How the instruction is written and how tokens are put out."""
+        return {
+            "captured_tokens": str(self.decoding.captured),
+            "lowercase": str(self.decoding.lowercase),
+            "temperature": repr(self.temperature),
+        }
+
+    def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
+        """As lerobot words it, in lower case where that is chosen."""
+        return super().prompts([text.lower() if self.decoding.lowercase else text for text in instructions], state)
+
+    @classmethod
+    def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
+        """Raise InstructionError for the text that is read, from configuration and tokenizer alone."""
+        lowercase = isinstance(evaluation, Decoding) and evaluation.lowercase
+        texts = [text.lower() if lowercase else text for text in instructions]
+        super().check_words(checkpoint, texts, evaluation)
 
     def _notes(self) -> tuple[str, ...]:
         most, chunk, executed = (
@@ -117,6 +137,9 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
             *super()._notes(),
             f"of up to {most} action tokens the first {self.decoding.captured} are captured",
             *((other,) if executed != chunk else ()),
+            "the instruction is in lower case, as openpi has it; lerobot keeps its case"
+            if self.decoding.lowercase
+            else "the instruction keeps its case, as in lerobot; openpi writes lower case (-M lowercase=true)",
         )
 
     def side_files(self) -> dict[str, Path]:
@@ -234,17 +257,19 @@ def load_pi0_fast(
     *,
     captured_tokens: int = CAPTURED,
     temperature: float | None = None,
+    lowercase: bool = False,
     weights_seed: int = 0,
 ) -> Pi0Fast:
     """Load a lerobot pi0-FAST checkpoint; see `LerobotPolicy.load`.
 
     captured_tokens: how many of the action tokens are sites. temperature: 0 for the likeliest token; above, drawn
-    by each row's seed; None for the checkpoint's. Raises UsageError for values outside of these.
+    by each row's seed; None for the checkpoint's. lowercase: the instruction in lower case, as openpi has it.
+    Raises UsageError for values outside of these.
     """
-    decoding = Decoding(captured=captured_tokens, temperature=temperature)
+    decoding = Decoding(captured=captured_tokens, temperature=temperature, lowercase=lowercase)
     return Pi0Fast.load(checkpoint, device, dtype, random_weights, weights_seed, decoding)
 
 
-def check_pi0_fast_words(checkpoint: str, instructions: Sequence[str], **_: Any) -> None:
+def check_pi0_fast_words(checkpoint: str, instructions: Sequence[str], lowercase: bool = False, **_: Any) -> None:
     """See `Family.words`."""
-    Pi0Fast.check_words(checkpoint, instructions)
+    Pi0Fast.check_words(checkpoint, instructions, Decoding(lowercase=lowercase))

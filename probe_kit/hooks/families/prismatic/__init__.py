@@ -24,6 +24,7 @@ FAMILIES = (
             "also folders in the layout of PrismaticForConditionalGeneration"
         ),
         verifier="probe_kit.hooks.families.prismatic.verify:verify_prismatic",
+        bare_adapters=True,
         config_types=("prismatic", "openvla"),
         files=(*PATTERNS, RUN_WEIGHTS),
         hub=(
@@ -33,6 +34,7 @@ FAMILIES = (
         ),
         declared={"": answering(33, 4096, 290)},
         full_size="probe_kit.models.prismatic:full_size_prismatic",
+        parameters={"": 7_541_237_184},
         options=(TOKENIZER, BITS, Option("steps", int, "Greedy tokens per inference.", "1")),
         acts=False,
         reads=True,

@@ -21,6 +21,7 @@ FAMILIES = (
             "3B": answering(37, 2048, 110),
         },
         full_size="probe_kit.models.qwen:full_size_qwen2_5_vl",
+        parameters={"7B": 8_292_166_656, "32B": 33_452_718_336, "3B": 3_754_622_976},
         stored_names="probe_kit.models.qwen:QWEN2_5_NAMES",
         sizes=(
             ("7B", "Qwen/Qwen2.5-VL-7B-Instruct"),

@@ -21,6 +21,7 @@ FAMILIES = (
             "4B": answering(37, 2560, 110, sums=False),
         },
         full_size="probe_kit.models.qwen:full_size_qwen3_vl",
+        parameters={"8B": 8_767_123_696, "32B": 33_357_390_064, "4B": 4_437_815_808},
         sizes=(
             ("8B", "Qwen/Qwen3-VL-8B-Instruct"),
             ("32B", "Qwen/Qwen3-VL-32B-Instruct"),

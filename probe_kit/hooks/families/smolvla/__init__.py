@@ -24,6 +24,8 @@ FAMILIES = (
             "": (backbone(17, 960, 113, "state", camera="top"), expert(17, 720, 10, 50, ("action",))),
         },
         full_size="probe_kit.models.lerobot.smolvla:full_size_smolvla",
+        always_float32=True,
+        parameters={"": 450_046_176},
         interventions=FLOW,
     ),
 )

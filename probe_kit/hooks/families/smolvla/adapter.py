@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, is_on_hub, side_files
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.attention_weights import Note, shares
 from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow
-from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
+from probe_kit.hooks.families.shared.lerobot.pipelines import CROP, tokenizer_folder, tokenizer_name
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, flow_stacks
 from probe_kit.models.lerobot.smolvla import build_smolvla, current_smolvla_keys, locate_vlm
 from probe_kit.models.pretrained import load_pretrained
@@ -73,12 +73,15 @@ class SmolVLA(LerobotFlow):
 
     @cached_property
     def tokenizer(self) -> Any:
-        """The VLM's; found by its name where words are checked without a network."""
-        if hasattr(self, "network"):
-            return self._joint.processor.tokenizer
+        """That of the saved step, or else the VLM's, found by its name where there is no network yet."""
         from transformers import AutoTokenizer
 
-        return load_pretrained(AutoTokenizer, locate_vlm(self.config, self.folder))
+        if (saved := tokenizer_folder(self.folder)) is not None:
+            return load_pretrained(AutoTokenizer, saved)
+        named, vlm = tokenizer_name(self.folder), locate_vlm(self.config, self.folder)
+        if named is not None and named != vlm and is_on_hub(named) and is_on_hub(vlm):
+            return load_pretrained(AutoTokenizer, checkpoint_folder(named, SMALL_FILES))
+        return self._joint.processor.tokenizer if hasattr(self, "network") else load_pretrained(AutoTokenizer, vlm)
 
     def side_files(self) -> dict[str, Path]:
         """Also the VLM's configuration and tokenizer, where they lie in a folder here."""

@@ -22,6 +22,7 @@ FAMILIES = (
         of_default={"unnorm_key": "bridge_orig/1.0.0"},
         declared={"": (backbone(27, 2304, 269), chosen_tokens("action", 27, 2304, 3))},
         full_size="probe_kit.models.spatialvla:full_size_spatialvla",
+        parameters={"": 4_027_854_731},
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
             Option("prompt", str, "bare, question or a template with {instruction}.", "bare"),

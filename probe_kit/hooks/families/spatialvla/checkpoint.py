@@ -10,6 +10,7 @@ import torch
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype
+from probe_kit.hooks.checkpoints.file_checks import check_own_config
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.spatialvla import SpatialVLAConfig, SpatialVLANetwork, build_spatialvla
@@ -63,6 +64,7 @@ def load_checkpoint(
     for another dtype.
     """
     folder = checkpoint_folder(checkpoint)
+    check_own_config(folder)
     config = SpatialVLAConfig.from_folder(folder)
     name = chosen_dtype(dtype, config.dtype, _DTYPES)
     processor = read_processor(folder)

@@ -41,6 +41,7 @@ FAMILIES = (
             )
         },
         full_size="probe_kit.models.xiaomi:full_size_xiaomi",
+        parameters={"": 4_716_274_176},
         options=(
             Option("robot", str, "Robot whose statistics, picture and state are used.", "the only one"),
             Option("steps", int, "Euler steps of the flow.", "5"),

@@ -7,6 +7,8 @@ from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.families.shared.capabilities import MERGED
 from probe_kit.hooks.family import Family
 
+PICTURES = ("padded", "squashed")
+"""As lerobot, and as the authors."""
 BLOCK = ("residual", "attention", "mlp")
 INTERVENTIONS = Interventions(
     edits={"backbone": BLOCK, "expert": BLOCK},
@@ -33,12 +35,14 @@ FAMILIES = (
         notes=(
             "A checkpoint in lerobot's layout. Its configuration holds Florence-2's; the tokenizer "
             "facebook/bart-large is fetched where no tokenizer.json lies beside it. -M domain=N chooses the soft "
-            "prompts of another robot. Absolute poses cannot act here: --no-act"
+            "prompts of another robot. Pictures are padded as config.json says; the authors squash them to 224 x "
+            "224, bicubic (-M picture=squashed). Absolute poses cannot act here: --no-act"
         ),
         verifier="probe_kit.hooks.families.xvla.verify:verify_xvla",
         config_types=("xvla",),
         words="probe_kit.hooks.families.xvla.adapter:check_xvla_words",
         full_size="probe_kit.models.lerobot.xvla:full_size_xvla",
+        parameters={"": 879_851_096},
         declared={
             "": (
                 DeclaredStream(
@@ -48,6 +52,13 @@ FAMILIES = (
             )
         },
         options=(
+            Option(
+                "picture",
+                str,
+                "How pictures come to the network's resolution.",
+                "padded where config.json has resize_imgs_with_padding",
+                PICTURES,
+            ),
             Option("domain", int, "Number of the robot's soft prompts.", "as policy_preprocessor.json says"),
         ),
         interventions=INTERVENTIONS,

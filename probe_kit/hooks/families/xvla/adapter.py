@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from lerobot.utils.constants import IMAGENET_STATS
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
@@ -27,7 +28,7 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.views import PADDING
-from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
+from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation, Picture
 from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE, LerobotPolicy
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
@@ -108,6 +109,10 @@ class Xvla(LerobotPolicy):
         domain = evaluation.domain if isinstance(evaluation, XvlaChoice) else None
         config.steps = read_steps(folder, domain, tuple(config.image_features))
         config.tokenizer_max_length = config.steps.length or config.tokenizer_max_length
+        config.picture = evaluation.picture or ("padded" if config.resize_imgs_with_padding else None)
+        if config.picture and config.resize_imgs_with_padding is None:
+            height, width = next(iter(config.image_features.values())).shape[-2:]
+            config.resize_imgs_with_padding = (width, height)
         return config
 
     @classmethod
@@ -138,8 +143,25 @@ class Xvla(LerobotPolicy):
         return found
 
     def further_settings(self) -> dict[str, str]:
-        """Whose soft prompts are read."""
-        return {"domain": str(self.steps.domain)}
+        """Whose soft prompts are read, and how pictures come to their size."""
+        return {"domain": str(self.steps.domain), "picture": str(self.config.picture)}
+
+    def _notes(self) -> tuple[str, ...]:
+        if self.config.picture is None:
+            how = "are read at the size that they have; X-VLA's authors squash them (-M picture=squashed)"
+        else:
+            size = " x ".join(map(str, self.config.resize_imgs_with_padding))
+            squashed = f"squashed to {size}, bicubic, as X-VLA's authors; lerobot pads"
+            padded = f"padded to {size}, as lerobot; X-VLA's authors squash them (-M picture=squashed)"
+            how = f"are {squashed if self.config.picture == 'squashed' else padded}"
+        return (*super()._notes(), f"pictures {how}")
+
+    def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:
+        """(B, 3, H, W) in [0, 1]: squashed where that is chosen; lerobot's network pads any other."""
+        if self.config.picture == "squashed":
+            size = tuple(self.config.resize_imgs_with_padding)
+            images = [np.asarray(Image.fromarray(own).resize(size, Image.Resampling.BICUBIC)) for own in images]
+        return super().look(camera, images)
 
     def side_files(self) -> dict[str, Path]:
         """Also the tokenizer, where it is another folder's."""
@@ -283,15 +305,18 @@ def load_xvla(
     random_weights: bool = False,
     *,
     domain: int | None = None,
+    picture: Picture | None = None,
     weights_seed: int = 0,
 ) -> Xvla:
     """Load a lerobot X-VLA checkpoint; see `LerobotPolicy.load`.
 
-    domain: number of the robot's soft prompts; None for the one that the processor files name.
+    domain: number of the robot's soft prompts; None for the one that the processor files name. picture: `padded`
+    as lerobot or `squashed` as the authors; None for what `config.json` says.
     """
-    return Xvla.load(checkpoint, device, dtype, random_weights, weights_seed, XvlaChoice(domain=domain))
+    chosen = XvlaChoice(domain=domain, picture=picture)
+    return Xvla.load(checkpoint, device, dtype, random_weights, weights_seed, chosen)
 
 
-def check_xvla_words(checkpoint: str, instructions: Sequence[str], domain: int | None = None) -> None:
+def check_xvla_words(checkpoint: str, instructions: Sequence[str], domain: int | None = None, **_: Any) -> None:
     """See `Family.words`."""
     Xvla.check_words(checkpoint, instructions, XvlaChoice(domain=domain) if domain is not None else AS_STORED)

@@ -56,7 +56,8 @@ class TestGroot(AdapterContract):
 
     @pytest.fixture
     def other_options(self, folder: Path) -> Mapping[str, Any]:
-        return {"embodiment": "other", "vlm": str(folder / "base" / "vlm")}
+        vlm = str(folder / "base" / "vlm")
+        return {"embodiment": "other", "vlm": vlm, "resize": "lerobot", "letterbox": True}
 
 
 def lerobots(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[GrootPolicy, Any, Any]:
@@ -87,7 +88,7 @@ def test_actions_are_those_of_lerobots_own_loading_processors_and_sampling_bit_f
 ) -> None:
     """From the raw picture and state to metres, with noise that lerobot draws itself of the same seed."""
     place = folder if layout == "lerobot" else folder / "base"
-    ours = load_groot(str(place), dtype=dtype, embodiment=TAG if layout == "nvidia" else None)
+    ours = load_groot(str(place), dtype=dtype, embodiment=TAG if layout == "nvidia" else None, resize="lerobot")
     policy, before, behind = lerobots(place, monkeypatch)
     policy.config.use_bf16 = dtype == "bfloat16"
     (one,) = seen

@@ -85,7 +85,7 @@ def test_of_the_hub_one_step_is_downloaded(run: Path, tmp_path: Path, monkeypatc
 
     listed = [file.relative_to(there).as_posix() for file in there.rglob("*") if file.is_file()]
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
-    monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", lambda _, _name: listed)
+    monkeypatch.setattr("huggingface_hub.HfApi.list_repo_files", lambda _, _name, **_further: listed)
     monkeypatch.setattr("probe_kit.hooks.checkpoints.checkpoint.unreachable", lambda: "")
     assert find_parts("some/run", None, unread=True).weights == here
     assert not list(here.rglob("*.pt"))

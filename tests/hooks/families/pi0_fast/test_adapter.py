@@ -50,7 +50,7 @@ class TestPi0Fast(AdapterContract):
 
     @pytest.fixture
     def other_options(self) -> dict[str, float]:
-        return {"captured_tokens": 3, "temperature": 0.5}
+        return {"captured_tokens": 3, "temperature": 0.5, "lowercase": True}
 
     @pytest.fixture(scope="class")
     def checkpoint(self, folder: Path) -> Path:
@@ -83,6 +83,20 @@ def test_tokens_are_those_of_lerobots_sampling(untrained: Pi0Fast, seen: list[Ob
         theirs = policy.model.sample_actions_fast_kv_cache(pictures, masks, *text, ours.shape[1])
     assert torch.equal(ours, theirs)
     assert ours.unique().numel() > 5
+
+
+def test_the_instruction_keeps_its_case_as_in_lerobot_or_loses_it_as_in_openpi(
+    folder: Path, pi0_fast: Pi0Fast, seen: list[Observation]
+) -> None:
+    lower = load_pi0_fast(str(folder), lowercase=True)
+    text, state = [seen[0].instruction.title()], np.zeros((1, 7), np.float32)
+    assert text[0] != text[0].lower()
+    assert pi0_fast.prompts(text, state)[0].startswith(f"Task: {text[0]}, State:")
+    assert lower.prompts(text, state) == pi0_fast.prompts([text[0].lower()], state)
+    assert lower.token_ids(text) == pi0_fast.token_ids([text[0].lower()])
+    assert any("openpi writes lower case" in note for note in pi0_fast.card.notes)
+    assert lower.card.settings["lowercase"] == "True"
+    check_pi0_fast_words(str(folder), text, lowercase=True)
 
 
 def test_the_card_says_where_lerobot_decodes_another_number_of_actions(folder: Path, tmp_path: Path) -> None:

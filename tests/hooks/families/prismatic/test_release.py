@@ -88,11 +88,12 @@ def test_no_other_model_of_the_repository_is_asked_for(cache: Path, monkeypatch:
 @pytest.mark.parametrize(
     ("checkpoint", "expected"),
     [
-        ("a/b", ("a/b", "")), ("a/b/c+7b", ("a/b", "c+7b")), ("a/b/c/d", None), ("./a/b", None), ("/a/b", None),
-        ("a//b", None), ("a", None),
+        ("a/b", ("a/b", "", "")), ("a/b/c+7b", ("a/b", "c+7b", "")), ("a/b/c/d", None), ("./a/b", None),
+        ("/a/b", None), ("a//b", None), ("a", None), ("a/b@v1.0", ("a/b", "", "v1.0")), ("a/b@", None),
+        ("a/b@refs/pr/3", ("a/b", "", "refs/pr/3")), ("a/b/c@main", ("a/b", "c", "main")), ("@main", None),
     ],
 )  # fmt: skip
-def test_ids_of_the_hub(checkpoint: str, expected: tuple[str, str] | None) -> None:
+def test_ids_of_the_hub(checkpoint: str, expected: tuple[str, str, str] | None) -> None:
     assert hub_name(checkpoint) == expected
 
 

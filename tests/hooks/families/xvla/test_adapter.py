@@ -13,6 +13,8 @@ import torch
 from lerobot.policies.xvla.modeling_xvla import XVLAPolicy
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.processor.converters import policy_action_to_transition, transition_to_policy_action
+from lerobot.utils.constants import IMAGENET_STATS
+from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError, WeightsError
@@ -53,7 +55,7 @@ class TestXvla(AdapterContract):
 
     @pytest.fixture
     def other_options(self) -> Mapping[str, Any]:
-        return {"domain": 1}
+        return {"domain": 1, "picture": "squashed"}
 
 
 def lerobots(folder: Path) -> tuple[XVLAPolicy, Any, Any]:
@@ -104,6 +106,40 @@ def test_actions_are_those_of_lerobots_own_loading_processors_and_sampling_bit_f
     if dtype == "float32":
         np.testing.assert_allclose(ours.act(seen, [7]), metres, atol=1e-6)
     assert theirs.abs().max() > 0.1
+
+
+def network_reads(policy: Xvla, seen: list[Observation]) -> np.ndarray[Any, Any]:
+    """(3, H, W) bytes of the picture that enters the network, without ImageNet's mean and deviation."""
+    mean, deviation = (np.array(IMAGENET_STATS[name]).reshape(3, 1, 1) for name in ("mean", "std"))
+    picture = policy.network._prepare_images(policy.batch(seen))[0][0, 0].numpy()
+    return np.asarray((picture * deviation + mean) * 255)
+
+
+def test_pictures_are_padded_as_the_configuration_says_or_squashed_as_the_authors_do(
+    folder: Path, xvla: Xvla, seen: list[Observation]
+) -> None:
+    squashed = load_xvla(str(folder), picture="squashed")
+    own = np.asarray(Image.fromarray(seen[0].image).resize((64, 64), Image.Resampling.BICUBIC), np.float32)
+    np.testing.assert_allclose(network_reads(squashed, seen), own.transpose(2, 0, 1), atol=1e-3)
+    assert xvla.card.settings["picture"] == "padded"
+    assert np.abs(network_reads(xvla, seen) - network_reads(squashed, seen)).max() > 10
+    np.testing.assert_array_equal(load_xvla(str(folder), picture="padded").act(seen, [0]), xvla.act(seen, [0]))
+    assert any("authors squash" in note for note in xvla.card.notes)
+    assert any("squashed to 64 x 64" in note for note in squashed.card.notes)
+
+
+def test_a_checkpoint_that_resizes_nothing_can_be_given_either_way(
+    tmp_path: Path, seen: list[Observation]
+) -> None:
+    place = write_xvla(tmp_path)
+    values = json.loads((place / "config.json").read_text(encoding="utf-8"))
+    values["resize_imgs_with_padding"] = None
+    values["input_features"]["observation.images.image"]["shape"] = [3, 64, 64]
+    (place / "config.json").write_text(json.dumps(values), encoding="utf-8")
+    with pytest.raises(ObservationError, match="resizes nothing"):
+        load_xvla(str(place)).act(seen, [0])
+    actions = [load_xvla(str(place), picture=own).act(seen, [0]) for own in ("padded", "squashed")]
+    assert not np.array_equal(*actions)
 
 
 def test_select_action_of_lerobot_gives_the_first_actions(

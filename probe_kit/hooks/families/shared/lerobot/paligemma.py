@@ -13,7 +13,7 @@ from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import side_files
 from probe_kit.hooks.checkpoints.hub import unreachable
 from probe_kit.hooks.contract.views import PADDING
-from probe_kit.hooks.families.shared.lerobot.pipelines import tokenizer_folder
+from probe_kit.hooks.families.shared.lerobot.pipelines import tokenizer_folder, tokenizer_name
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
 from probe_kit.models.pretrained import load_pretrained
 
@@ -51,11 +51,13 @@ class PaliGemmaPolicy(LerobotPolicy):
         """PaliGemma's, from the checkpoint folder or the hub."""
         if (place := self._tokenizer_folder()) is not None:
             return load_pretrained(AutoTokenizer, place)
+        named = tokenizer_name(self.folder) or _TOKENIZER
         try:
-            return load_pretrained(AutoTokenizer, _TOKENIZER, local_files_only=bool(unreachable()))
-        except OSError as error:
+            return load_pretrained(AutoTokenizer, named, local_files_only=bool(unreachable()))
+        except (OSError, ValueError) as error:
+            gated = "gated " if named == _TOKENIZER else ""
             raise CheckpointError(
-                f"{self.folder} has no tokenizer.json and the gated {_TOKENIZER} cannot be fetched. Run "
+                f"{self.folder} has no tokenizer.json and the {gated}{named} cannot be fetched. Run "
                 "`hf auth login`, or put its tokenizer.json and tokenizer_config.json into the checkpoint folder"
             ) from error
 

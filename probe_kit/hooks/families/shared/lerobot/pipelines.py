@@ -140,28 +140,40 @@ def check_fields(step: SavedStep, source: str) -> None:
 
     source: the file, for messages.
     """
-    known = _FIELDS.get(step.name, {})
-    for name, value in step.config.items():
+    check_values(step.config, _FIELDS.get(step.name, {}), f"{source}: the step {step.name!r}")
+
+
+def check_values(values: Mapping[str, Any], known: Mapping[str, tuple[Any, ...] | None], subject: str) -> None:
+    """Raise CheckpointError for a field whose effect is unknown here, and for a value that is not honoured.
+
+    known: fields with the values that are honoured; None for any. subject: the file and the part of it.
+    """
+    for name, value in values.items():
         if name not in known:
             fields = ", ".join(known) or "none"
             raise CheckpointError(
-                f"{source}: the step {step.name!r} has the field {name}: {value!r}, which may change numbers in "
-                f"a way probe_kit does not know. Known are {fields}. If it changes nothing, remove it from a copy "
-                "of the file"
+                f"{subject} has the field {name}: {value!r}, which may change numbers in a way probe_kit does not "
+                f"know. Known are {fields}. If it changes nothing, remove it from a copy of the file"
             )
         plain = known[name]
         if plain is not None and not any(value == one and type(value) is type(one) for one in plain):
             raise CheckpointError(
-                f"{source}: the step {step.name!r} says {name}: {value!r}, which probe_kit does not repeat. "
-                f"Supported is {' or '.join(map(repr, plain))}: take a checkpoint that was trained so"
+                f"{subject} says {name}: {value!r}, which probe_kit does not repeat. Supported is "
+                f"{' or '.join(map(repr, plain))}: take a checkpoint that was trained so"
             )
+
+
+def tokenizer_name(folder: Path) -> str | None:
+    """What the saved step names as its tokenizer; None where no step does."""
+    step = next((step for step in saved_steps(folder, PREPROCESSOR) if step.name == TOKENIZER), None)
+    named = None if step is None else step.config.get("tokenizer_name")
+    return named if isinstance(named, str) and named else None
 
 
 def tokenizer_folder(folder: Path) -> Path | None:
     """The folder of the tokenizer that lerobot saved into the checkpoint; None where the step names none there."""
-    step = next((step for step in saved_steps(folder, PREPROCESSOR) if step.name == TOKENIZER), None)
-    named = None if step is None else step.config.get("tokenizer_name")
-    if not isinstance(named, str) or not named or Path(named).is_absolute() or ".." in Path(named).parts:
+    named = tokenizer_name(folder)
+    if named is None or Path(named).is_absolute() or ".." in Path(named).parts:
         return None
     return folder / named if (folder / named / "tokenizer.json").is_file() else None
 
