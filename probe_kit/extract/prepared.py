@@ -408,8 +408,11 @@ def _check_loaded(settings: ExtractSettings, policy: "Policy") -> None:
     from probe_kit.hooks.registry import family_names
 
     card = policy.card
-    said: dict[str, tuple[object, object]] = {"random_weights": (settings.random_weights, card.random_weights)}
-    if card.random_weights:
+    said: dict[str, tuple[object, object]] = {}
+    # A file may call its weights random; requested random weights have a seed.
+    if settings.random_weights or card.weights_seed is not None:
+        said["random_weights"] = settings.random_weights, card.random_weights
+    if card.weights_seed is not None:
         said["weights_seed"] = settings.weights_seed, card.weights_seed
     if card.family in family_names():
         said["model"] = settings.model, card.family

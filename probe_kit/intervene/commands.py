@@ -58,7 +58,7 @@ def intervene(
     suite: common.SuiteFolder = None,
     checkpoint: own.Checkpoint = None,
     model_options: common.ModelOptions = None,
-    weights_seed: common.WeightsSeed = 0,
+    weights_seed: own.WeightsSeed = None,
     scene_files: own.SceneFiles = None,
     wording: common.Wording = None,
     device: common.Device = "cpu",

@@ -33,6 +33,7 @@ from probe_kit.extract.run_layout import (
     VectorKind,
     stored_inputs_of,
 )
+from probe_kit.extract.run_sources import RunSources
 from probe_kit.extract.store.certificates import read_certificate
 from probe_kit.extract.store.format.arrays import decode_bfloat16, open_array
 from probe_kit.extract.store.format.checking import CheckedStore
@@ -256,6 +257,18 @@ class Run:
                 if name.endswith("_with_hooks_sha256")
             )
         return {**certificate, "processes": processes, "mixed": list(self.mixed)}
+
+    @cached_property
+    def sources(self) -> tuple[RunSources, ...]:
+        """Sources of the processes that played it, the first process's first; empty before the first episode."""
+        if not self._commits:
+            return ()
+        certificate, processes = read_certificate(self.root)
+        found: list[RunSources] = []
+        for record in (certificate, *processes):
+            if (sources := RunSources.of_record(record)) not in found:
+                found.append(sources)
+        return tuple(found)
 
     @cached_property
     def provenances(self) -> dict[str, Provenance]:

@@ -55,7 +55,7 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
         return _possible(folder)
     named = hub_name(checkpoint)
     if named is None:
-        raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist")
+        raise CheckpointError(_not_here(checkpoint))
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 
@@ -66,14 +66,20 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
     except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError, ValueError) as error:
         reason = f"{why}; the cache has no copy" if why else str(error).strip().splitlines()[0]
         raise CheckpointError(
-            f"cannot fetch {checkpoint!r} from the hub ({reason}). Check the name, your network and, for gated "
-            "models, `hf auth login`; or pass a local folder as --checkpoint"
+            f"{_not_here(checkpoint)}, and as a hub id it cannot be fetched ({reason}). Check the path or the "
+            "name, your network and, for gated models, `hf auth login`"
         ) from error
     if not folder.is_dir():
         raise CheckpointError(
             f"the repository {repository} has no folder {inside!r}; look its folders up on its page"
         )
     return _possible(folder)
+
+
+def _not_here(checkpoint: str) -> str:
+    """The part of a message that says where a folder was looked for."""
+    where = "" if Path(checkpoint).is_absolute() or checkpoint.startswith("~") else f" in {Path.cwd()}"
+    return f"checkpoint folder {checkpoint!r} does not exist{where}"
 
 
 def hub_files(checkpoint: str) -> list[str]:
