@@ -94,13 +94,15 @@ class ReplaySession:
     """A policy and a scene; a context manager, because it holds a simulator.
 
     items: of the run's suite, by id. counterparts: of those that have one, see `counterparts_of`. on_fit_progress:
-    called after every item that is inferred beforehand, for directions and erasers.
+    called after every item that is inferred beforehand, for directions and erasers. passed_over: places of a
+    wildcard, each with its role, at which an answer has no direction, and why.
     """
 
     def __init__(self, run: Run, policy: "Policy", scene: SceneSpec, items: Mapping[str, Item]) -> None:
         self.run, self.policy, self.scene = run, policy, scene
         self.items, self.counterparts = items, counterparts_of(items.values())
         self.on_fit_progress: Progress | None = None
+        self.passed_over: dict[str, str] = {}
         self.stage = Stage(scene, None)
         left, right = np.array(scene.tile_left), np.array(scene.tile_right)
         self._middle, self._across = (left + right) / 2, (left - right) / float(np.linalg.norm(left - right))
