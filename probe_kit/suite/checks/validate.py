@@ -92,8 +92,8 @@ def validate_suite(
 
 
 _BOTH_WAYS = (
-    "The answer can be told without understanding the question. Ask each pair of pictures both ways, so that every "
-    "picture is as often right as wrong"
+    "The answer can be told without understanding the question. Ask each pair of pictures both ways, so that "
+    "every picture is as often right as wrong"
 )
 _REMEDIES = {
     "position": "The answer lies on one side. Let it lie left as often as right",
