@@ -126,7 +126,7 @@ def probe(
     sites = _sites(X, "X")
     count = len(next(iter(sites.values())))
     names = [f"{number:09d}" for number in range(count)]
-    order = np.arange(count)
+    order: NDArray[np.intp] = np.arange(count)
     if not ordered:
         order = np.random.default_rng(derive_seed("array order", seed)).permutation(count)
     labels = _column(y, count, "y")

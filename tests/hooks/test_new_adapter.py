@@ -63,7 +63,7 @@ def test_a_run_is_made_with_it_as_its_readme_says(installed: Path, small_suite: 
 def test_the_written_family_goes_all_the_way_without_naming_a_folder_twice(
     installed: Path, tmp_path: Path
 ) -> None:
-    """Its file calls its weights random, which nobody requested. The suite cannot be drawn again."""
+    """Its file calls its weights random, which no option requested. The suite cannot be drawn again."""
     ran(installed, "my_vla.checkpoint", "checkpoint")
     build_suite(installed / "suite", ["color"], 12, seed=5)
     played = ("--categories", "color", "--max-steps", "2", "--env-workers", "0", "--out", str(tmp_path / "run"))

@@ -23,7 +23,7 @@ from probe_kit.errors import (
 )
 from probe_kit.extract import ExtractSettings, Run, open_run, verify_run
 from probe_kit.extract.rollout.stage import Seen, Stage
-from probe_kit.extract.run_sources import RunSources
+from probe_kit.extract.store.sources import RunSources
 from probe_kit.intervene import (
     ImageSwap,
     InstructionSwap,

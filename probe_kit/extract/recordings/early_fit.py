@@ -1,7 +1,6 @@
 """Cameras, words and state of recordings against a checkpoint, in one message and before a network is loaded."""
 
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 from probe_kit._system.bounded_json import parse_json
@@ -9,8 +8,7 @@ from probe_kit.errors import InstructionError, RecordingError
 from probe_kit.extract.recordings.lerobot_source import IMAGES, STATE
 from probe_kit.extract.recordings.recorded_plan import Recording
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
-from probe_kit.hooks.family import SIZE, Family
-from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.hooks.family import Family
 
 Check = Callable[[], object]
 _EMPTY = "empty_camera"
@@ -21,8 +19,7 @@ def declared_inputs(
     family: Family, checkpoint: str | None, options: Mapping[str, Any]
 ) -> tuple[tuple[str, ...], int | None] | None:
     """Cameras and numbers of the state that a checkpoint in lerobot's layout declares; None where none is here."""
-    place = family.place(checkpoint, options.get(SIZE))
-    folder = embedded_checkpoint(family.name) if place is None else Path(place).expanduser()
+    folder = family.folder_here(checkpoint, options)
     try:
         inputs = parse_json((folder / CONFIG_FILE).read_bytes())["input_features"]
         cameras = [name.removeprefix(IMAGES) for name in inputs if name.startswith(IMAGES)]

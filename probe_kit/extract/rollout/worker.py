@@ -26,8 +26,8 @@ from probe_kit.extract.rollout.recorded.recorded_stage import RecordedStage
 from probe_kit.extract.rollout.stage import AskableStage, LocalStage
 from probe_kit.extract.rollout.stage_process import ProcessStage
 from probe_kit.extract.run_layout import VIDEOS, stored_inputs_of
-from probe_kit.extract.run_sources import SOURCES, RunSources
 from probe_kit.extract.settings import RunSettings
+from probe_kit.extract.store.sources import SOURCES, RunSources
 from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.extract.store.writer import RunWriter
 

@@ -33,7 +33,6 @@ from probe_kit.extract.run_layout import (
     VectorKind,
     stored_inputs_of,
 )
-from probe_kit.extract.run_sources import RunSources
 from probe_kit.extract.store.certificates import read_certificate
 from probe_kit.extract.store.format.arrays import decode_bfloat16, open_array
 from probe_kit.extract.store.format.checking import CheckedStore
@@ -61,6 +60,7 @@ from probe_kit.extract.store.provenance import Provenance, differences, read_pro
 from probe_kit.extract.store.recorded.inputs import StoredInputs
 from probe_kit.extract.store.seconds import Seconds, read_seconds
 from probe_kit.extract.store.selection import select_items
+from probe_kit.extract.store.sources import RunSources
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.views import resolve_view
 

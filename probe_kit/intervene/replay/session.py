@@ -21,8 +21,8 @@ from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.capturing import SMALL
 from probe_kit.extract.rollout.stage import Seen, Stage
 from probe_kit.extract.rollout.worker import torch_threads
-from probe_kit.extract.run_sources import RunSources
 from probe_kit.extract.store.run import Run
+from probe_kit.extract.store.sources import RunSources
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting

@@ -1,15 +1,39 @@
-"""Files and choices that a run was made of, recorded so that later steps need not be told them again."""
+"""Files and choices that a run was made of, recorded so that later steps find them by themselves."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
-from probe_kit.extract.settings import RunSettings
+from probe_kit.env import SceneSpec
 from probe_kit.hooks.contract.card import EMBEDDED
 
 SOURCES = "sources"
 """Entry of a certificate."""
+
+
+class SettingsWithSources(Protocol):
+    """The settings of a run that name files and choices; see `RunSettings`."""
+
+    @property
+    def suite(self) -> Path | None:
+        """Suite folder."""
+
+    @property
+    def scene(self) -> SceneSpec:
+        """Scene, with its files."""
+
+    @property
+    def options(self) -> Mapping[str, Any]:
+        """Options of the family."""
+
+    @property
+    def random_weights(self) -> bool:
+        """Whether random weights were requested."""
+
+    @property
+    def weights_seed(self) -> int:
+        """Seed of requested random weights."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +54,7 @@ class RunSources:
     weights_seed: int = 0
 
     @classmethod
-    def of(cls, settings: RunSettings, checkpoint: str) -> Self:
+    def of(cls, settings: SettingsWithSources, checkpoint: str) -> Self:
         """Sources of a process with these settings. checkpoint: as the loaded model's card has it."""
         files = {name: getattr(settings.scene, name) for name in ("arm_urdf", "background")}
         return cls(
