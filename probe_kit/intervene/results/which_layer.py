@@ -67,7 +67,7 @@ def _read(run: RunReader, places: str) -> str:
     if family is None or not family.interventions.supports("kv"):
         return ""
     read = [part for part in places.split("; ") if part.startswith("read ") or KV_STREAM in part]
-    return "; ".join(read) or "where it is read was not found (--kind joint)"
+    return "; ".join(read) or "where it is read is open (--kind joint tests it)"
 
 
 def _best_site(

@@ -92,7 +92,7 @@ def validate_suite(
 
 
 _BOTH_WAYS = (
-    "The answer can be told without understanding the question. Ask each pair of pictures both ways, so that "
+    "The answer shows without understanding the question. Ask each pair of pictures both ways, so that "
     "every picture is as often right as wrong"
 )
 _REMEDIES = {
