@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     )
     from probe_kit.retention.report import write_report
     from probe_kit.suite import Suite, build_suite, default_suite, load_suite
-    from probe_kit.train import Labels, load_results, train_probes
+    from probe_kit.train import Labels, load_results, probe, train_probes
 
 __all__ = [
     "Act2AnswerEnv",
@@ -81,6 +81,7 @@ __all__ = [
     "load_suite",
     "open_run",
     "patching",
+    "probe",
     "retention_table",
     "run_intervention",
     "train_probes",
@@ -127,6 +128,7 @@ __getattr__, __dir__ = lazy_names(
         "load_suite": "suite",
         "open_run": "extract",
         "patching": "intervene.patching:",
+        "probe": "train",
         "retention_table": "retention",
         "train_probes": "train",
         "write_report": "retention.report",

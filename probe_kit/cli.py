@@ -96,7 +96,8 @@ class Commands(typer.core.TyperGroup):
 
     def _told_where(self, error: Any, ctx: Any) -> Exception:
         """The same error; of an option that only other commands have, it says which."""
-        option = getattr(error, "option_name", None)
+        # Only of an option that is unknown: one without its value carries its name too.
+        option = error.option_name if hasattr(error, "possibilities") else None
         homes = [path for path, command in commands_of(self, ctx) if option in _options(command)]
         if homes:
             named = ", ".join(f"`probe-kit {path}`" for path in homes)

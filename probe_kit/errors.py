@@ -46,6 +46,10 @@ class UnsupportedInterventionError(UsageError):
     """The family does not support the intervention that was asked for."""
 
 
+class NoDirectionError(UsageError):
+    """The class means of an answer are equal at a place, so that no direction leads from one to the other."""
+
+
 class RunNotFoundError(UsageError):
     """The folder is not a run."""
 

@@ -25,6 +25,16 @@ def install_command(extra: str = "", rebuild: str = "") -> str:
     return f"{_installer()} {shlex.quote(name)}"
 
 
+def install_folder_command(folder: Path) -> str:
+    """Shell command that installs the package in `folder`, which stays editable, for the Python that runs."""
+    return f"{_installer()} -e {shlex.quote(str(folder))}"
+
+
+def install_here_command() -> str:
+    """The same for the folder in which the shell is, in an activated environment and on any machine."""
+    return "pip install -e ." if _has_pip() else "uv pip install -e ."
+
+
 def _is_of_checkout() -> bool:
     """Whether the running Python is the environment that `with-uv` makes in its folder."""
     return (_ROOT / "with-uv").is_file() and Path(sys.prefix).resolve().is_relative_to(_ROOT.resolve())
@@ -41,7 +51,15 @@ def _has_pip() -> bool:
 def _installer() -> str:
     if _has_pip():
         return f"{_python()} -m pip install"
-    return f"uv pip install --python {_python()}"
+    return f"{_uv()} pip install --python {_python()}"
+
+
+def _uv() -> str:
+    """The uv that a shell finds, or that `with-uv` uses."""
+    usual = (Path.home() / ".local/bin/uv", Path.home() / ".cargo/bin/uv", _ROOT / ".uv/bin/uv")
+    if shutil.which("uv") is not None:
+        return "uv"
+    return next((shlex.quote(str(path)) for path in usual if path.is_file()), "uv")
 
 
 def _python() -> str:

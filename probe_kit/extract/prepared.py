@@ -1,6 +1,6 @@
 """Preparation of an extraction: finds the suite, loads the model, plans the episodes. Writes nothing."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ from probe_kit.extract.plan import (
     skipped_items,
 )
 from probe_kit.extract.protocols import protocol_identity
+from probe_kit.extract.recordings.early_fit import check_state_width, declared_inputs, raise_together
 from probe_kit.extract.recordings.lerobot_folder import fetched, open_lerobot
 from probe_kit.extract.recordings.lerobot_source import LeRobotSource
 from probe_kit.extract.recordings.recorded_plan import RecordedPlan, Recording
@@ -202,10 +203,8 @@ def _load_source(
     if location is not None:
         check_writable(location)
     opened = OpenedEnvironment.of(source) if isinstance(source, EnvSource) else open_recording(source)
-    instructions = opened.instructions
     if loaded is None:
-        check_words(settings, instructions, tuple(SCRIPTED))
-        _check_instructions(settings, instructions, fetch)
+        raise_together(_before_loading(settings, opened, fetch))
     if not fetch and (streams := declared_streams(settings)) is not None:
         if isinstance(opened, OpenedEnvironment):
             settings = settings.with_every_call(settings.execute or 1)
@@ -219,6 +218,31 @@ def _load_source(
     if isinstance(opened, OpenedEnvironment):
         return _prepared_environment(settings, opened, policy)
     return _prepared_recording(settings, opened, policy)
+
+
+def _before_loading(
+    settings: ExtractSettings, opened: "OpenedEnvironment | Recording", fetch: bool
+) -> list[Callable[[], object]]:
+    """Checks of words, and of cameras and state where the checkpoint's files declare them."""
+    from probe_kit.hooks.registry import get_family
+
+    instructions, family = opened.instructions, get_family(settings.model)
+    checks: list[Callable[[], object]] = [
+        lambda: check_words(settings, instructions, tuple(SCRIPTED)),
+        lambda: _check_instructions(settings, instructions, fetch),
+    ]
+    if family is None or not isinstance(opened, Recording):
+        return checks
+    declared = declared_inputs(family, settings.checkpoint, settings.options)
+    if declared is None:
+        return checks
+    cameras, state = declared
+    named = settings.checkpoint or settings.model
+    return [
+        lambda: opened.mapped(cameras),
+        *checks,
+        lambda: check_state_width(opened, named, state),
+    ]
 
 
 def _prepared_environment(settings: ExtractSettings, opened: OpenedEnvironment, policy: "Policy") -> Prepared:
@@ -408,8 +432,11 @@ def _check_loaded(settings: ExtractSettings, policy: "Policy") -> None:
     from probe_kit.hooks.registry import family_names
 
     card = policy.card
-    said: dict[str, tuple[object, object]] = {"random_weights": (settings.random_weights, card.random_weights)}
-    if card.random_weights:
+    said: dict[str, tuple[object, object]] = {}
+    # A file may call its weights random; requested random weights have a seed.
+    if settings.random_weights or card.weights_seed is not None:
+        said["random_weights"] = settings.random_weights, card.random_weights
+    if card.weights_seed is not None:
         said["weights_seed"] = settings.weights_seed, card.weights_seed
     if card.family in family_names():
         said["model"] = settings.model, card.family

@@ -54,12 +54,16 @@ def new_adapter(
 
     The package contains a small example network and passes the contract test. Its README lists what to change.
     """
+    from probe_kit._system.installing import install_folder_command
     from probe_kit.hooks.new_adapter import write_adapter
 
     for path in write_adapter(name, out_folder):
         out.print(str(path), highlight=False, markup=False, soft_wrap=True)
     folder = out_folder or Path(name)
-    err.print(f"next: read {folder / 'README.md'}", highlight=False, markup=False, soft_wrap=True)
+    err.print(
+        f"next: {install_folder_command(folder)}\nthen read {folder / 'README.md'}",
+        highlight=False, markup=False, soft_wrap=True,
+    )  # fmt: skip
 
 
 def _print_verification(verification: "Verification") -> None:

@@ -350,6 +350,15 @@ class Family:
             )
         return dict(self.sizes)[size]
 
+    def folder_here(self, checkpoint: str | None, options: Mapping[str, Any]) -> Path:
+        """The folder that a local checkpoint has, or an embedded one; of a hub id it need not exist."""
+        place = self.place(checkpoint, options.get(SIZE))
+        if place is not None:
+            return Path(place).expanduser()
+        from probe_kit.models.embedded.folder import embedded_checkpoint
+
+        return embedded_checkpoint(self.name)
+
     def function(self, purpose: Literal["verifier", "full_size"]) -> Callable[..., Any]:
         """The family's function for `purpose`. Raises UsageError if it has none."""
         path = getattr(self, purpose)

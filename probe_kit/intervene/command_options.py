@@ -86,11 +86,15 @@ ReadoutName = Annotated[
         "episode (teacher-forced), for policies with one action per inference.",
     ),
 ]
+WeightsSeed = Annotated[
+    int | None, further_option("--weights-seed", help="Seed of the untrained weights. Default: that of the run.")
+]
 SceneFiles = Annotated[
     list[str] | None,
     further_option(
         "--scene-file",
         metavar="NAME=FILE",
-        help="File of the scene, if the run had one: background=FILE or arm_urdf=FILE. Repeat for several.",
+        help="File of the scene, if the run had one and it was moved: background=FILE or arm_urdf=FILE. Repeat "
+        "for several.",
     ),
 ]

@@ -58,7 +58,7 @@ def intervene(
     suite: common.SuiteFolder = None,
     checkpoint: own.Checkpoint = None,
     model_options: common.ModelOptions = None,
-    weights_seed: common.WeightsSeed = 0,
+    weights_seed: own.WeightsSeed = None,
     scene_files: own.SceneFiles = None,
     wording: common.Wording = None,
     device: common.Device = "cpu",
@@ -96,8 +96,9 @@ def intervene(
 def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "InterventionResult":
     """With progress. Says so if the result was stored before."""
     from probe_kit.intervene import run_intervention
+    from probe_kit.intervene.edits.unread import unread_note
     from probe_kit.intervene.kinds.image_swap.verdict import groups_for_not_used
-    from probe_kit.intervene.runner import check_supported, too_few_groups
+    from probe_kit.intervene.runner import check_supported, too_few_groups, unread_sites
     from probe_kit.intervene.store.answers import is_stored
     from probe_kit.intervene.store.settings import check_run_fits, key_of, settings_of
 
@@ -109,6 +110,9 @@ def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "I
         counts = ", ".join(f"{name} has {count}" for name, count in few.items())
         needed = groups_for_not_used()
         say(marked("[yellow]note:[/] the verdict *not used* needs {} groups of items; {}", needed, counts))
+    unread = () if was_stored else unread_sites(run, intervention)
+    if unread:
+        say(marked("[yellow]note:[/] {}", unread_note(unread)))
     with progress() as bar:
         fitted = counter(bar, "items fitted on") if intervention.fits_first else None
         replayed = counter(bar, "items replayed")

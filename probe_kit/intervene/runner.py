@@ -14,6 +14,7 @@ from probe_kit.extract.store.run import Run
 from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS
 from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.edits.sites import check_roles_have_tokens, resolve_sites
+from probe_kit.intervene.edits.unread import unread_places
 from probe_kit.intervene.kinds.base import ConditionName, Measurement
 from probe_kit.intervene.kinds.image_swap.intervention import ImageSwap
 from probe_kit.intervene.kinds.image_swap.verdict import groups_for_not_used
@@ -72,7 +73,7 @@ def _execute(
     on_fit_progress: Progress | None,
 ) -> None:
     pieces = Pieces.of(run.location, INTERVENTIONS, key, run.stamp, REDO)
-    wanted = items_of(run, intervention)
+    wanted, patterns = items_of(run, intervention), _patterns(settings)
     with open_session(run, source, load) as session, session.ready():
         session.on_fit_progress = on_fit_progress or notebook_progress("items learnt from")
         _check_roles(session, settings, getattr(type(intervention), "roles", ROLES))
@@ -88,6 +89,8 @@ def _execute(
             "items": {"asked": len(wanted), "played": len(items)},
             "supported": session.policy.interventions.to_json(),
             "edits": _ledgers(conditions, parts),
+            "unread": list(unread_places(patterns, session.policy.every_stream(), session.policy.interventions)),
+            "passed_over": session.passed_over,
             **intervention.certificate_entries(conditions, parts),
         }
     outcomes = outcomes_of(run, [condition.name for condition in conditions], parts)
@@ -111,6 +114,20 @@ def _check_roles(session: ReplaySession, settings: Mapping[str, Any], usual: Seq
     for patterns, wanted in intervention:
         found = [place.stream for pattern in patterns for place in resolve_sites(pattern, session.policy)]
         check_roles_have_tokens(session.policy, tuple(dict.fromkeys(found)), wanted, usual)
+
+
+def _patterns(settings: Mapping[str, Any]) -> list[str]:
+    """The patterns of places that an intervention changes."""
+    targets = [ConditionName.parse(target).place for target in settings.get("targets", ())]
+    return [*settings.get("sites", ()), *targets]
+
+
+def unread_sites(run: Run, intervention: Intervention) -> tuple[str, ...]:
+    """Places of an intervention that nothing reads, as the run's family declares, before anything is loaded."""
+    family = get_family(run.model)
+    if family is None:
+        return ()
+    return unread_places(_patterns(settings_of(intervention, run)), run.streams, family.interventions)
 
 
 def check_supported(run: Run, intervention: Intervention) -> None:

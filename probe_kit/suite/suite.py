@@ -26,8 +26,13 @@ def count_by_category(items: Iterable[Item]) -> dict[str, int]:
 
 
 def missing_categories(items: Iterable[Item]) -> list[str]:
-    """Slugs of the twelve categories without any item: an average over the others must say so."""
+    """Slugs of the twelve categories without any item: an average over the others must say so.
+
+    None of questions of one's own alone, which are not measured against these categories.
+    """
     present = count_by_category(items)
+    if not any(slug in CATEGORIES for slug in present):
+        return []
     return [slug for slug in CATEGORIES if slug not in present]
 
 

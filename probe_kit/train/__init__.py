@@ -9,6 +9,7 @@ from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
+    from probe_kit.train.array_probe import ArrayProbes, probe
     from probe_kit.train.choices import BASELINES, INCOMPLETE, TARGETS, Baseline, Incomplete, Target
     from probe_kit.train.data.array_run import ArrayRun
     from probe_kit.train.data.run_reader import RunReader
@@ -31,6 +32,7 @@ __all__ = [
     "FOLD_UNITS",
     "INCOMPLETE",
     "TARGETS",
+    "ArrayProbes",
     "ArrayRun",
     "Baseline",
     "BaselineScore",
@@ -53,6 +55,7 @@ __all__ = [
     "load_label_results",
     "load_results",
     "load_results_by_call",
+    "probe",
     "save_results",
     "train_probes",
     "transfer_probes",
@@ -62,7 +65,9 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "ArrayProbes": "array_probe",
         "ArrayRun": "data.array_run",
+        "probe": "array_probe",
         "BASELINES": "choices",
         "Baseline": "choices",
         "BaselineScore": "results.control_scores",

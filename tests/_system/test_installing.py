@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit._system import installing
-from probe_kit._system.installing import install_command
+from probe_kit._system.installing import install_command, install_folder_command
 
 PACKAGE = Path(installing.__file__).parents[1]
 
@@ -62,6 +62,23 @@ def test_the_python_that_runs_is_named_by_its_path_where_a_shell_finds_another(
     monkeypatch.setattr(installing.shutil, "which", lambda _: "/usr/bin/python")
     monkeypatch.setattr(installing, "find_spec", lambda _: None)
     assert install_command() == "uv pip install --python '/my env/bin/python' probe-kit"
+
+
+@pytest.mark.usefixtures("elsewhere")
+def test_a_package_of_the_users_own_is_installed_by_the_installer_that_the_environment_has(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(sys, "executable", "/env/bin/python")
+    monkeypatch.setattr(installing.shutil, "which", lambda name: "/env/bin/python" if name == "python" else None)
+    monkeypatch.setattr(installing, "find_spec", lambda _: object())
+    assert install_folder_command(Path("my vla")) == "python -m pip install -e 'my vla'"
+    monkeypatch.setattr(installing, "find_spec", lambda _: None)
+    monkeypatch.setattr(installing, "_ROOT", tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    assert install_folder_command(Path("my-vla")) == "uv pip install --python python -e my-vla"
+    (tmp_path / ".uv" / "bin").mkdir(parents=True)
+    (tmp_path / ".uv" / "bin" / "uv").touch()
+    assert install_folder_command(Path("my-vla")) == f"{tmp_path}/.uv/bin/uv pip install --python python -e my-vla"
 
 
 def test_no_message_names_an_installer_of_its_own() -> None:

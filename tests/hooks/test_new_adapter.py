@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from probe_kit.errors import UsageError
+from probe_kit.extract import open_run
 from probe_kit.hooks.new_adapter import write_adapter
-from probe_kit.suite import Suite
+from probe_kit.suite import Suite, build_suite
+from probe_kit.train import load_results
 
 ENTRY = "[probe_kit.policies]\nmy-vla = my_vla:FAMILY\n"
 
@@ -55,6 +57,26 @@ def test_a_run_is_made_with_it_as_its_readme_says(installed: Path, small_suite: 
     arguments = ("--model", "my-vla", "--checkpoint", "checkpoint", *suite)
     run = ran(installed, "probe_kit", "extract", *arguments, "--max-steps", "4", "--out", "run")
     assert run.strip().endswith("run")
+
+
+@pytest.mark.slow
+def test_the_written_family_goes_all_the_way_without_naming_a_folder_twice(
+    installed: Path, tmp_path: Path
+) -> None:
+    """Its file calls its weights random, which no option requested. The suite cannot be drawn again."""
+    ran(installed, "my_vla.checkpoint", "checkpoint")
+    build_suite(installed / "suite", ["color"], 12, seed=5)
+    played = ("--categories", "color", "--max-steps", "2", "--env-workers", "0", "--out", str(tmp_path / "run"))
+    chosen = ("--model", "my-vla", "--checkpoint", "checkpoint", "--suite", "suite")
+    ran(installed, "probe_kit", "extract", *chosen, *played)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    ran(elsewhere, "probe_kit", "train", "../run", "--permutations", "20")
+    assert load_results(open_run(tmp_path / "run")).controls.excess
+    ran(elsewhere, "probe_kit", "intervene", "../run", "--items", "2")
+    assert "not used" in ran(elsewhere, "probe_kit", "retention", "../run", "--details", "all")
+    ran(elsewhere, "probe_kit", "view", "../run", "--export", "page")
+    assert (elsewhere / "page" / "index.html").is_file()
 
 
 @pytest.mark.parametrize("name", ["My-VLA", "1vla", "my_vla", "-", "class", ""])

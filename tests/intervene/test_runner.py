@@ -8,18 +8,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from probe_kit.env import SceneSpec
 from probe_kit.errors import (
     CaptureChangedActionError,
     NoInterventionsError,
     RunDamagedError,
+    SceneError,
     SettingsMismatchError,
     SuiteError,
     UnknownCategoryError,
     UsageError,
 )
-from probe_kit.extract import Run, open_run, verify_run
+from probe_kit.extract import ExtractSettings, Run, open_run, verify_run
 from probe_kit.extract.rollout.stage import Seen, Stage
+from probe_kit.extract.store.sources import RunSources
 from probe_kit.intervene import (
     ImageSwap,
     InstructionSwap,
@@ -251,6 +255,31 @@ def test_a_folder_called_embedded_is_not_taken_for_the_checkpoint_of_the_package
     assert load_policy_of(copy, ReplaySource()).card.weights_sha256 == copy.weights_sha256
 
 
+def test_the_seed_of_untrained_weights_is_that_of_the_run_unless_another_is_named(copy: Run) -> None:
+    assert copy.sources[0].random_weights
+    assert load_policy_of(copy, ReplaySource()).card.weights_sha256 == copy.weights_sha256
+    run = open_run(copy.path)
+    run.__dict__["sources"] = (replace(copy.sources[0], weights_seed=7),)
+    assert load_policy_of(run, ReplaySource()).card.weights_seed == 7
+    assert load_policy_of(run, ReplaySource(weights_seed=8)).card.weights_seed == 8
+
+
+def test_files_of_the_scene_are_those_of_the_run_as_long_as_they_are_there(
+    copy: Run, twin: "Policy", tmp_path: Path
+) -> None:
+    photo = tmp_path / "photo.png"
+    Image.new("RGB", (64, 48), "white").save(photo)
+    scene = replace(SceneSpec.from_json(copy.settings["scene"]), rendering="visual-matching", background=photo)
+    run = open_run(copy.path)
+    run.settings = {**run.settings, "scene": scene.to_json()}
+    run.__dict__["sources"] = (RunSources.of(ExtractSettings("pi0-tiny", scene=scene), ""),)
+    with open_session(run, ReplaySource(), lambda *_: twin) as session:
+        assert session.scene.background == photo
+    photo.unlink()
+    with pytest.raises(SceneError, match="background"):
+        open_session(run, ReplaySource(), lambda *_: twin)
+
+
 @pytest.mark.parametrize("where", ["drawn again", "found among more items"])
 def test_without_a_named_suite_the_embedded_one_is_found_or_drawn_again(
     where: str, copy: Run, twin: "Policy", tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -261,8 +290,10 @@ def test_without_a_named_suite_the_embedded_one_is_found_or_drawn_again(
     monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path))
     if where == "found among more items":
         build_suite(default_folder(["color", "shape"]), ["color", "shape"], 14)
+    run = open_run(copy.path)
+    run.__dict__["sources"] = ()  # as of a run from another machine
     with open_session(
-        copy, ReplaySource(), lambda *_: twin
+        run, ReplaySource(), lambda *_: twin
     ) as session:  # the first frames are the run's, or this raises
         assert len(session.replay_inputs(str(copy.episodes["item_id"].iloc[0]))) == 2
     assert len(list((tmp_path / "suites").iterdir())) == 1

@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Self, cast
+from typing import Any, Self, cast
 
 import numpy as np
 from PIL import Image
@@ -27,6 +27,7 @@ from probe_kit.extract.rollout.stage import AskableStage, LocalStage
 from probe_kit.extract.rollout.stage_process import ProcessStage
 from probe_kit.extract.run_layout import VIDEOS, stored_inputs_of
 from probe_kit.extract.settings import RunSettings
+from probe_kit.extract.store.sources import SOURCES, RunSources
 from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.extract.store.writer import RunWriter
 
@@ -124,13 +125,19 @@ class Worker:
         try:
             rollout.buffers.wait()
             with self._writer.location.in_words():
-                self._writer.write_certificate(self._controller.certificate())
+                self._writer.write_certificate(self._certificate())
                 self._writer.write(
                     replace(rollout.record, pictures=self._pictures(rollout), frames=self._frame_count(rollout))
                 )
         finally:
             self._ring.give_back(rollout.buffers)
         return Done(rollout.planned.index, rollout.outcome)
+
+    def _certificate(self) -> dict[str, Any]:
+        """The controller's, and the sources of this process."""
+        certificate = self._controller.certificate()
+        checkpoint = str(certificate["policy"].get("checkpoint") or "")
+        return {**certificate, SOURCES: RunSources.of(self._settings, checkpoint).to_json()}
 
     def _pictures(self, rollout: Rollout) -> dict[str, bytes]:
         """Content by key of what is kept for people."""

@@ -60,6 +60,7 @@ from probe_kit.extract.store.provenance import Provenance, differences, read_pro
 from probe_kit.extract.store.recorded.inputs import StoredInputs
 from probe_kit.extract.store.seconds import Seconds, read_seconds
 from probe_kit.extract.store.selection import select_items
+from probe_kit.extract.store.sources import RunSources
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.views import resolve_view
 
@@ -256,6 +257,18 @@ class Run:
                 if name.endswith("_with_hooks_sha256")
             )
         return {**certificate, "processes": processes, "mixed": list(self.mixed)}
+
+    @cached_property
+    def sources(self) -> tuple[RunSources, ...]:
+        """Sources of the processes that played it, the first process's first; empty before the first episode."""
+        if not self._commits:
+            return ()
+        certificate, processes = read_certificate(self.root)
+        found: list[RunSources] = []
+        for record in (certificate, *processes):
+            if (sources := RunSources.of_record(record)) not in found:
+                found.append(sources)
+        return tuple(found)
 
     @cached_property
     def provenances(self) -> dict[str, Provenance]:

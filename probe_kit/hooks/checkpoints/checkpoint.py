@@ -112,7 +112,7 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
         return _possible(folder)
     named = hub_name(checkpoint)
     if named is None:
-        raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist")
+        raise CheckpointError(_not_here(checkpoint))
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 
@@ -125,8 +125,8 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
     except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError, ValueError) as error:
         reason = f"{why}; the cache has no copy" if why else hub_reason(error)
         raise CheckpointError(
-            f"cannot fetch {checkpoint!r} from the hub ({reason}). {way_out(error, bool(why))}; or pass a local "
-            "folder as --checkpoint"
+            f"{_not_here(checkpoint)}, and as a hub id it cannot be fetched ({reason}). "
+            f"{way_out(error, bool(why))}; or pass a local folder as --checkpoint"
         ) from error
     folder = Path(place) / inside
     if not folder.is_dir():
@@ -134,6 +134,12 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
             f"the repository {repository} has no folder {inside!r}; look its folders up on its page"
         )
     return _possible(folder)
+
+
+def _not_here(checkpoint: str) -> str:
+    """The part of a message that says where a folder was looked for."""
+    where = "" if Path(checkpoint).is_absolute() or checkpoint.startswith("~") else f" in {Path.cwd()}"
+    return f"checkpoint folder {checkpoint!r} does not exist{where}"
 
 
 def hub_files(checkpoint: str) -> list[str]:

@@ -102,6 +102,15 @@ def random_twins_differ_by_their_seed_and_repeat_by_it(subject: Subject) -> None
 
 
 @check(
+    "The card names a seed for requested random weights only.",
+    "Set `weights_seed=weights_seed if random_weights else None`: a file has no seed, whatever it says of itself.",
+)
+def weights_of_a_file_have_no_seed(subject: Subject) -> None:
+    seed = subject.load(subject.given.checkpoint).card.weights_seed
+    require(seed is None, f"weights_seed {seed!r} for the weights of a file", "None")
+
+
+@check(
     "Weights that are not exactly the network's are refused.",
     "Load with `read_weights` and `load_weights`, which compare every name, shape and value.",
 )

@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from string import Template
 
+from probe_kit._system.installing import install_here_command
 from probe_kit.errors import UsageError
 from probe_kit.hooks.registry import family_names
 from probe_kit.version import __version__
@@ -45,7 +46,10 @@ def write_adapter(name: str, folder: Path | str | None = None) -> list[Path]:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder} holds something already; give a new folder with --out")
     title = "".join(part.capitalize() for part in name.split("-"))
-    words = {"name": name, "module": module, "Name": title, "version": __version__}
+    words = {
+        "name": name, "module": module, "Name": title, "version": __version__,
+        "install": install_here_command(),
+    }  # fmt: skip
     return sorted(_write(files(__name__) / "template", folder, words))
 
 

@@ -12,7 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import UsageError
+from probe_kit.errors import NoDirectionError, UsageError
 
 Array = NDArray[np.float64]
 Way = Literal["leace", "mean-difference", "inlp"]
@@ -109,8 +109,8 @@ class Eraser:
 def fit_eraser(tokens: PaddedTokens, left: NDArray[np.bool_], method: Method) -> Eraser:
     """What erases the answer from such tokens. left: (N,) the answer.
 
-    Raises UsageError if no position has episodes enough of either answer, or a direction, or if there are fewer
-    directions than the method's name says.
+    Raises NoDirectionError if no position has a direction, and UsageError if none has episodes enough of either
+    answer, or if there are fewer directions than the method's name says.
     """
     _check(tokens, left)
     centred, means = tokens.centred()
@@ -125,7 +125,7 @@ def fit_eraser(tokens: PaddedTokens, left: NDArray[np.bool_], method: Method) ->
         removed = read = _shared(_differences(centred, tokens.present, left)[usable], method.rank, size)
     there = (np.linalg.norm(removed, axis=-1) > 0).sum(axis=1)
     if not there.any():
-        raise UsageError(f"no direction for {method}: {NO_DIRECTION}")
+        raise NoDirectionError(f"no direction for {method}: {NO_DIRECTION}")
     _check_more(method, int(there[there > 0].min()))
     return Eraser(means, removed, read, usable & (there > 0))
 

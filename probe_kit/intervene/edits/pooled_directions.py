@@ -7,13 +7,13 @@ These are directions of a mean over tokens. An answer that lies in *which* token
 see `token_directions`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import UsageError
+from probe_kit.errors import NoDirectionError, UsageError
 from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
@@ -65,11 +65,19 @@ def view_of(role: str) -> str:
     return "mean" if role == "all" else f"mean:{role}"
 
 
-def fit_directions(run: Run, site: Site, role: str, direction: str, controls: int, seed: int) -> PooledDirections:
-    """Of every category of the run, from what is pooled over the tokens of `role` at `site`.
+def fit_directions(
+    run: Run,
+    site: Site,
+    role: str,
+    direction: str,
+    controls: int,
+    seed: int,
+    categories: Sequence[str] | None = None,
+) -> PooledDirections:
+    """Directions of these categories, by default of all, from the pooled tokens of `role` at `site`.
 
-    Raises UsageError for an unknown direction and for equal class means, UnknownSiteError for a site or view that
-    is not stored.
+    Raises UsageError for an unknown direction, NoDirectionError for equal class means, UnknownSiteError for a site
+    or view that is not stored.
     """
     if direction not in DIRECTIONS:
         raise UsageError(f"unknown direction {direction!r}; expected one of {', '.join(DIRECTIONS)}")
@@ -79,7 +87,7 @@ def fit_directions(run: Run, site: Site, role: str, direction: str, controls: in
     units: dict[tuple[str, str], Vector] = {}
     gaps: dict[str, NDArray[np.float64]] = {}
     fold_of: dict[str, int] = {}
-    for category in dict.fromkeys(episodes["category"].astype(str)):
+    for category in categories or dict.fromkeys(episodes["category"].astype(str)):
         rows = np.flatnonzero((episodes["category"] == category).to_numpy())
         left = (episodes["side_correct"].to_numpy()[rows] == "left").astype(int)
         groups = episodes["group_id"].to_numpy(dtype=str)[rows]
@@ -93,7 +101,9 @@ def fit_directions(run: Run, site: Site, role: str, direction: str, controls: in
             training, labels = features[rows[fold.train]], left[fold.train].astype(bool)
             difference = training[labels].mean(axis=0) - training[~labels].mean(axis=0)
             if (np.abs(difference) <= _ROUNDING * np.abs(training).max(axis=0)).all():
-                raise UsageError(f"{category}, {site}, role {role}: no direction for {direction}: {NO_DIRECTION}")
+                raise NoDirectionError(
+                    f"{category}, {site}, role {role}: no direction for {direction}: {NO_DIRECTION}"
+                )
             unit = _direction(training, labels, direction)
             widths.append(abs(float(difference @ unit)) / 2)
             of_fold[direction].append(unit)

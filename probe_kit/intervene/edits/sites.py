@@ -178,6 +178,22 @@ def resolve_sites(pattern: str, policy: "Model") -> list[SiteGroup]:
     ]
 
 
+def resolve_all(patterns: Sequence[str], policy: "Model") -> dict[str, SiteGroup]:
+    """The places of several patterns by name, each once. Raises as `resolve_sites` does."""
+    return {place.name: place for pattern in patterns for place in resolve_sites(pattern, policy)}
+
+
+def parse_pattern(pattern: str) -> dict[str, str | None] | None:
+    """Stream, layer, quantity, head, first and last iteration of a pattern; None for what names no place."""
+    match = _PATTERN.fullmatch(pattern)
+    return None if match is None else match.groupdict()
+
+
+def names_one_place(pattern: str) -> bool:
+    """Whether a pattern has no wildcard, so that its place was meant by name."""
+    return "*" not in pattern
+
+
 def _check_kv(model: "Model") -> None:
     """Raise UnsupportedInterventionError for a policy without keys and values of the prompt."""
     interventions = getattr(model, "interventions", None)

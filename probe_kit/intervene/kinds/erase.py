@@ -20,7 +20,7 @@ from probe_kit.hooks.capturing.edit_engine import apply_patch
 from probe_kit.hooks.capturing.token_edits import Identity, TokenIndex
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.edits.linear_erasure import Eraser, Method, PaddedTokens
-from probe_kit.intervene.edits.sites import SiteGroup, resolve_sites, roles_of
+from probe_kit.intervene.edits.sites import SiteGroup, resolve_all, roles_of
 from probe_kit.intervene.kinds.base import (
     ConditionName,
     EffectRow,
@@ -42,6 +42,7 @@ from probe_kit.intervene.replay.conditions import (
     ReplayBatch,
 )
 from probe_kit.intervene.replay.image_tokens import TILES, role_tokens
+from probe_kit.intervene.replay.passed_over import PassedOver
 from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.intervene.replay.token_features import (
     TokenFeatures,
@@ -138,14 +139,18 @@ class ConceptErasure(Intervention):
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
         """Clean, then every place and role untouched, erased and with its controls. Raises UnknownSiteError."""
-        found = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
+        found = resolve_all(self.sites, session.policy)
         wanted = {place: roles_of(session.policy, place.stream, self.roles) for place in found.values()}
         if not any(wanted.values()):
             raise UsageError(f"no token of {', '.join(found)} has the role {', '.join(self.roles)}")
         cells: dict[tuple[SiteGroup, str], _FittedErasers] = {}
+        passed_over = PassedOver(session, self.sites)
         for place, role, category, own in collect_token_features(session, items_of(session.run, self), wanted):
-            self._fit(cells.setdefault((place, role), _FittedErasers()), place, role, category, own)
-        return [CleanRun(), *(erased for (place, role), cell in cells.items() for erased in cell.at(place, role))]
+            with passed_over.fitting(place, role):
+                self._fit(cells.setdefault((place, role), _FittedErasers()), place, role, category, own)
+        left = {cell: fitted for cell, fitted in cells.items() if not passed_over.holds(*cell)}
+        passed_over.check_some_left(list(left))
+        return [CleanRun(), *(erased for (place, role), cell in left.items() for erased in cell.at(place, role))]
 
     def certificate_entries(self, conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, Any]:
         """How well a fresh probe reads the answer behind each condition, by category."""

@@ -19,7 +19,7 @@ class Kind:
     notes: (rows, `Measurement`) → what a reader must know, in sentences; may be missing, like `sentences`.
     keys_in_use: run → keys of the stored interventions that tables and figures read; missing if none reads them.
     has_verdict: whether its rows are classified by `classify_use`. is_descriptive: whether it edits nothing and
-    tests nothing.
+    tests nothing. asks_where: whether it edits places of the network, so that a line says which layer matters.
     """
 
     name: str
@@ -33,6 +33,7 @@ class Kind:
     keys_in_use: str = ""
     has_verdict: bool = False
     is_descriptive: bool = False
+    asks_where: bool = False
 
     def function(self, part: str) -> Callable[..., Any]:
         """What `build`, `effects`, `table`, `sentences`, `notes` or `keys_in_use` names, imported now."""

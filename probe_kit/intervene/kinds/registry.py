@@ -32,6 +32,7 @@ _ENTRIES = (
     Kind(
         name="interchange",
         summary="Activation patching: where does the swapped image pass?",
+        asks_where=True,
         build="probe_kit.intervene.kinds.interchange.intervention:Interchange.from_options",
         effects="probe_kit.intervene.kinds.site_effects:measured_patches",
         table="probe_kit.intervene.kinds.site_table:site_table",
@@ -50,6 +51,7 @@ _ENTRIES = (
     Kind(
         name="joint",
         summary="Patch sets of places: each alone, all but it, smallest set.",
+        asks_where=True,
         build="probe_kit.intervene.kinds.joint.intervention:JointPlaces.from_options",
         effects="probe_kit.intervene.kinds.joint.effects:measured_joint_places",
         table="probe_kit.intervene.kinds.joint.table:joint_table",
@@ -79,6 +81,7 @@ _ENTRIES = (
     Kind(
         name="steer",
         summary="Add a direction to tokens, with controls of the same norm.",
+        asks_where=True,
         build="probe_kit.intervene.kinds.steer.intervention:Steering.from_options",
         effects="probe_kit.intervene.kinds.site_effects:measured_patches",
         table="probe_kit.intervene.kinds.site_table:site_table",

@@ -15,7 +15,7 @@ _LEGEND = (
     "effect: share of what the whole image swap does, n/a where that is not beyond chance; net flip rate: share "
     "of episodes that flip to the target side, minus those that flip away from it; p: family-wise over all edits "
     "of the category, one-sided; relative change: how far tokens were moved, in their own norms; *: carries the "
-    "effect by construction and locates nothing"
+    "effect by construction and locates nothing; unread: nothing that acts reads this place"
 )
 
 
@@ -24,11 +24,12 @@ def site_table(rows: Sequence[PatchEffect], context: TableContext) -> "Responsiv
     from probe_kit._terminal.responsive_table import Part, ResponsiveTable
 
     shown = [row for row in rows if not row.is_control]
+    unread = context.measurement.certificate.get("unread", ())
     return ResponsiveTable(
         title=f"Where is it used? {context.subject}, {context.measurement.settings['kind']}",
         caption=_LEGEND,
         name="category · edit",
-        names=tuple(f"{row.category} · {row.name}" for row in shown),
+        names=tuple(f"{row.category} · {row.name}{' (unread)' * (row.place in unread)}" for row in shown),
         styles=tuple("bold" if row.is_localised and not row.is_by_construction else "" for row in shown),
         parts=(
             Part(
@@ -48,9 +49,18 @@ def site_table(rows: Sequence[PatchEffect], context: TableContext) -> "Responsiv
     )
 
 
-def site_sentences(rows: Sequence[PatchEffect], _: TableContext) -> list[str]:
+def site_sentences(rows: Sequence[PatchEffect], context: TableContext) -> list[str]:
     """One per category: which edits carry half of what the image swap does, or move the action at all."""
-    return [f"{category_of(name).title}: {_finding(own)}." for name, own in by_category(rows).items()]
+    unread = context.measurement.certificate.get("unread", ())
+    return [
+        f"{category_of(name).title}: {_finding(own)}{_unread(own, unread)}."
+        for name, own in by_category(rows).items()
+    ]
+
+
+def _unread(rows: Sequence[PatchEffect], unread: Sequence[str]) -> str:
+    places = [place for place in unread if any(row.place == place for row in rows)]
+    return f"; unread: {', '.join(places)}" if places else ""
 
 
 def _finding(rows: Sequence[PatchEffect]) -> str:

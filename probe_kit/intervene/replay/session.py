@@ -22,12 +22,14 @@ from probe_kit.extract.rollout.capturing import SMALL
 from probe_kit.extract.rollout.stage import Seen, Stage
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.store.run import Run
+from probe_kit.extract.store.sources import RunSources
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.checkpoint import cached_folder
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.family import SIZE
 from probe_kit.suite.counterparts import counterparts_of
 from probe_kit.suite.items import Episode, Item, Layout, Side
 from probe_kit.train.data.run_suite import suite_of
@@ -53,15 +55,16 @@ class Progress(Protocol):
 class ReplaySource:
     """Where a run's policy, pictures and files are found again; what is found must have the run's hashes.
 
-    suite: folder; None for the embedded suite, which is drawn again if need be. checkpoint, options, weights_seed,
-    device: as for `probe-kit extract`; without a checkpoint, the run's own folder if it is still there. files: of
-    the scene, by field, such as `background`.
+    suite: folder; None for that of the run, see `suite_of`. checkpoint, options, weights_seed: as for
+    `probe-kit extract`; by default those of the run, of a checkpoint its folder if it is still there. Options of
+    the run stay but for those that are named anew. device: of the model. files: of the scene, by field, such as
+    `background`; by default those of the run that are still there.
     """
 
     suite: Path | None = None
     checkpoint: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
-    weights_seed: int = 0
+    weights_seed: int | None = None
     device: str = "cpu"
     files: Mapping[str, Path] = field(default_factory=dict)
 
@@ -92,13 +95,15 @@ class ReplaySession:
     """A policy and a scene; a context manager, because it holds a simulator.
 
     items: of the run's suite, by id. counterparts: of those that have one, see `counterparts_of`. on_fit_progress:
-    called after every item that is inferred beforehand, for directions and erasers.
+    called after every item that is inferred beforehand, for directions and erasers. passed_over: places of a
+    wildcard, each with its role, at which an answer has no direction, and why.
     """
 
     def __init__(self, run: Run, policy: "Policy", scene: SceneSpec, items: Mapping[str, Item]) -> None:
         self.run, self.policy, self.scene = run, policy, scene
         self.items, self.counterparts = items, counterparts_of(items.values())
         self.on_fit_progress: Progress | None = None
+        self.passed_over: dict[str, str] = {}
         self.stage = Stage(scene, None)
         left, right = np.array(scene.tile_left), np.array(scene.tile_right)
         self._middle, self._across = (left + right) / 2, (left - right) / float(np.linalg.norm(left - right))
@@ -219,7 +224,7 @@ def open_session(
     SuiteError for another suite, SuiteNotFoundError for one that is neither given nor can be drawn again,
     SceneError for a scene that needs a file which is not given.
     """
-    scene = SceneSpec.from_json(run.settings["scene"], source.files)
+    scene = SceneSpec.from_json(run.settings["scene"], {**_scene_files(run), **source.files})
     suite = suite_of(run, source.suite)
     policy = (load or load_policy_of)(run, source)
     _check_policy(run, policy)
@@ -227,18 +232,38 @@ def open_session(
 
 
 def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
-    """The policy that a run names."""
+    """The policy that a run names, loaded as its own process loaded it.
+
+    A file whose weights call themselves random is loaded as a file: only requested random weights are drawn.
+    """
     from probe_kit.hooks import load_policy
 
+    made = _sources_of(run)
+    checkpoint = source.checkpoint or _folder_of(run)
     return load_policy(
         run.model,
-        source.checkpoint or _folder_of(run),
+        checkpoint,
         source.device,
         run.settings["dtype"],
-        run.random_weights,
-        source.weights_seed,
-        **source.options,
+        made.random_weights,
+        made.weights_seed if source.weights_seed is None else source.weights_seed,
+        **{**_options_of(made, checkpoint), **source.options},
     )
+
+
+def _sources_of(run: Run) -> RunSources:
+    return run.sources[0] if run.sources else RunSources()
+
+
+def _options_of(made: RunSources, checkpoint: str | None) -> dict[str, Any]:
+    """Options of the run, without the one that stands for a checkpoint where there is a checkpoint."""
+    return {name: value for name, value in made.options.items() if checkpoint is None or name != SIZE}
+
+
+def _scene_files(run: Run) -> dict[str, Path]:
+    """Files of the scene from which the run was made, as far as they exist here."""
+    files = {name: Path(path) for name, path in _sources_of(run).scene_files.items()}
+    return {name: path for name, path in files.items() if path.is_file()}
 
 
 def _folder_of(run: Run) -> str | None:
@@ -246,22 +271,17 @@ def _folder_of(run: Run) -> str | None:
 
     A hub id of a run is never fetched.
     """
-    made = _checkpoint_of(run)
+    made = _sources_of(run).checkpoint
     if cached_folder(made) is not None:
         return made
     is_folder = made not in ("", EMBEDDED) and Path(made).expanduser().is_dir()
     return made if is_folder else None
 
 
-def _checkpoint_of(run: Run) -> str:
-    """The checkpoint as it was named when the run was made; empty if unknown."""
-    return str(run.certificate.get("policy", {}).get("checkpoint", ""))
-
-
 def _check_policy(run: Run, policy: "Policy") -> None:
     card = policy.card
     if card.weights_sha256 != run.weights_sha256:
-        made = _checkpoint_of(run) or "an unknown checkpoint"
+        made = _sources_of(run).checkpoint or "an unknown checkpoint"
         raise SettingsMismatchError(
             f"the weights of {card.checkpoint} are {card.weights_sha256[:12]}; {run.location} was made with "
             f"{str(run.weights_sha256)[:12]}, loaded from {made}. Give that --checkpoint (or --weights-seed)"

@@ -21,6 +21,7 @@ from probe_kit.intervene.edits.pooled_directions import (
     fit_directions,
 )
 from probe_kit.intervene.edits.sites import SiteGroup
+from probe_kit.intervene.replay.passed_over import PassedOver
 from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.intervene.replay.token_features import by_episode, collect_token_features, fit_by_fold
 
@@ -67,26 +68,35 @@ def fit_token_directions(
     direction: str,
     controls: int,
     seed: int,
+    passed_over: PassedOver,
 ) -> dict[tuple[SiteGroup, str], DirectionBasis]:
     """By place and role what `direction` means there: of the run's columns, or of the tokens of these items (ids).
 
     `mean-difference:K`: the K directions along which the differences of class means at all positions lie most, the
-    same for every token; from one clean inference per episode and place. wanted: roles by place. Raises
-    UnknownSiteError for a place of several sites or one that is not stored, UsageError where there are too few
-    episodes to learn from.
+    same for every token; from one clean inference per episode and place. wanted: roles by place. passed_over: what
+    may be left out. Raises UnknownSiteError for a place of several sites or one that is not stored,
+    NoDirectionError for a named place without a direction, UsageError where there are too few episodes to learn
+    from.
     """
+    categories = tuple(dict.fromkeys(session.items[item].category for item in items))
+    pooled: dict[tuple[SiteGroup, str], DirectionBasis] = {}
     if ":" not in direction:
-        return {
-            (place, role): fit_directions(session.run, place.only_site, role, direction, controls, seed)
-            for place, roles in wanted.items()
-            for role in roles
-        }
+        for place, role in ((place, role) for place, roles in wanted.items() for role in roles):
+            with passed_over.fitting(place, role):
+                pooled[place, role] = fit_directions(
+                    session.run, place.only_site, role, direction, controls, seed, categories
+                )
+        passed_over.check_some_left(list(pooled))
+        return pooled
     bases: dict[tuple[SiteGroup, str], dict[tuple[str, str], Vector]] = {}
     for place, role, category, own in collect_token_features(session, items, wanted):
-        fits = fit_by_fold(own, place.only_site, role, Method.of(direction), controls, seed, category)
-        found = bases.setdefault((place, role), {})
-        for name, of_episode in by_episode(own, fits).items():
-            found |= {
-                (name, episode): eraser.removed[0].astype(np.float32) for episode, eraser in of_episode.items()
-            }
-    return {cell: TokenDirections(found, control_names(controls)) for cell, found in bases.items()}
+        with passed_over.fitting(place, role):
+            fits = fit_by_fold(own, place.only_site, role, Method.of(direction), controls, seed, category)
+            found = bases.setdefault((place, role), {})
+            for name, of_episode in by_episode(own, fits).items():
+                found |= {
+                    (name, episode): eraser.removed[0].astype(np.float32) for episode, eraser in of_episode.items()
+                }
+    left = {cell: found for cell, found in bases.items() if not passed_over.holds(*cell)}
+    passed_over.check_some_left(list(left))
+    return {cell: TokenDirections(found, control_names(controls)) for cell, found in left.items()}

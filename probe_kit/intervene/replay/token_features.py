@@ -91,7 +91,7 @@ def fit_by_fold(
 ) -> Fits:
     """An eraser called `method` and its controls, for every fold of the groups of one category.
 
-    Raises UsageError, which names category, site and role, where there is nothing to learn from: see `fit_eraser`.
+    Raises as `fit_eraser` does, where there is nothing to learn from, and names category, site and role.
     """
     groups = min(FOLDS, np.unique(own.groups).size)
     folds = grouped_folds(own.left.astype(int), own.groups, groups, derive_seed("erase", seed, category))
@@ -99,7 +99,7 @@ def fit_by_fold(
     try:
         return [(fold, _fitted(own, fold, method, controls, draw)) for fold in folds]
     except UsageError as error:
-        raise UsageError(f"{category}, {site}, role {role}: {error}") from error
+        raise type(error)(f"{category}, {site}, role {role}: {error}") from error
 
 
 def by_episode(own: TokenFeatures, fits: Fits) -> dict[str, dict[str, Eraser]]:

@@ -23,8 +23,8 @@ def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, 
     where no single role carries half of it. Raises UsageError if none was located.
     """
     stored = stored_site_effects(run)
-    found = [_best(stored.get(category, [])) for category in categories]
-    cells = tuple(dict.fromkeys(cell for cell in found if cell is not None))
+    found = [best_cell(stored.get(category, [])) for category in categories]
+    cells = tuple(dict.fromkeys(str(ConditionName(cell.place, cell.role)) for cell in found if cell is not None))
     if not cells:
         raise UsageError(
             f"no stored interchange of {run.location} located a place of {', '.join(categories)}: run "
@@ -33,14 +33,14 @@ def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, 
     return cells
 
 
-def _best(rows: Sequence[PatchEffect]) -> str | None:
+def best_cell(rows: Sequence[PatchEffect]) -> PatchEffect | None:
+    """The patch behind which nothing of the answer passes, of one category; see `best_patch_targets`."""
     located = [row for row in rows if row.is_localised and not row.direction]
     if not located:
         return None
     deepest = ([row for row in located if is_backbone_layer(row)] or located)[-1]
     last = [row for row in located if row.place == deepest.place]
-    best = max(last, key=lambda row: (row.role != ALL, row.effect or 0.0))
-    return str(ConditionName(best.place, best.role))
+    return max(last, key=lambda row: (row.role != ALL, row.effect or 0.0))
 
 
 def build_closed_loop(run: Run, **options: Any) -> ClosedLoop:

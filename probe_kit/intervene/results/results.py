@@ -10,6 +10,7 @@ import numpy as np
 
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError
+from probe_kit.intervene.edits.unread import unread_note
 from probe_kit.intervene.kinds.base import EffectLike, Measurement, TableContext, frame_of
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, stored_image_swaps
 from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict, classify_all, encoded_in
@@ -19,6 +20,7 @@ from probe_kit.intervene.kinds.registry import kind_of
 from probe_kit.intervene.results.places import stored_places
 from probe_kit.intervene.results.readouts import stored_other_readouts
 from probe_kit.intervene.results.ties import stored_ties
+from probe_kit.intervene.results.which_layer import which_layer
 from probe_kit.intervene.store.answers import ConditionOutcomes, StoredIntervention, find_stored
 from probe_kit.intervene.store.settings import PER_STEP
 from probe_kit.statistics.sign_flips import smallest_flip_p
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit.train.results.probe_results import ProbeResults
 
 _VERDICT_COLUMNS = ("verdict", "behaviour", "reversed", "reason", "place", "tie")
 
@@ -39,13 +42,14 @@ class InterventionResult:
     """One intervention: its settings, what it gave, and what that means.
 
     label: of the run. measurement: what effects are computed from. verdicts: by category, from this and what else
-    is stored with the run.
+    is stored with the run. layers: by category a line about the layer, of a kind that edits places.
     """
 
     label: str
     random_weights: bool
     measurement: Measurement = field(repr=False)
     verdicts: dict[str, UseVerdict] = field(default_factory=dict)
+    layers: dict[str, str] = field(default_factory=dict)
 
     @property
     def key(self) -> str:
@@ -98,13 +102,22 @@ class InterventionResult:
         """What a reader must know, a sentence each."""
         own = self._kind.function("notes")(self.effects, self.measurement) if self._kind.notes else ()
         tests = () if self._kind.is_descriptive else (*self._few_groups(), *self._one_step())
-        return *self._replayed(), *self._passed_over(), *tests, *own
+        return *self._replayed(), *self._skipped_items(), *self._places(), *tests, *own
 
     @property
     def _kind(self) -> Kind:
         return kind_of(self.kind)
 
-    def _passed_over(self) -> list[str]:
+    def _places(self) -> list[str]:
+        """Places that nothing reads, and places of a wildcard without a direction."""
+        unread, passed = self.certificate.get("unread", ()), self.certificate.get("passed_over", {})
+        notes = [f"{unread_note(unread)}."] if unread else []
+        if passed:
+            reason = next(iter(passed.values()))
+            notes.append(f"passed over, because an answer has no direction there: {', '.join(passed)} ({reason}).")
+        return notes
+
+    def _skipped_items(self) -> list[str]:
         counts = self.certificate.get("items", {"asked": 0, "played": 0})
         left_out = counts["asked"] - counts["played"]
         return [f"{left_out} of {counts['asked']} items have no counterpart and were skipped."] if left_out else []
@@ -164,8 +177,10 @@ class InterventionResult:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What was found, a sentence per category; none of a kind that only describes."""
-        return tuple(self._kind.function("sentences")(self.effects, self._context)) if self._kind.sentences else ()
+        """The finding, a sentence per category, and a line about the layer; none of a kind that only describes."""
+        if not self._kind.sentences:
+            return ()
+        return *self._kind.function("sentences")(self.effects, self._context), *self.layers.values()
 
     def to_rich(self, details: bool = True) -> "ResponsiveTable":
         """The table for a terminal. details: split it where it is wide, else leave columns out by name."""
@@ -196,6 +211,8 @@ def effects_of(run: RunReader, stored: StoredIntervention) -> InterventionResult
     found = InterventionResult(run.label, run.random_weights, measurement)
     shown = found.effects if kind_of(found.kind).has_verdict else ()
     found.verdicts.update(verdicts_of(run, shown))
+    if kind_of(found.kind).asks_where:
+        found.layers.update(which_layer(run, _newest_probes(run), list(stored.settings["categories"])))
     return found
 
 
@@ -204,13 +221,17 @@ def verdicts_of(run: RunReader, shown: Sequence[ImageSwapEffect] = ()) -> dict[s
 
     shown: the image swap that is to be classified, whatever else is stored of these categories.
     """
-    try:
-        results = load_results(run)
-    except NoProbesError:
-        results = None
+    results = _newest_probes(run)
     found = {**stored_image_swaps(run), **{row.category: row for row in shown}}
     others = stored_other_readouts(run, found)
     return classify_all(found, encoded_in(results), stored_places(run), stored_ties(run, results), others)
+
+
+def _newest_probes(run: RunReader) -> "ProbeResults | None":
+    try:
+        return load_results(run)
+    except NoProbesError:
+        return None
 
 
 def effects_csv(measurement: Measurement) -> str:

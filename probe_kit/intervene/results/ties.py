@@ -99,7 +99,7 @@ def stored_ties(run: RunReader, results: "ProbeResults | None", view: str | None
 
     view: None for the first that was probed. Empty without probes, and for views that are no mean over a role.
     """
-    role = None if results is None else _role_of(view or results.settings.views[0])
+    role = None if results is None else role_of_view(view or results.settings.views[0])
     if results is None or role is None:
         return {}
     scores = results.scores
@@ -138,8 +138,8 @@ def _is_read_along(row: PatchEffect) -> bool:
     return row.is_localised and row.control_displacement is not None and _low(row) > NOTHING
 
 
-def _role_of(view: str) -> str | None:
-    """The role whose tokens a view averages: all of them for `mean`."""
+def role_of_view(view: str) -> str | None:
+    """The role whose tokens a view averages, all of them for `mean`; None for another view."""
     kind, _, role = view.partition(":")
     return (role or ALL) if kind == "mean" else None
 

@@ -1,11 +1,12 @@
 """What a row says in words: its verdict, and the sentence about it."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 from probe_kit.intervene.kinds.image_swap.verdict import UNTESTED, UseVerdict
 from probe_kit.intervene.kinds.image_swap.words import describe_swap
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.text import is_vlm, percent
+from probe_kit.retention.columns.text import is_vlm, model_name, percent
 from probe_kit.retention.estimators.stream_scores import Limits
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
@@ -253,7 +254,23 @@ def _in_stream(name: str, part: StreamPart, what: str) -> str:
 
 
 def _accuracy(part: StreamPart) -> str:
-    return f"{_whole(part.score)} %{_range(part.ci)}"
+    """Of a stream with signal; a signal that no control was compared with may be in the pictures themselves."""
+    against = "" if part.is_controlled else "; against chance only"
+    return f"{_whole(part.score)} %{_range(part.ci)}{against}"
+
+
+def chance_only(rows: Sequence[RetentionRow]) -> str:
+    """A warning that names the runs whose probes were compared with no control; empty where all were."""
+    probed = [row for row in rows if _is_probed(row)]
+    names = list(dict.fromkeys(model_name(row) for row in probed if not row.backbone.is_controlled))
+    if not names:
+        return ""
+    several = len({model_name(row) for row in rows}) > 1
+    of_runs = f" for {', '.join(names)}" if several else ""
+    return (
+        f"No control was run{of_runs}: a signal is judged against chance only, and pictures and words alone may "
+        "give the answer away. Run `probe-kit train RUN`, with --suite FOLDER where it cannot find the suite"
+    )
 
 
 # -- behaviour -----------------------------------------------------------------------------------------------

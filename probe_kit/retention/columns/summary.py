@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from probe_kit.intervene.kinds.image_swap.verdict import describe_readouts
-from probe_kit.retention.columns.sentences import describe_category, knows, verdict
+from probe_kit.retention.columns.sentences import chance_only, describe_category, knows, verdict
 from probe_kit.retention.columns.text import (
     difference_interval,
     difference_test,
@@ -19,11 +19,12 @@ from probe_kit.retention.columns.text import (
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.estimators.stream_scores import Limits
+from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.suite.categories import category_of
 
 MARK = "✓"
-"""After a share: the stream's signal is shown, or the regime of the behaviour is knowledge."""
+"""After a share: the stream exceeds chance and a control, or the regime of the behaviour is knowledge."""
 _LEGENDS = {
     "VLM %": "VLM: share of its answers that are right",
     "backbone %": "Backbone: accuracy of probes in the backbone, at sites that other questions chose",
@@ -58,8 +59,8 @@ class CategorySummary:
         acts = None if is_vlm(row) else row
         return (
             "–" if asked is None else _share(asked.success.sr, asked.success.ci, knows(asked), intervals),
-            _share(row.backbone.score, row.backbone.ci, row.backbone.has_signal, intervals),
-            _share(row.action.score, row.action.ci, row.action.has_signal, intervals),
+            _share(row.backbone.score, row.backbone.ci, _is_marked(row.backbone), intervals),
+            _share(row.action.score, row.action.ci, _is_marked(row.action), intervals),
             "–" if acts is None else _share(acts.success.sr, acts.success.ci, knows(acts), intervals),
             _retention(row, intervals),
             "" if row.category == MEAN else str(verdict(row)),
@@ -72,6 +73,10 @@ class CategorySummary:
 
 
 HEADINGS = ("VLM %", "backbone %", "action %", "success %", "retention", "verdict")
+
+
+def _is_marked(part: StreamPart) -> bool:
+    return part.has_signal and part.is_controlled
 
 
 def _share(value: float | None, limits: Limits | None, marked: bool, intervals: bool) -> str:
@@ -137,11 +142,18 @@ def summary_table(
     legend += [f"{readouts[0].upper()}{readouts[1:]}"] if readouts else []
     return TextTable(
         f"Summary: {' · '.join(dict.fromkeys(run.title for run in found))}",
-        ". ".join([*legend, f"{MARK} above every control that was run"]),
+        ". ".join([*legend, *_marks(found, lines)]),
         tuple(headings[at] for at in shown),
         tuple(tuple(line[at] for at in shown) for line in lines),
         names=2 if 1 in shown else 1,
     )
+
+
+def _marks(found: Sequence[RunSummary], lines: Sequence[tuple[str, ...]]) -> list[str]:
+    """What the mark says where it stands, and a warning where it cannot stand because no control was run."""
+    marked = any(MARK in cell for line in lines for cell in line)
+    warning = chance_only([one.row for run in found for one in run.categories])
+    return [f"{MARK} above every control that was run"] * marked + [warning] * bool(warning)
 
 
 def _difference_cells(row: Difference, intervals: bool) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from probe_kit.retention.columns.lines import (
     probe_lines,
 )
 from probe_kit.retention.columns.modes import modes_of
+from probe_kit.retention.columns.sentences import chance_only
 from probe_kit.retention.columns.text import controlled, is_vlm, once_per_category, probed
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
@@ -154,7 +155,8 @@ def _legend(title: str, rows: Sequence[RetentionRow]) -> list[str]:
     if title == "Success rate":
         return [_OUTCOMES, *rule_sentences(rows)]
     if title == "Retention":
-        return [_ANSWER_SITES if modes_of(rows) == "answers" else _SITES, *_undefined(rows), *_chance_only(rows)]
+        sites = _ANSWER_SITES if modes_of(rows) == "answers" else _SITES
+        return [*filter(None, (sites, *_undefined(rows), chance_only(rows)))]
     return [_controls(rows)]
 
 
@@ -181,14 +183,6 @@ def _undefined(rows: Sequence[RetentionRow]) -> list[str]:
     means = {row.retention.note for row in rows if row.retention.defined and row.retention.note}
     found = [f"{reason}: {', '.join(dict.fromkeys(names))}" for reason, names in reasons.items()]
     return [*found, *(f"mean {note}" for note in sorted(means))]
-
-
-def _chance_only(rows: Sequence[RetentionRow]) -> list[str]:
-    """A warning where signal was compared with chance only, because no control was run."""
-    found = [row.backbone.exceeds for row in rows if row.backbone.exceeds]
-    tried = any(better is not None for one in found for name, better in one.items() if name != "chance")
-    mark = "signal is judged against chance only: add the controls random-features and untrained"
-    return [mark] if found and not tried else []
 
 
 def _controls(rows: Sequence[RetentionRow]) -> str:

@@ -53,6 +53,11 @@ class LabelPeak:
         """Whether it is above chance and exceeds every control that was run."""
         return not self.missed
 
+    @property
+    def is_marked(self) -> bool:
+        """Whether it has signal and was compared with a control, and not with chance alone."""
+        return self.has_signal and bool(self.exceeds)
+
 
 @dataclass(frozen=True, kw_only=True)
 class LabelRetention:

@@ -134,7 +134,14 @@ class LabelRetentionTable:
     def sentences(self) -> list[str]:
         """One per row: what reaches the action, or why that has no number. Then how many labels were tried."""
         several = len({place for place, _ in self.results}) > 1
-        return [*(_sentence(row, several) for row in self.rows), *self._tried()]
+        return [*(_sentence(row, several) for row in self.rows), *self._uncontrolled(), *self._tried()]
+
+    def _uncontrolled(self) -> list[str]:
+        """A warning where a signal was compared with no control."""
+        if not (bare := [row for row in self.rows if not row.retention.backbone.exceeds]):
+            return []
+        names = ", ".join(dict.fromkeys(f"{row.retention.target} of {row.run}" for row in bare))
+        return [f"No control was run for {names}: a signal there is judged against chance only."]
 
     def _tried(self) -> list[str]:
         """What the p-values are corrected for, wherever a run has probes of several labels."""
@@ -260,7 +267,7 @@ def _corrected(rows: Sequence[LabelRow], results: Mapping[tuple[str, str], Label
 
 
 def _peak(peak: LabelPeak) -> tuple[str, str, str, str]:
-    score = f"{number(peak.score)}{_SIGNAL * peak.has_signal}"
+    score = f"{number(peak.score)}{_SIGNAL * peak.is_marked}"
     chance = "–" if peak.chance != peak.chance else number(peak.chance)
     return peak.site, score, chance, _above(peak).removesuffix(_SIGNAL)
 
@@ -269,7 +276,7 @@ def _above(peak: LabelPeak) -> str:
     """Score above chance with its interval, marked where there is signal."""
     if peak.chance != peak.chance:
         return "–"
-    return with_limits(number(peak.above), peak.ci, number) + _SIGNAL * peak.has_signal
+    return with_limits(number(peak.above), peak.ci, number) + _SIGNAL * peak.is_marked
 
 
 def _value(found: LabelRetention) -> str:

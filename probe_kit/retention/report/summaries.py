@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from probe_kit.retention.columns.modes import RATE, modes_of
+from probe_kit.retention.columns.sentences import chance_only
 from probe_kit.retention.columns.text import is_vlm, model_name, percent
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
@@ -57,6 +58,8 @@ def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     if biased:
         habit = "The answers have a habit of naming" if is_vlm(mean) else "The policy has a habit of going to"
         found.append(f"{habit} one side in {_of(biased, rows)}.")
+    if uncontrolled := chance_only(rows):
+        found.append(f"{uncontrolled}.")
     if mean.controls.leaks:
         found.append(
             f"The suite gives answers away without a model ({', '.join(mean.controls.leaks)}): see the "

@@ -144,6 +144,11 @@ class StreamPart:
         """Whether it is better than chance and than every control that was run."""
         return bool(self.exceeds) and has_signal(self.exceeds)
 
+    @property
+    def is_controlled(self) -> bool:
+        """Whether its best site was compared with a control, and not with chance alone."""
+        return any(better is not None for name, better in self.exceeds.items() if name != "chance")
+
 
 @dataclass(frozen=True, kw_only=True)
 class BackbonePart(StreamPart):

@@ -91,10 +91,22 @@ def validate_suite(
     return Report(suite.identity, tuple(missing_categories(suite.items)), once, gates)
 
 
+_BOTH_WAYS = (
+    "The answer shows without understanding the question. Ask each pair of pictures both ways, so that "
+    "every picture is as often right as wrong"
+)
+_REMEDIES = {
+    "position": "The answer lies on one side. Let it lie left as often as right",
+    "instruction": _BOTH_WAYS,
+    "pixels": _BOTH_WAYS,
+    "statistics": _BOTH_WAYS,
+}
+
+
 def _leaks(baselines: tuple[Baseline, ...]) -> list[Finding]:
     """W05: a baseline knows more than a coin."""
     return [
-        warning("W05", category_of(baseline.category).title, str(baseline))
+        warning("W05", category_of(baseline.category).title, f"{baseline}. {_REMEDIES[baseline.name]}")
         for baseline in baselines
         if not baseline.ok
     ]

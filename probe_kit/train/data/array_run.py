@@ -28,7 +28,8 @@ class ArrayRun:
 
     path: folder for the probe results. episodes: the table described in `RunReader.episodes`.
     features: (E, D) per site and view, rows in the order of `episodes`. token_features: per site and role (None
-    for all tokens), (E, T, D) values and (E, T) mask. A site needs a pooled view too.
+    for all tokens), (E, T, D) values and (E, T) mask. A site needs a pooled view too. control_features: (E, D) by
+    name, of controls of a label that never saw the model.
     Raises UsageError if an array has another number of rows or dimensions.
     """
 
@@ -42,6 +43,7 @@ class ArrayRun:
     token_features: Mapping[tuple[Site, str | None], tuple[NDArray[np.floating], NDArray[np.bool_]]] = field(
         default_factory=dict
     )
+    control_features: Mapping[str, NDArray[np.floating]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for (site, view), array in self.features.items():
@@ -69,7 +71,8 @@ class ArrayRun:
             [str(site), f"tokens:{role}", _sha256(values), _sha256(mask)]
             for (site, role), (values, mask) in self.token_features.items()
         ]
-        return sha256_json(sorted(pooled) + sorted(tokens))
+        controls = [[name, "control", _sha256(array)] for name, array in self.control_features.items()]
+        return sha256_json(sorted(pooled) + sorted(tokens) + sorted(controls))
 
     @property
     def streams(self) -> Mapping[str, Stream]:

@@ -1,4 +1,4 @@
-"""The suite of a run: from a folder, or drawn again if it is the embedded one."""
+"""The suite of a run: from a folder, from the folder it was extracted with, or drawn again."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probe_kit.errors import SuiteError, SuiteNotFoundError
+from probe_kit.errors import SuiteError, SuiteNotFoundError, UsageError
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
@@ -18,14 +18,33 @@ _GIVE = "Give the folder of that suite (--suite, suite=…)"
 def suite_of(run: RunReader, folder: Path | None = None) -> "Suite":
     """The run's suite, in a folder that may hold more than the run's items.
 
-    folder: where it lies; without one the run's part of the embedded suite is found in the cache or drawn again,
-    the same items whatever else the cache holds. Raises SuiteError for another suite in `folder` or a damaged
-    one; without a folder SuiteNotFoundError if the run's suite is not the embedded one, or drawn differently here.
+    folder: where it lies. Without one it is the suite of the folder that the run was extracted with, if that still
+    holds it; else the run's part of the embedded suite is found in the cache or drawn again, the same items
+    whatever else the cache holds. Raises SuiteError for another suite in `folder` or a damaged one; without a
+    folder SuiteNotFoundError if the run's suite is neither in its folder nor the embedded one, or drawn
+    differently here.
     """
+    if folder is not None:
+        return _in_folder(run, folder)
+    moved = []
+    for own in dict.fromkeys(sources.suite for sources in getattr(run, "sources", ()) if sources.suite):
+        try:
+            return _in_folder(run, Path(own))
+        except UsageError:
+            moved.append(f"The folder {own} of its extraction is gone")
+        except SuiteError as error:
+            moved.append(f"The folder {own} of its extraction no longer holds it: {error}")
+    try:
+        return _embedded(run)
+    except SuiteNotFoundError as error:
+        if not moved:
+            raise
+        raise SuiteNotFoundError(f"{error}. {'. '.join(moved)}") from error
+
+
+def _in_folder(run: RunReader, folder: Path) -> "Suite":
     from probe_kit.suite import load_suite
 
-    if folder is None:
-        return _embedded(run)
     suite = load_suite(folder)
     if not _holds(suite, run):
         raise SuiteError(

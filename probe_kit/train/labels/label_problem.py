@@ -87,13 +87,27 @@ def label_problem(
     columns = np.column_stack([samples.values, samples.values[source]])
     columns = columns[:, _trainable(columns, folds, labels)]
     problem = LabelProblem(labels.target, labels.task, labels.coded.classes, samples, folds, columns)
-    if problem.smallest_p >= SIGNIFICANCE and problem.smallest_p > 1.001 * smallest_p(permutations):
+    if columns.shape[1] > 1 and (columns == columns[:, :1]).all():
+        _warn_of_one_pattern(labels, samples, blocks)
+    elif problem.smallest_p >= SIGNIFICANCE and problem.smallest_p > 1.001 * smallest_p(permutations):
         warnings.warn(
             f"label {labels.target!r}: its groups allow no p below {problem.smallest_p:.3f}, so nothing can be "
             f"below {SIGNIFICANCE}. Label more groups",
             stacklevel=3,
         )
     return problem
+
+
+def _warn_of_one_pattern(labels: Labels, samples: LabelledSamples, blocks: dict[str, NDArray[np.intp]]) -> None:
+    classes, first = labels.coded.classes, samples.values[next(iter(blocks.values()))].tolist()
+    shown = [classes[int(value)] if classes else f"{value:g}" for value in first[:4]]
+    more = ", …" if len(first) > len(shown) else ""
+    warnings.warn(
+        f"label {labels.target!r} is the same in every group: each of the {len(blocks)} groups holds "
+        f"{', '.join(shown)}{more} in this order. Exchanging labels between groups changes nothing, so every "
+        "p is 1. Give groups in which the label differs (--group-by), or a label that differs between the groups",
+        stacklevel=4,
+    )
 
 
 def _check_groups(labels: Labels, samples: LabelledSamples) -> None:

@@ -5,6 +5,7 @@ import os
 import shutil
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 
-from probe_kit.errors import RecordingError, SettingsMismatchError, UnitsError
+from probe_kit.errors import InstructionError, RecordingError, SettingsMismatchError, UnitsError
 from probe_kit.extract import ExtractSettings, LeRobotSource, prepare
 from probe_kit.extract.recordings.hashed_files import HashedFiles
 from probe_kit.extract.recordings.lerobot_folder import LeRobotFolder, open_lerobot
@@ -545,3 +546,54 @@ def test_actions_are_compared_with_recorded_ones_of_the_same_names_in_the_same_o
         ExtractSettings("pi0-tiny", source=LeRobotSource(str(copy)), env_workers=0), policy=pi0_tiny
     )
     assert reason in prepared.plan.selection["recording"]["other_actions"]
+
+
+# -- what does not fit -------------------------------------------------------------------------------------------
+
+
+def misfit(folder: Path, state: int, words: str, camera: str) -> ExtractSettings:
+    """A recording with a state of so many numbers, such words and a camera of that name of the model."""
+    episodes = [
+        [replace(one, state=one.state[:state], instruction=words) for one in episode] for episode in observations()
+    ]
+    write_recording(folder, episodes)
+    source = LeRobotSource(str(folder), cameras=((camera, CAMERA),))
+    return ExtractSettings("pi0-tiny", source=source, env_workers=0)
+
+
+def test_camera_words_and_state_that_do_not_fit_are_refused_together_before_a_network_is_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("probe_kit.extract.prepared.load_acting_policy", lambda _: pytest.fail("it was loaded"))
+    settings = misfit(tmp_path / "rec", 6, "Stack the plates", "wrist")
+    with pytest.raises(RecordingError) as refused:
+        prepare(settings)
+    said = str(refused.value)
+    assert said.startswith("3 things about the recordings do not fit the model")
+    assert "--camera wrist" in said
+    assert "'plates'" in said
+    assert "has 6 numbers as observation.state; pi0-tiny reads 8" in said
+
+
+@pytest.mark.parametrize(
+    ("state", "words", "camera", "error", "message"),
+    [
+        (8, "Put the cube on the red shape", "wrist", RecordingError, "--camera wrist"),
+        (8, "Stack the plates", "base", InstructionError, "plates"),
+        (6, "Put the cube on the red shape", "base", RecordingError, "6 numbers"),
+    ],
+)
+def test_one_thing_that_does_not_fit_is_its_own_error(
+    state: int, words: str, camera: str, error: type[Exception], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=message) as refused:
+        prepare(misfit(tmp_path / "rec", state, words, camera))
+    assert "things" not in str(refused.value)
+
+
+def test_camera_and_state_are_refused_together_where_only_the_loaded_model_knows_them(
+    pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    settings = misfit(tmp_path / "rec", 6, "Put the cube on the red shape", "wrist")
+    with pytest.raises(RecordingError, match=r"2 things(.|\n)*wrist(.|\n)*6 numbers"):
+        prepare(settings, policy=pi0_tiny)

@@ -31,7 +31,8 @@ def test_a_hub_out_of_reach_is_said_within_seconds(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", address)
     started = time.monotonic()
     with pytest.raises(
-        CheckpointError, match=r"cannot fetch 'some/model' from the hub \(.*the cache has no copy\)"
+        CheckpointError,
+        match=r"folder 'some/model' does not exist in /.*cannot be fetched \(.*the cache has no copy\)",
     ):
         checkpoint_folder("some/model")
     assert (
@@ -48,6 +49,17 @@ def test_offline_mode_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     monkeypatch.setattr(hub, "urlopen", lambda *_, **__: pytest.fail("it was asked"))
     assert "offline mode" in hub.unreachable()
+
+
+@pytest.mark.parametrize("name", ["checkpoint", "./runs/checkpoint", "runs/mine/checkpoints/last"])
+def test_a_relative_folder_that_is_not_here_is_named_with_the_folder_it_was_looked_for_in(
+    name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CheckpointError, match=f"folder '{name}' does not exist in {tmp_path}$"):
+        checkpoint_folder(name)
+    with pytest.raises(CheckpointError, match=f"folder '{tmp_path}/nothing' does not exist$"):
+        checkpoint_folder(str(tmp_path / "nothing"))
 
 
 @pytest.mark.parametrize("name", ["some/[bold]", "some/..", "some/" + "a" * 200, "~nobody/x", "some/\x1b[31m"])

@@ -49,7 +49,8 @@ def part(found: Literal["shown", "not shown", "absent"], score: float, most: flo
 
 
 PARTS: dict[str, dict[str, Any]] = {
-    "shown": part("shown", 0.98, 1.0, chance=True),
+    "shown": part("shown", 0.98, 1.0, **{"chance": True, "random-features": True}),
+    "shown, no control": part("shown", 0.98, 1.0, chance=True),
     "at chance": part("not shown", 0.52, 0.78),
     "no better than controls": part("not shown", 0.9, 0.97, **{"chance": True, "random-features": False}),
     "no permutations": part("not shown", 0.9, 0.97, chance=None),

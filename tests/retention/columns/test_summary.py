@@ -11,6 +11,7 @@ from probe_kit.intervene import Behaviour, UseVerdict
 from probe_kit.retention import RetentionRow, RetentionTable
 from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
 from probe_kit.retention.columns.summary import HEADINGS, MARK, summarise_runs, summary_table
+from probe_kit.retention.report.summaries import read_run
 from probe_kit.retention.rows.parts import (
     ActionPart,
     AnswerStats,
@@ -46,7 +47,12 @@ def acts(
     category: str, backbone: float | None, used: Behaviour | None, sr: float | None = 0.5, **run: Any
 ) -> RetentionRow:
     shown = backbone is not None and backbone > 0.7
-    part: dict[str, Any] = {"score": backbone, "ci": (0.4, 1.0), "at_most": 0.78, "exceeds": {"chance": shown}}
+    part: dict[str, Any] = {
+        "score": backbone,
+        "ci": (0.4, 1.0),
+        "at_most": 0.78,
+        "exceeds": {"chance": shown, "random-features": True},
+    }
     part["verdict"] = None if backbone is None else "shown" if shown else "not shown"
     return replace(
         row("acts", category, sr, **run),
@@ -100,6 +106,29 @@ def test_every_number_has_its_interval_and_a_mark_where_it_exceeds_every_control
     assert counting[-2:] == ("n/a", "not shown")
     assert mean[0] == "Mean"
     assert mean[-1] == ""
+
+
+def test_nothing_is_marked_where_no_control_was_run_and_a_warning_names_the_run() -> None:
+    bare = [
+        replace(
+            one,
+            backbone=replace(one.backbone, exceeds={"chance": True, "random-features": None, "untrained": None}),
+            action=replace(one.action, exceeds={"chance": True}),
+            run=replace(one.run, location="bare", label="bare"),
+        )
+        for one in ACTED
+    ]
+    (found,) = summarise_runs(bare)
+    table = summary_table([found])
+    backbone, action, success = (table.columns.index(name) for name in ("backbone %", "action %", "success %"))
+    assert MARK not in table.cells[0][backbone] + table.cells[0][action]
+    assert MARK in table.cells[0][success]
+    assert "No control was run: a signal is judged against chance only" in table.note
+    assert "against chance only" in found.sentences[0]
+    both = summary_table(summarise_runs([*ACTED, *bare]))
+    assert "No control was run for bare:" in both.note
+    assert "No control" not in summary_table(summarise_runs(ACTED)).note
+    assert any("No control was run" in warning for warning in read_run([*bare[:3], bare[3]]).warnings)
 
 
 def test_several_runs_stand_in_one_table_by_category() -> None:

@@ -97,7 +97,15 @@ def test_a_category_of_ones_own_is_a_row_and_a_misspelt_one_is_pointed_out(
     assert suite.categories == ("ripe-fruit",)
     assert load_suite(suite.folder).items == suite.items
     assert "Ripe fruit" in validate_suite(suite.folder).to_text()
-    misspelt = suite_from_pictures(tmp_path / "other", [replace(pair, category="colour")], **TERMS)
+    alone = suite_from_pictures(tmp_path / "alone", [replace(pair, category="colour")], **TERMS)
+    for own in (suite, alone):
+        report = validate_suite(own.folder)
+        assert report.missing == ()
+        assert "Not in this suite" not in report.to_text()
+        assert not [finding for finding in report.warnings if finding.rule == "W08"]
+    known = PicturePair("shape", "red disc", discs["red"], "green disc", discs["green"])
+    both = [replace(pair, category="colour"), known]
+    misspelt = suite_from_pictures(tmp_path / "other", both, **TERMS)
     assert [str(f) for f in validate_suite(misspelt.folder).warnings if f.rule == "W08"] == [
         "W08 colour: is none of the paper; if 'color' is meant, rename it"
     ]

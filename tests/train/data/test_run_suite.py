@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SuiteError, SuiteNotFoundError
-from probe_kit.extract import ExtractSettings, Run, open_run, seal
+from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, seal
 from probe_kit.extract.plan import make_plan
 from probe_kit.extract.prepared import check_run
 from probe_kit.extract.store.locations.locate import locate
@@ -126,6 +126,24 @@ def test_a_run_is_told_by_all_that_it_was_to_have_whatever_is_left_of_it(tmp_pat
     for run in (unfinished, later, worded):
         assert suite_of(run, suite.folder) == suite
         assert suite_of(run).items == part.items
+
+
+def test_the_folder_of_the_extraction_is_found_from_anywhere_as_long_as_it_holds_the_suite(
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    suite = build_suite(tmp_path / "mine", ["color"], 4, seed=3)
+    monkeypatch.chdir(tmp_path)
+    settings = ExtractSettings("expert", scene=SHORT, suite=Path("mine"), items=2, env_workers=0, frames="none")
+    run = extract_run(settings, tmp_path / "run")
+    monkeypatch.chdir("/")
+    assert suite_of(open_run(run.path)) == suite
+    shutil.rmtree(suite.folder)
+    with pytest.raises(SuiteNotFoundError, match=r"drawn again.*--suite.*mine of its extraction is gone"):
+        suite_of(run)
+    build_suite(tmp_path / "mine", ["color"], 4, seed=4)
+    with pytest.raises(SuiteNotFoundError, match=r"mine of its extraction no longer holds it.*hash to"):
+        suite_of(run)
+    assert cache.is_dir()  # the pictures of the embedded suite were drawn and found to be others
 
 
 REFUSED = {

@@ -77,7 +77,7 @@ def test_inferences_correspond_by_their_place_behind_the_event(run: Run) -> None
     assert (samples.values == samples.steps).all()
     assert set(samples.inferences.tolist()) == {0, 1, 2, 3}
     assert (step_features(samples).argmax(axis=1) == samples.steps).all()
-    with pytest.warns(UserWarning, match="no p below"):
+    with pytest.warns(UserWarning, match="the same in every group"):
         columns = label_problem(run, labels, samples, 19, 0).columns
     assert (columns == samples.steps[:, None]).all(), "labels of one place stay at that place"
 

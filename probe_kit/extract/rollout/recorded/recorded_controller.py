@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import ObservationError, PolicyFailedError, RecordingError
+from probe_kit.extract.recordings.early_fit import check_state_width, raise_together
 from probe_kit.extract.recordings.lerobot_folder import fetched
 from probe_kit.extract.recordings.lerobot_source import ACTION, STATE
 from probe_kit.extract.recordings.recorded_plan import Recording
@@ -65,14 +66,22 @@ def fit(recording: Recording, policy: "Policy") -> Fitted:
     Raises RecordingError for cameras, states or files that do not fit, and CheckpointError for a checkpoint
     without statistics.
     """
-    recording = recording.mapped(policy.card.cameras)
+    raise_together(
+        [
+            lambda: recording.mapped(policy.card.cameras),
+            lambda: check_state_width(recording, policy.card.checkpoint, policy.state_numbers),
+        ]
+    )
+    return _fit_mapped(recording.mapped(policy.card.cameras), policy)
+
+
+def _fit_mapped(recording: Recording, policy: "Policy") -> Fitted:
     fetched(recording.folder, recording.episodes, recording.features)
     recording.check()
     try:
         policy = policy.with_cameras([camera for camera, _ in recording.source.cameras])
     except ObservationError as error:
         raise RecordingError(f"{error}. Map the model's first cameras with --camera") from error
-    _check_state(recording, policy)
     numbers = _chosen_numbers(recording)
     unusual = _unusual(recording, policy, numbers.get(STATE))
     example = example_of(recording, recording.instructions[0])
@@ -93,18 +102,6 @@ def recorded_controller(fitted: Fitted, settings: ExtractSettings) -> RecordedCo
     )  # fmt: skip
     del controller.identity["execute"]
     return controller
-
-
-def _check_state(recording: Recording, policy: "Policy") -> None:
-    """Raise RecordingError unless the recorded state has as many numbers as the policy reads."""
-    folder, expected = recording.folder, policy.state_numbers
-    width = folder.width(STATE)
-    if expected is not None and width != expected:
-        seen = "no " + STATE if width is None else f"{width} numbers as {STATE}"
-        raise RecordingError(
-            f"{folder.path.name} has {seen}; {policy.card.checkpoint} reads {expected}. Take the data set's own "
-            "checkpoint, or a data set of this robot"
-        )
 
 
 def _chosen_numbers(recording: Recording) -> dict[str, NDArray[np.float32]]:

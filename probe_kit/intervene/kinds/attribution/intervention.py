@@ -12,7 +12,7 @@ from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.edits.sites import ALL, resolve_sites, roles_of
+from probe_kit.intervene.edits.sites import ALL, resolve_all, roles_of
 from probe_kit.intervene.kinds.attribution.effects import (
     ESTIMATE,
     EXACT,
@@ -103,7 +103,7 @@ class AttributionPatching(Intervention):
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
         """Clean, images swapped, exact patches of anchors and chosen cells, and the estimates of all."""
-        places = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
+        places = resolve_all(self.sites, session.policy)
         cells = [
             Cell(place, role)
             for place in places.values()

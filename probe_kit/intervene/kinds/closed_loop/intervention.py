@@ -34,6 +34,7 @@ from probe_kit.intervene.replay.conditions import (
     ReplayBatch,
 )
 from probe_kit.intervene.replay.image_tokens import TILES
+from probe_kit.intervene.replay.passed_over import PassedOver
 from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.intervene.replay.token_directions import DirectionBasis, check_direction, fit_token_directions
 from probe_kit.intervene.store.answers import CLEAN
@@ -127,7 +128,8 @@ class ClosedLoop(Intervention):
             if self.direction != NONE and len(place.sites) == 1 and role not in TILES:
                 wanted.setdefault(place, []).append(role)
         items = items_of(session.run, replace(self, items=None))
-        return fit_token_directions(session, items, wanted, self.direction, self.controls, self.seed)
+        passed_over = PassedOver(session, [pattern for pattern, _ in map(self._split, self.targets)])
+        return fit_token_directions(session, items, wanted, self.direction, self.controls, self.seed, passed_over)
 
     @staticmethod
     def _split(target: str) -> tuple[str, str]:

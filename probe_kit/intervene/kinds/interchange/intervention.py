@@ -14,7 +14,7 @@ from probe_kit.hooks.capturing.edit_engine import apply_patch
 from probe_kit.hooks.capturing.token_edits import ReplaceInSubspace, ReplaceWith, TokenEdit
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM, Site
-from probe_kit.intervene.edits.sites import ALL, SiteGroup, resolve_sites, roles_of
+from probe_kit.intervene.edits.sites import ALL, SiteGroup, resolve_all, roles_of
 from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.replay.conditions import (
     CleanRun,
@@ -25,6 +25,7 @@ from probe_kit.intervene.replay.conditions import (
     Intervention,
 )
 from probe_kit.intervene.replay.image_tokens import TILES, role_tokens
+from probe_kit.intervene.replay.passed_over import PassedOver
 from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.intervene.replay.token_directions import DirectionBasis, check_direction, fit_token_directions
 from probe_kit.intervene.store.settings import items_of
@@ -105,7 +106,7 @@ class Interchange(Intervention):
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
         """Clean, images swapped, and every place at every role. Raises UnknownSiteError, NoProbesError."""
-        found = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
+        found = resolve_all(self.sites, session.policy)
         source_sites = tuple(dict.fromkeys(site for place in found.values() for site in place.sites))
         wanted = {place: roles_of(session.policy, place.stream, self.roles) for place in found.values()}
         conditions: list[Condition] = [CleanRun(), ImagesSwapped()]
@@ -114,7 +115,9 @@ class Interchange(Intervention):
                 PatchedFromSource(place, role, source_sites) for place in wanted for role in wanted[place]
             ]
         items = items_of(session.run, replace(self, items=None))
-        found_along = fit_token_directions(session, items, wanted, self.direction, self.controls, self.seed)
+        found_along = fit_token_directions(
+            session, items, wanted, self.direction, self.controls, self.seed, PassedOver(session, self.sites)
+        )
         for (place, role), bases in found_along.items():
             conditions += patches_within(self.direction, bases, place, role, source_sites)
         return conditions

@@ -7,7 +7,7 @@ from typing import Any
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.edits.sites import ALL, resolve_sites, roles_of
+from probe_kit.intervene.edits.sites import ALL, resolve_all, roles_of
 from probe_kit.intervene.kinds.interchange.intervention import capabilities_for
 from probe_kit.intervene.kinds.joint.cells import Cell, CellsPatched, all_but
 from probe_kit.intervene.kinds.joint.effects import (
@@ -102,7 +102,7 @@ class JointPlaces(Intervention):
         return {"joint": {name: one.to_json() for name, one in minimal.found.items()}}
 
     def _cells(self, session: ReplaySession) -> tuple[Cell, ...]:
-        places = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
+        places = resolve_all(self.sites, session.policy)
         layers = {KV_STREAM if place.stream == KV_STREAM else place.layer for place in places.values()}
         if len(layers) > 1:
             raise UsageError(

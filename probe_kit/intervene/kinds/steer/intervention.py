@@ -7,7 +7,7 @@ with the same norm, and both sides are reported.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
@@ -20,9 +20,8 @@ from probe_kit.intervene.edits.pooled_directions import (
     DIRECTIONS,
     MEAN_DIFFERENCE,
     PooledDirections,
-    fit_directions,
 )
-from probe_kit.intervene.edits.sites import SiteGroup, resolve_sites
+from probe_kit.intervene.edits.sites import SiteGroup, resolve_all
 from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.replay.conditions import (
     CleanRun,
@@ -32,7 +31,10 @@ from probe_kit.intervene.replay.conditions import (
     Intervention,
 )
 from probe_kit.intervene.replay.image_tokens import TILES, role_tokens
+from probe_kit.intervene.replay.passed_over import PassedOver
 from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.replay.token_directions import fit_token_directions
+from probe_kit.intervene.store.settings import items_of
 
 TargetSide = Literal["wrong", "correct", "left", "right"]
 COEFFICIENTS = (1.0, 2.0, 4.0)
@@ -101,13 +103,18 @@ class Steering(Intervention):
         }  # fmt: skip
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
-        """Clean, then every place at every coefficient, with its controls. Raises UnknownSiteError."""
-        found = {place.name: place for pattern in self.sites for place in resolve_sites(pattern, session.policy)}
+        """Clean, then every place at every coefficient, with its controls.
+
+        Raises UnknownSiteError, and NoDirectionError for a named place without a direction.
+        """
+        wanted = dict.fromkeys(resolve_all(self.sites, session.policy).values(), (self.role,))
+        items = items_of(session.run, replace(self, items=None))
+        fitted = fit_token_directions(
+            session, items, wanted, self.direction, self.controls, self.seed, PassedOver(session, self.sites)
+        )
         conditions: list[Condition] = [CleanRun()]
-        for place in found.values():
-            axes = fit_directions(
-                session.run, place.only_site, self.role, self.direction, self.controls, self.seed
-            )
+        for (place, _), axes in fitted.items():
+            assert isinstance(axes, PooledDirections)
             conditions.append(Steered(place, self.role, self.direction, 0.0, self.target_side, axes))
             conditions += [
                 Steered(place, self.role, name, coefficient, self.target_side, axes)

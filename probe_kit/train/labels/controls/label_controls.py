@@ -1,7 +1,7 @@
 """Controls of a label: the same probe on step, state, instruction, pictures, or random features."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -61,6 +61,8 @@ class ControlInputs:
             return state_features(self.run, self.samples)
         if name == "action":
             return self._recorded("action")[:, 0].astype(np.float32)
+        if name in (own := control_features(self.run)):
+            return own[name][self.samples.rows].astype(np.float32)
         if name == "instruction":
             return word_counts(self.run)[self.samples.rows]
         return self._pixels(THUMBNAIL)
@@ -102,6 +104,12 @@ class ControlInputs:
         assert self.suite is not None, "what needs pictures is given them"
         rows, place = np.unique(self.samples.rows, return_inverse=True)
         return tile_pixels(self.run.episodes.iloc[rows], self.suite, side)[place]
+
+
+def control_features(run: RunReader) -> "Mapping[str, NDArray[np.floating]]":
+    """(E, D) features of controls that a run of arrays brings, by name."""
+    found: Mapping[str, NDArray[np.floating]] = getattr(run, "control_features", {})
+    return found
 
 
 def step_features(samples: LabelledSamples, places: NDArray[np.intp] | None = None) -> Features:
@@ -163,17 +171,20 @@ def prepare_controls(
     missing. folder: of the run's suite, see `suite_of`. Raises UsageError for a control that was asked for and is
     unknown or not possible, and what `suite_of` raises.
     """
-    if unknown := [name for name in names or () if name not in LABEL_CONTROLS]:
-        raise UsageError(f"control {unknown[0]!r} of a label; expected some of {', '.join(LABEL_CONTROLS)}")
-    wanted = names if names is not None else [name for name in LABEL_CONTROLS if name not in NOT_BY_DEFAULT]
-    asked = [cast(Name, name) for name in LABEL_CONTROLS if name in wanted]
-    impossible = _impossible(run, samples)
+    known = (*control_features(run), *(name for name in LABEL_CONTROLS if name not in control_features(run)))
+    if unknown := [name for name in names or () if name not in known]:
+        raise UsageError(f"control {unknown[0]!r} of a label; expected some of {', '.join(known)}")
+    wanted = names if names is not None else [name for name in known if name not in NOT_BY_DEFAULT]
+    asked = [cast(Name, name) for name in known if name in wanted]
+    impossible = {
+        name: why for name, why in _impossible(run, samples).items() if name not in control_features(run)
+    }
     if names is not None and (wrong := [name for name in asked if name in impossible]):
         raise UsageError(f"the control {wrong[0]!r} is not possible: {impossible[wrong[0]]}. Leave it out")
     left_out: dict[str, str] = {name: impossible[name] for name in asked if name in impossible}
     chosen = [name for name in asked if name not in impossible]
     suite = None
-    if PICTURED.intersection(chosen) and getattr(run, "inputs", None) is None:
+    if PICTURED.intersection(chosen).difference(control_features(run)) and getattr(run, "inputs", None) is None:
         try:
             suite = suite_of(run, folder)
         except SuiteNotFoundError as error:

@@ -1,0 +1,89 @@
+"""Files and choices that a run was made of, recorded so that later steps find them by themselves."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+from probe_kit.env import SceneSpec
+from probe_kit.hooks.contract.card import EMBEDDED
+
+SOURCES = "sources"
+"""Entry of a certificate."""
+
+
+class SettingsWithSources(Protocol):
+    """The settings of a run that name files and choices; see `RunSettings`."""
+
+    @property
+    def suite(self) -> Path | None:
+        """Suite folder."""
+
+    @property
+    def scene(self) -> SceneSpec:
+        """Scene, with its files."""
+
+    @property
+    def options(self) -> Mapping[str, Any]:
+        """Options of the family."""
+
+    @property
+    def random_weights(self) -> bool:
+        """Whether random weights were requested."""
+
+    @property
+    def weights_seed(self) -> int:
+        """Seed of requested random weights."""
+
+
+@dataclass(frozen=True)
+class RunSources:
+    """Sources of one process that played episodes of a run; none of them is part of the run's identity.
+
+    suite: absolute folder; None for the embedded suite and for runs without one. checkpoint: absolute folder, hub
+    id, or a word of the family; empty if unknown. scene_files: absolute, by field of the scene. options: of the
+    family, as they were passed. random_weights: whether random weights were requested, which a file that calls its
+    weights random is not. weights_seed: of requested random weights.
+    """
+
+    suite: str | None = None
+    checkpoint: str = ""
+    scene_files: Mapping[str, str] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)
+    random_weights: bool = False
+    weights_seed: int = 0
+
+    @classmethod
+    def of(cls, settings: SettingsWithSources, checkpoint: str) -> Self:
+        """Sources of a process with these settings. checkpoint: as the loaded model's card has it."""
+        files = {name: getattr(settings.scene, name) for name in ("arm_urdf", "background")}
+        return cls(
+            suite=None if settings.suite is None else _absolute(settings.suite),
+            checkpoint=_absolute(checkpoint) if _is_here(checkpoint) else checkpoint,
+            scene_files={name: _absolute(path) for name, path in files.items() if path is not None},
+            options=dict(settings.options),
+            random_weights=settings.random_weights,
+            weights_seed=settings.weights_seed,
+        )
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> Self:
+        """Sources in the record of a process; none where it has none."""
+        return cls(**record.get(SOURCES, {}))
+
+    def to_json(self) -> dict[str, Any]:
+        """The sources as plain values."""
+        return asdict(self)
+
+
+def _absolute(path: Path | str) -> str:
+    return str(Path(path).expanduser().absolute())
+
+
+def _is_here(checkpoint: str) -> bool:
+    if checkpoint in ("", EMBEDDED):
+        return False
+    try:
+        return Path(checkpoint).expanduser().exists()
+    except (OSError, RuntimeError):  # no path at all, or ~name of an unknown user
+        return False

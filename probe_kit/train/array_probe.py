@@ -1,0 +1,223 @@
+"""`probe`: probes of plain arrays, without a run, a model or a folder."""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.train.choices import Task
+from probe_kit.train.data.array_run import ArrayRun
+from probe_kit.train.labels.label_results import LabelResults
+from probe_kit.train.labels.labels import Labels
+from probe_kit.train.probe_sweep import train_probes
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Sites = ArrayLike | Mapping[str, ArrayLike]
+"""Features of one site (N, D), of several (S, N, D), or by name."""
+VIEW, STREAM = "mean", "backbone"  # a stream of any other name would need a part
+_OF_RUNS = (
+    "model", "random_weights", "target", "view", "site", "stream", "part", "layer", "depth", "iteration",
+    "episodes", "settings",
+)  # fmt: skip
+"""Columns of scores that arrays do not have."""
+_RESERVED = ("chance", "untrained", "random-features")
+
+
+@dataclass(frozen=True, repr=False)
+class ArrayProbes:
+    """Probes of plain arrays. names: of the S sites, in order. results: as `train_probes` gives them for labels.
+
+    order: (N,) the row of X that each sample of `results` is. classes: values of y in the order of their codes,
+    empty for quantities.
+    """
+
+    names: tuple[str, ...]
+    results: LabelResults
+    order: NDArray[np.intp]
+    classes: NDArray[Any]
+
+    @cached_property
+    def scores(self) -> "pd.DataFrame":
+        """One row per site, by name; the columns are those of `LabelResults.scores`."""
+        found = self.results.scores.drop(columns=list(_OF_RUNS))
+        found.index = list(self.names)
+        return found.rename_axis("site")
+
+    @property
+    def best(self) -> str:
+        """The site whose score exceeds its chance most; its score is too high by the luck of being chosen."""
+        curve = self.results.curves[VIEW]
+        return self.names[curve.largest_excess(np.arange(len(self.names)))]
+
+    @property
+    def predictions(self) -> NDArray[Any]:
+        """(S, N) held-out predictions in the order of X: values of y, or quantities."""
+        codes = np.empty_like(self.results.curves[VIEW].predictions)
+        codes[:, self.order] = self.results.curves[VIEW].predictions
+        return self.classes[codes.astype(int)] if self.classes.size else codes
+
+    @property
+    def fold_of(self) -> NDArray[np.int64]:
+        """(N,) number of the outer fold in which a row of X was held out."""
+        found = np.empty_like(self.results.fold_of)
+        found[self.order] = self.results.fold_of
+        return found
+
+    @property
+    def null(self) -> NDArray[np.float64]:
+        """(S, P) score of every site with every permutation of the labels."""
+        return self.results.curves[VIEW].null
+
+    def __repr__(self) -> str:
+        row = self.scores.loc[self.best]
+        p = "no p" if row["p_fwe"] != row["p_fwe"] else f"p {row['p_fwe']:.3f}"
+        missed = [name for name in self.results.controls.names if not row[f"exceeds_{name}"]]
+        limits = f"[{row['ci_low']:.3f}, {row['ci_high']:.3f}]"
+        parts = [
+            f"<ArrayProbes of {len(self.names)} sites, {row['n']} samples in {row['groups']} groups:",
+            f"best {self.best} with {row['metric']} {row['score']:.3f} {limits}, chance {row['chance']:.3f}, {p}"
+            + f"; not shown to exceed {', '.join(missed)}" * bool(missed)
+            + "; .scores has every site>",
+        ]
+        return " ".join(parts)
+
+
+def probe(
+    X: Sites,
+    y: ArrayLike,
+    groups: ArrayLike | None = None,
+    *,
+    task: Task | None = None,
+    controls: Mapping[str, ArrayLike] | None = None,
+    untrained: Sites | None = None,
+    strata: ArrayLike | None = None,
+    ordered: bool = False,
+    permutations: int = 200,
+    seed: int = 0,
+    jobs: int | None = None,
+) -> ArrayProbes:
+    """Probe arrays: at which site can `y` be decoded, beyond chance and beyond controls?
+
+    X: (N, D) features of one site, (S, N, D) of several, or a dictionary from names to (N, D). y: (N,) labels: two
+    values, classes as texts, or quantities. groups: (N,) what folds, intervals and label permutations keep
+    together, such as a subject or a picture; by default every sample is a group. task: `binary`, `classes` or
+    `continuous`, where the values leave a doubt. controls: features (N, D) by name that never saw the model; a
+    signal must exceed each of them. untrained: the same sites of an untrained network; a signal must exceed the
+    best of them. strata: (N,) within which label permutations exchange groups. ordered: whether the samples of
+    every group come in an order that corresponds between groups, such as time; permutations then keep it.
+    permutations, seed, jobs: as in `train_probes`, which does the work.
+
+    The score is balanced accuracy or R² of held-out groups, with nested folds. Nothing is stored.
+    Raises UsageError for arrays that do not fit together, hold NaN or infinity, or for labels without a task, and
+    TooFewGroupsError for fewer than five groups with each class.
+    """
+    import pandas as pd
+
+    sites = _sites(X, "X")
+    count = len(next(iter(sites.values())))
+    names = [f"{number:09d}" for number in range(count)]
+    order: NDArray[np.intp] = np.arange(count)
+    if not ordered:
+        order = np.random.default_rng(derive_seed("array order", seed)).permutation(count)
+    labels = _column(y, count, "y")
+    columns: dict[str, list[Any]] = {"episode_id": names, "y": [labels[row] for row in order]}
+    own = names if groups is None else list(map(str, _column(groups, count, "groups")))
+    columns["group_id"] = [own[row] for row in order]
+    if strata is not None:
+        texts = list(map(str, _column(strata, count, "strata")))
+        columns["strata"] = [texts[row] for row in order]
+    table = pd.DataFrame(columns)
+    episodes = table[["episode_id", "group_id"]].assign(category="all")
+    with tempfile.TemporaryDirectory(prefix="probe-kit-") as folder:
+        runs = [
+            ArrayRun(
+                Path(folder) / name,
+                model=name,
+                suite="arrays@1#0",
+                episodes=episodes,
+                features={(Site(STREAM, layer), VIEW): array[order] for layer, array in enumerate(given.values())},
+                control_features={
+                    name: _matrix(array, f"controls[{name!r}]", count)[order]
+                    for name, array in (controls or {}).items()
+                },
+            )
+            for name, given in (
+                ("arrays", sites),
+                *([] if untrained is None else [("untrained", _sites(untrained, "untrained", count))]),
+            )
+        ]
+        results = train_probes(
+            runs[0],
+            labels=Labels.read(table, "y", task, exchange_within=None if strata is None else "strata"),
+            views=(VIEW,),
+            permutations=permutations,
+            controls=tuple(_names(controls)),  # type: ignore[arg-type]
+            untrained=runs[1] if len(runs) > 1 else None,
+            seed=seed,
+            jobs=jobs,
+        )
+    classes = np.unique(np.asarray(y)) if results.classes else np.empty(0)
+    return ArrayProbes(tuple(sites), results, order, classes)
+
+
+def _names(controls: Mapping[str, ArrayLike] | None) -> list[str]:
+    names = list(controls or {})
+    if wrong := [name for name in names if not isinstance(name, str) or not name or name in _RESERVED]:
+        raise UsageError(f"a control is called {wrong[0]!r}; expected a text other than {', '.join(_RESERVED)}")
+    return names
+
+
+def _sites(given: Sites, what: str, count: int | None = None) -> dict[str, NDArray[np.float32]]:
+    """Features (N, D) by the name of their site."""
+    if isinstance(given, Mapping):
+        named = {str(name): array for name, array in given.items()}
+    else:
+        array = np.asarray(given)
+        if array.ndim not in (2, 3):
+            raise UsageError(
+                f"{what} has the shape {array.shape}; expected (N, D) of one site or (S, N, D) of several"
+            )
+        named = {str(number): one for number, one in enumerate(array if array.ndim == 3 else array[None])}
+    if not named:
+        raise UsageError(f"{what} holds no site; expected one or more")
+    found: dict[str, NDArray[np.float32]] = {}
+    for name, one in named.items():
+        found[name] = _matrix(one, f"site {name!r} of {what}" if len(named) > 1 else what, count)
+        count = len(found[name])
+    return found
+
+
+def _matrix(given: ArrayLike, what: str, count: int | None) -> NDArray[np.float32]:
+    """(N, D) finite numbers. Raises UsageError."""
+    try:
+        array = np.asarray(given, np.float32)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{what} holds no numbers ({error}); expected (N, D) floats") from None
+    if array.ndim != 2 or 0 in array.shape or (count is not None and len(array) != count):
+        rows = "N" if count is None else str(count)
+        raise UsageError(f"{what} has the shape {array.shape}; expected ({rows}, D), a row per sample")
+    if not np.isfinite(array).all():
+        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise UsageError(f"{what} holds NaN or infinity in row {row}; leave the sample out, or correct it")
+    return array
+
+
+def _column(given: ArrayLike | Sequence[Any], count: int, what: str) -> list[Any]:
+    """N values. Raises UsageError for another number of them, and for missing ones."""
+    array = np.asarray(given)
+    if array.shape != (count,):
+        raise UsageError(f"{what} has the shape {array.shape}; expected ({count},), one value per row of X")
+    values: list[Any] = array.tolist()
+    if missing := [row for row, value in enumerate(values) if value is None or value != value]:
+        raise UsageError(f"{what} has no value in row {missing[0]}; leave the sample out of X, y and groups")
+    return values

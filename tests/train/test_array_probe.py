@@ -1,0 +1,131 @@
+"""`pk.probe`: probes of plain arrays, as users of scikit-learn expect them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from sklearn.linear_model import LogisticRegression, Ridge
+from sklearn.metrics import balanced_accuracy_score, r2_score
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
+
+import probe_kit as pk
+from probe_kit.errors import TooFewGroupsError, UsageError
+
+GROUPS = np.repeat(np.arange(24), 4)
+Y = np.tile([0, 1, 1, 0], 24)
+N, D = Y.size, 6
+
+
+def noise(seed: int, *shape: int) -> NDArray[np.float64]:
+    return np.random.default_rng(seed).normal(size=shape)
+
+
+@pytest.fixture(scope="module")
+def planted() -> NDArray[np.float64]:
+    """(3, N, D): the label lies in the second site."""
+    features = noise(0, 3, N, D)
+    features[1, :, 2] += 3 * Y
+    return features
+
+
+@pytest.fixture(scope="module")
+def found(planted: NDArray[np.float64]) -> Any:
+    return pk.probe(
+        planted, Y, GROUPS, controls={"words": noise(1, N, 3)}, untrained=noise(2, 3, N, D), permutations=40
+    )
+
+
+def test_the_site_that_holds_the_label_has_signal_and_the_others_have_none(found: Any) -> None:
+    assert found.best == "1"
+    assert found.scores["signal"].tolist() == [False, True, False]
+    best = found.scores.loc["1"]
+    assert best["ci_low"] <= best["score"] <= best["ci_high"]
+    assert best["p_fwe"] == pytest.approx(1 / 41)
+    assert best[["exceeds_words", "exceeds_untrained"]].all()
+    assert abs(best["chance"] - 0.5) < 0.1
+    assert found.null.shape == (3, 40)
+    assert "best 1 with balanced accuracy" in repr(found)
+
+
+def test_groups_are_held_out_as_a_whole(found: Any) -> None:
+    assert all(np.unique(found.fold_of[group == GROUPS]).size == 1 for group in range(24))
+
+
+def test_scores_and_predictions_are_those_of_scikit_learn_on_the_same_folds(
+    planted: NDArray[np.float64], found: Any
+) -> None:
+    """L2 logistic regression on standardised features, without the prior of the training fold."""
+    penalties = [float(one) for one in found.scores.loc["1", "penalties"].split()]
+    predicted = np.empty(N, int)
+    for fold, penalty in enumerate(penalties):
+        test = found.fold_of == fold
+        model = make_pipeline(StandardScaler(), LogisticRegression(C=1 / penalty, tol=1e-10, max_iter=10_000))
+        model.fit(planted[1][~test].astype(np.float32), Y[~test])
+        share = Y[~test].mean()
+        predicted[test] = model.decision_function(planted[1][test].astype(np.float32)) > np.log(
+            share / (1 - share)
+        )
+    assert (found.predictions[1] == predicted).all()
+    assert found.scores.loc["1", "score"] == pytest.approx(balanced_accuracy_score(Y, predicted), abs=0.01)
+
+
+def test_quantities_have_the_r2_of_a_ridge_of_scikit_learn() -> None:
+    features = noise(3, N, D)
+    quantity = features[:, 0] + 0.1 * noise(4, N)
+    found = pk.probe(features, quantity, GROUPS, permutations=0)
+    assert found.scores["metric"].tolist() == ["R²"]
+    assert found.scores.loc["0", "score"] == pytest.approx(r2_score(quantity, found.predictions[0]), abs=0.02)
+    test = found.fold_of == 0
+    plain = make_pipeline(StandardScaler(), Ridge(1e-3)).fit(features[~test], quantity[~test])
+    assert np.corrcoef(plain.predict(features[test]), found.predictions[0][test])[0, 1] > 0.999
+
+
+def test_one_site_names_and_classes_come_back_as_they_were_passed(planted: NDArray[np.float64]) -> None:
+    texts = np.where(Y == 1, "yes", "no")
+    found = pk.probe({"tower": planted[1], "words": planted[0][:, :2]}, texts, permutations=0)
+    assert found.scores.index.tolist() == ["tower", "words"]
+    assert set(found.predictions.ravel()) == {"yes", "no"}
+    assert found.scores["p_fwe"].isna().all()
+    assert found.scores.loc["tower", "groups"] == N
+    alone = pk.probe(planted[1], Y, permutations=0)
+    assert alone.predictions.dtype == Y.dtype
+    assert alone.scores.index.tolist() == ["0"]
+
+
+def test_the_order_of_samples_has_no_meaning_unless_it_is_said_to(planted: NDArray[np.float64]) -> None:
+    """Of labels that are alike in every group no exchange in order changes anything."""
+    free = pk.probe(planted[1], Y, GROUPS, permutations=20)
+    assert free.scores.loc["0", "p_fwe"] == pytest.approx(1 / 21)
+    with pytest.warns(UserWarning, match="the same in every group"):
+        ordered = pk.probe(planted[1], Y, GROUPS, permutations=20, ordered=True)
+    assert not ordered.scores.loc["0", "p_fwe"] < 0.05
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"X": np.zeros(N)}, r"X has the shape \(96,\); expected \(N, D\)"),
+        ({"X": {}}, "holds no site"),
+        ({"X": {"a": np.zeros((N, 2)), "b": np.zeros((N - 1, 2))}}, r"site 'b' of X has the shape \(95, 2\)"),
+        ({"X": np.full((N, 2), np.nan)}, "X holds NaN or infinity in row 0"),
+        ({"X": np.full((N, 2), "a")}, "X holds no numbers"),
+        ({"y": Y[:-1]}, r"y has the shape \(95,\); expected \(96,\)"),
+        ({"y": np.where(Y == 1, np.nan, 1.5)}, "y has no value in row 1"),
+        ({"y": np.arange(N) % 5}, "classes or quantities"),
+        ({"groups": GROUPS[:3]}, "groups has the shape"),
+        ({"controls": {"chance": np.zeros((N, 1))}}, "called 'chance'"),
+        ({"controls": {"words": np.zeros((3, 1))}}, r"controls\['words'\] has the shape"),
+        ({"untrained": noise(5, N - 1, D)}, "untrained has the shape"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused_by_name(changed: dict[str, Any], message: str) -> None:
+    whole: dict[str, Any] = {"X": noise(0, N, D), "y": Y, "groups": GROUPS}
+    with pytest.raises(UsageError, match=message):
+        pk.probe(**{**whole, **changed}, permutations=0)
+
+
+def test_fewer_than_five_groups_are_refused() -> None:
+    with pytest.raises(TooFewGroupsError, match="4 groups"):
+        pk.probe(noise(0, N, D), Y, GROUPS % 4, permutations=0)
