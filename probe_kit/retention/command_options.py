@@ -190,7 +190,7 @@ Details = Annotated[
         "--details",
         parser=some_of((*get_args(Section), "all")),
         metavar=f"{choices((*get_args(Section), 'all'))},…",
-        help="Tables to print above the summary, comma-separated.",
+        help="Tables to print above the summary, comma-separated. all: every table, and every figure of --figures.",
     ),
 ]
 NO_DETAILS = Names()
@@ -209,5 +209,5 @@ Html = Annotated[
 ]
 Figures = Annotated[
     Path | None,
-    typer.Option("--figures", metavar="FOLDER", help="Write all figures as PNG and PDF."),
+    typer.Option("--figures", metavar="FOLDER", help="Write the main figures as PNG and PDF; with --details all every figure."),
 ]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 WITH_STAGES = ("runs", "probes", "views", "wording", "score", "with_side_words", "style", "figures")
 WITH_TARGET = (
-    "runs", "family", "probes", "views", "iterations", "wording", "partial", "style", "html", "figures",
+    "runs", "family", "probes", "views", "iterations", "wording", "partial", "details", "style", "html", "figures",
 )  # fmt: skip
 WITH_AS_PAPER = (
     "runs", "probes", "views", "iterations", "wording", "partial", "rule", "last_steps", "score",
@@ -79,7 +79,10 @@ def retention(
         return
     if target:
         _check_only(given, WITH_TARGET)
-        _show_labels(runs or (), target, family, probes, views, iterations, wording, partial, style, html, figures)
+        _show_labels(
+            runs or (), target, family, probes, views, iterations, wording, partial, style, html, figures,
+            "all" in details,
+        )  # fmt: skip
         return
     if family != "label":
         raise UsageError("--family is for labels of your own; give --target COLUMN too, or leave it out")
@@ -111,7 +114,7 @@ def retention(
     if figures is not None:
         from probe_kit.retention.displays import collect_figures
 
-        save_all(collect_figures(shown, table), figures)
+        save_all(collect_figures(shown, table), figures, "all" in details)
     if html is not None:
         from probe_kit.retention.report import write_report
 
@@ -147,6 +150,7 @@ def _show_labels(
     style: "TableFormat",
     html: Path | None,
     figures: Path | None,
+    details: bool,
 ) -> None:
     """The retention of labels of one's own, whose columns are given."""
     from probe_kit.extract import open_run
@@ -160,7 +164,7 @@ def _show_labels(
     opened = [open_run(path, allow_partial=partial).in_wording(wording) for path in runs]
     steps, keys = own.read_iterations(iterations), _keys(list(runs), probes or [])
     table = label_retention_table(opened, columns, views, iterations=steps, keys=keys, family=family)
-    show_label_retention(opened, table, style, html, figures)
+    show_label_retention(opened, table, style, html, figures, details)
 
 
 def _check_only(given: Mapping[str, object], allowed: Collection[str]) -> None:

@@ -244,7 +244,7 @@ def retention_table(
     `order-balanced`; they stand first. with_side_words: count their items in whose name a side stands. vlm_vla:
     compare every VLM run with every acting one, see `vlm_vla_differences`. labels: names of runs in tables and
     figures by their location, instead of their own. pairs: by location, the runs that are compared, each the first
-    minus the second, instead of the first run with every other; all of them are one family of tests.
+    minus the second, instead of every other with the first; all of them are one family of tests.
     categories: rows of these alone, and means over them; probes are those of the whole runs. with_behaviour: False
     leaves empty what the rule `disc` does not need (other rules and behaviour), so that no trajectory is read.
     Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that

@@ -14,8 +14,9 @@ TERMS = {
         "The backbone's signal is not shown: its best layer is not shown to exceed chance and every control that "
         "was run. So there may be nothing to retain."
     ),
-    "A − B": (
-        "Difference of two runs on the same questions, which count as pairs, with its 95 % interval. Zero inside "
+    "B − A": (
+        "Difference of a run and the first one, or that of --against, on the same questions. They count as pairs, "
+        "with a 95 % interval. Zero inside "
         "it: they may be equal."
     ),
     "against": ("Before a verdict: the same, away from the correct picture."),

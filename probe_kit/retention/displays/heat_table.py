@@ -218,7 +218,10 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
         shown.append((RetentionTableDisplay, "retention", "Retention", "retention"))
     for display, name, title, subject in shown:
         note = display.notes.get(modes, display.note)
-        yield ReportFigure(name, title, subject, note, None, partial(_drawn, display, table), is_table=True)
+        yield ReportFigure(
+            name, title, subject, note, None, partial(_drawn, display, table), is_table=True,
+            is_detail=display is SideTableDisplay,
+        )  # fmt: skip
 
 
 def _drawn(
