@@ -72,6 +72,15 @@ Against = Annotated[
         help="Run or group that all others are compared with. Default: the first run; of groups every pair.",
     ),
 ]
+TrainingSteps = Annotated[
+    str | None,
+    typer.Option(
+        "--x",
+        metavar="step|N,N,…",
+        help="Table and figure over training checkpoints. step: read from each checkpoint's folder, such as "
+        "checkpoint-500; or a training step per run.",
+    ),
+]
 LabelTargets = Annotated[
     list[str] | None,
     typer.Option(
@@ -171,7 +180,7 @@ Stages = Annotated[
     bool,
     typer.Option(
         "--stages",
-        help="Compare VLM_RUN and RUN question by question: answered, encoded, acted on.",
+        help="Compare VLM_RUN and RUN question by question: answer, probe, success.",
         rich_help_panel=VLM_RUNS,
     ),
 ]

@@ -88,7 +88,7 @@ def test_every_format_shows_groups_and_differences(table: RetentionTable) -> Non
     assert content["differences"][0]["sr_ci"][0] < 0
     assert "| with VQA − without | color | +0.0 [" in table.to_markdown()
     assert "| with VQA: vqa |" in table.to_markdown()
-    assert "with VQA $-$ without & mean & 0 & color" in table.to_latex()
+    assert "with VQA $-$ without & mean & 0 & color" in table.to_latex("all")
     frame = table.differences_frame()
     assert frame["backbone"].tolist() == [row.backbone for row in table.differences]
     assert frame["backbone"][0] == pytest.approx(0.1)

@@ -211,7 +211,7 @@ def test_runs_on_other_questions_have_no_differences_and_every_form_says_why(
     assert table.unpaired == (f"one and other are not compared: {why}.",)
     console = Console(width=200, record=True, file=StringIO())
     console.print(table.to_rich("all"))
-    for text in (table.to_markdown(), table.to_latex().replace("\\#", "#"), console.export_text()):
+    for text in (table.to_markdown(), table.to_latex("all").replace("\\#", "#"), console.export_text()):
         assert table.unpaired[0] in text
 
 

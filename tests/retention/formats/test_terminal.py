@@ -193,7 +193,7 @@ def test_headings_are_the_same_in_every_format(table: RetentionTable) -> None:
         for one in html_tables(rows, table.differences)
         for column in one.columns
     ]
-    texts = {"terminal": printed(table, 300), "markdown": table.to_markdown(), "latex": table.to_latex()}
+    texts = {"terminal": printed(table, 300), "markdown": table.to_markdown(), "latex": table.to_latex("all")}
     texts["latex"] = (
         texts["latex"].replace(r"\,\%", " %").replace("$-$", "−").replace(r"$\pm$", "±").replace(r"$\Delta$", "Δ")
     )
