@@ -66,7 +66,15 @@ def _print(lines: list[dict[str, Any]]) -> None:
         if "error" in line:
             continue
         correct = "–" if line["correct"] is None else f"{100 * line['correct']:.0f}"
-        cells = (line["run"], line["model"], line["suite"], line["episodes"], correct, line["probes"], line["interventions"])
+        cells = (
+            line["run"],
+            line["model"],
+            line["suite"],
+            line["episodes"],
+            correct,
+            line["probes"],
+            line["interventions"],
+        )
         table.add_row(*(Text(str(cell)) for cell in cells))
     out.print(table)
     for line in lines:

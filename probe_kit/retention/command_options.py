@@ -218,5 +218,9 @@ Html = Annotated[
 ]
 Figures = Annotated[
     Path | None,
-    typer.Option("--figures", metavar="FOLDER", help="Write the main figures as PNG and PDF; with --details all every figure."),
+    typer.Option(
+        "--figures",
+        metavar="FOLDER",
+        help="Write the main figures as PNG and PDF; with --details all every figure.",
+    ),
 ]

@@ -71,6 +71,7 @@ def retention(
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
     from probe_kit.retention.rows.outcome_rules import check_epsilons
+    from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
     from probe_kit.retention.displays.training_steps import training_step_figure
     from probe_kit.retention.stages_command import show_stages
     from probe_kit.retention.training_steps import read_steps, step_table
@@ -126,7 +127,8 @@ def retention(
     if x is not None:
         by_step = step_table(table, training)
         if figures is not None:
-            save_all([training_step_figure(by_step)], figures)
+            lines = [ProvenanceLine.of_row(mean) for mean in table.means]
+            save_all([training_step_figure(by_step, lines)], figures)
         _print(by_step, style, (*table.unpaired, *table.notes))
         return
     shown = [scored(run, score, with_side_words) for run in listed]

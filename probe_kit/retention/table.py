@@ -210,9 +210,7 @@ class RetentionTable:
 
         chosen: Collection[Section] = get_args(Section) if details == "all" else details
         rows, differences, notes = self.all_rows, self.differences, self.notes
-        return rich_tables(
-            rows, differences, notes, self.wordings, self._further(chosen), self.unpaired, chosen
-        )
+        return rich_tables(rows, differences, notes, self.wordings, self._further(chosen), self.unpaired, chosen)
 
     @property
     def further_tables(self) -> list[TextTable]:

@@ -82,7 +82,15 @@ def step_table(table: RetentionTable, steps: Mapping[str, int]) -> NumbersTable:
     names = list(dict.fromkeys(row.category for row in rows))
     ordered = sorted(rows, key=lambda row: (names.index(row.category), steps[row.run.location]))
     numbers = [_numbers(row, steps, drifts) for row in ordered]
-    columns = ("category", "step", "success %", "backbone %", "action %", "retention", "drift of the backbone, points")
+    columns = (
+        "category",
+        "step",
+        "success %",
+        "backbone %",
+        "action %",
+        "retention",
+        "drift of the backbone, points",
+    )
     cells = tuple(_cells(one) for one in numbers)
     shown = [at for at in range(len(columns)) if at < 2 or any(line[at] != "–" for line in cells)]
     view = next((row.view for row in rows if row.view is not None), None)

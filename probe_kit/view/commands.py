@@ -22,7 +22,10 @@ RUNS_BY_NAME: "list[Callable[[str], list[Run] | None]]" = []
 def view(
     runs: Annotated[
         list[str],
-        typer.Argument(help="Run folders or URLs, folders that hold runs, or study files, whose runs are opened.", metavar="RUN…"),
+        typer.Argument(
+            help="Run folders or URLs, folders that hold runs, or study files, whose runs are opened.",
+            metavar="RUN…",
+        ),
     ],
     export: Annotated[
         Path | None,

@@ -4,8 +4,9 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import ReportFigure
-from probe_kit.retention.displays.base.style import footer, legend_above, panels, plain, series
+from probe_kit.retention.displays.base.style import caption, legend_above, panels, plain, series
 from probe_kit.retention.formats.numbers_table import NumbersTable
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.retention.text import spell
@@ -24,17 +25,17 @@ _PANELS = (
 """Number, label, its factor, and where a dashed line stands."""
 
 
-def training_step_figure(table: NumbersTable) -> ReportFigure:
-    """Return the figure of a table of training steps. Nothing is drawn yet."""
+def training_step_figure(table: NumbersTable, lines: Sequence[ProvenanceLine]) -> ReportFigure:
+    """Return the figure of a table of training steps. Nothing is drawn yet. lines: of the runs, below it."""
     return ReportFigure(
         "training-steps", "Training steps", "retention",
         "What a training does to success, to the answer in the backbone, and to the share of it that reaches the "
         "action. A point per checkpoint and category, with its 95 % interval. Drift is against the first step.",
-        None, partial(draw_training_steps, table),
+        None, partial(draw_training_steps, table, lines),
     )  # fmt: skip
 
 
-def draw_training_steps(table: NumbersTable) -> "Figure":
+def draw_training_steps(table: NumbersTable, lines: Sequence[ProvenanceLine]) -> "Figure":
     """Return a figure with a panel per number and a line per category; a number without a value has a gap."""
     names = [name for name in dict.fromkeys(one["category"] for one in table.numbers) if name != MEAN]
     chosen = [panel for panel in _PANELS if any(one[panel[0]] is not None for one in table.numbers)]
@@ -48,7 +49,7 @@ def draw_training_steps(table: NumbersTable) -> "Figure":
         axes.set_xlabel("training step", fontsize=8.5)
         axes.set_ylabel(label, fontsize=8.5)
     legend_above(figure, grid[0].get_legend_handles_labels()[0])
-    footer(figure, table.text.note)
+    caption(figure, *lines)
     return figure
 
 

@@ -40,9 +40,7 @@ def paper_retention(action: float, backbone: float) -> float:
     return (action - CHANCE) / (backbone - CHANCE + EPSILON)
 
 
-def paper_table(
-    rows: Sequence[RetentionRow], means: Sequence[RetentionRow], outcome_rule: str
-) -> NumbersTable:
+def paper_table(rows: Sequence[RetentionRow], means: Sequence[RetentionRow], outcome_rule: str) -> NumbersTable:
     """Return the paper's numbers, category by category and as a mean.
 
     Keys are `run`, `model`, `view`, `category` (`mean` for the category mean), `episodes`, `sr`, `margin` (Δ over

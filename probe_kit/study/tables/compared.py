@@ -170,7 +170,16 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
         for join, row in shown
     ]
     note = "items right in both layouts, which guessing manages in 25 %; lost: share of answered and encoded ones"
-    columns = ("systems", "category", "items", "answer right", "probe right", "success", "answer and probe right", "of these without success %")
+    columns = (
+        "systems",
+        "category",
+        "items",
+        "answer right",
+        "probe right",
+        "success",
+        "answer and probe right",
+        "of these without success %",
+    )
     made = NamedTable(TextTable("Stages", note, columns, cells, names=2), tuple(numbers))
     notes = [text for join in joins for text in join.notes if text not in without_signal(join.rows)]
     dull = any(row.has_signal is False for _, row in shown)

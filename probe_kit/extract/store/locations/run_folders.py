@@ -12,19 +12,29 @@ def is_run(folder: Path) -> bool:
     return (folder / RUN_FILE).is_file()
 
 
-def find_runs(folder: Path) -> list[Path]:
-    """Return the runs below `folder`, finished or not, in the order of their paths; a run holds no other.
+def runs_in(folder: Path, deep: bool = True) -> list[Path]:
+    """Return the runs below `folder`, finished or not, in the order of their paths; empty without any.
 
-    Raises UsageError for what is no folder, or holds no run.
+    A run holds no other. deep: at any depth, else directly below, which is quick in a large folder.
     """
-    if not folder.is_dir():
-        raise UsageError(f"{folder} is no folder of this machine; give the folder that holds the runs")
+    if not deep:
+        return [path.parent for path in sorted(folder.glob(f"*/{RUN_FILE}"))] if folder.is_dir() else []
     runs = []
     for path, names, _ in os.walk(folder):
         if is_run(Path(path)):
             runs.append(Path(path))
             names.clear()
         names[:] = sorted(name for name in names if not name.startswith("."))
+    return runs
+
+
+def find_runs(folder: Path) -> list[Path]:
+    """Return the runs below `folder` at any depth. Raises UsageError for no folder, or one without a run."""
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is no folder of this machine; give the folder that holds the runs")
+    runs = runs_in(folder)
     if not runs:
-        raise UsageError(f"there is no run below {folder}: no folder of it has a {RUN_FILE}. Make one with `probe-kit extract`")
+        raise UsageError(
+            f"there is no run below {folder}: no folder of it has a {RUN_FILE}. Make one with `probe-kit extract`"
+        )
     return runs

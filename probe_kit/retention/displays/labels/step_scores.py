@@ -95,7 +95,9 @@ class StepScoresDisplay(LabelPanel):
     def draw(self, axes: "Axes") -> None:
         """The site's and the controls' scores."""
         line = PARTS[self.part]
-        arms = np.array([self.score - self.low, self.high - self.score]).clip(min=0)  # rounding, where groups agree
+        arms = np.array([self.score - self.low, self.high - self.score]).clip(
+            min=0
+        )  # rounding, where groups agree
         axes.errorbar(self.steps, self.score, yerr=arms, fmt="none", ecolor=line.colour, elinewidth=0.8, alpha=0.7)
         axes.plot(
             self.steps,
