@@ -43,7 +43,7 @@ def _facts(run: "Run") -> dict[str, Any]:
     from probe_kit.intervene.results.inventory import listed_interventions
     from probe_kit.train.results.inventory import inventory
 
-    outcomes = run.episodes["outcome"] if "outcome" in run.episodes else None
+    outcomes = run.episodes.get("outcome")
     judged = outcomes is not None and len(outcomes) > 0 and set(outcomes) <= {"correct", "wrong", "oob"}
     return {
         "model": run.label,

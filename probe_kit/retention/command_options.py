@@ -199,7 +199,8 @@ Details = Annotated[
         "--details",
         parser=some_of((*get_args(Section), "all")),
         metavar=f"{choices((*get_args(Section), 'all'))},…",
-        help="Tables to print above the summary, comma-separated. all: every table, and every figure of --figures.",
+        help="Tables to print above the summary, comma-separated. all: every table, and every figure of "
+        "--figures.",
     ),
 ]
 NO_DETAILS = Names()

@@ -70,9 +70,9 @@ def retention(
     from probe_kit.extract import open_run
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
-    from probe_kit.retention.rows.outcome_rules import check_epsilons
     from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
     from probe_kit.retention.displays.training_steps import training_step_figure
+    from probe_kit.retention.rows.outcome_rules import check_epsilons
     from probe_kit.retention.stages_command import show_stages
     from probe_kit.retention.training_steps import read_steps, step_table
 
@@ -196,7 +196,8 @@ def _show_labels(
 def _check_only(given: Mapping[str, object], allowed: Collection[str]) -> None:
     """Raise UsageError for an option of `retention` that differs from its default and does not go with the table.
 
-    given: the value of every parameter, `stages`, `target`, `as_paper` or `x` among them. allowed: what goes with it.
+    given: the value of every parameter, `stages`, `target`, `as_paper` or `x` among them. allowed: what goes
+    with it.
     """
     what = next(name for name in ("stages", "target", "as_paper", "x") if given[name])
     others = {

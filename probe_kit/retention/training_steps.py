@@ -39,9 +39,9 @@ def training_step(run: RunReader) -> int:
     if folders and (match := _STEP.match(folders[-1])):
         return int(match[1])
     raise UsageError(
-        f"the training step of {run.location} is unknown: its checkpoint is {checkpoint or 'not stored'!r}; expected "
-        "a folder such as checkpoints/020000 or checkpoint-500. Give the steps in the order of the runs, such as "
-        "--x 1000,2000"
+        f"the training step of {run.location} is unknown: its checkpoint is {checkpoint or 'not stored'!r}; "
+        "expected a folder such as checkpoints/020000 or checkpoint-500. Give the steps in the order of the runs, "
+        "such as --x 1000,2000"
     )
 
 

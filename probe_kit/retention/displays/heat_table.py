@@ -180,7 +180,7 @@ class RetentionTableDisplay(HeatTableDisplay):
     """Bounded retention and the published ratio by model and category; empty where the backbone knows nothing."""
 
     title = "Retention | published ratio"
-    note = "dash: no backbone signal, so the ratio has no meaning"
+    note = "dash: the backbone's signal is not shown, so the ratio has no meaning"
     parts = ("retention", "published")
     scale, digits = 1.0, 2
 

@@ -198,8 +198,8 @@ class LabelResults:
     def step_scores(self, scores: Matrix) -> Matrix:
         """Return (n,) scores whose mean over the samples of a step is the metric at that step.
 
-        scores: (n,) as in `LabelCurve`. Classes are balanced within each step, over those that occur there. Weights
-        of the whole window would lift a step of rare classes above 1. Scores of a continuous label stay.
+        scores: (n,) as in `LabelCurve`. Classes are balanced within each step, over those that occur there.
+        Weights of the whole window would lift a step of rare classes above 1. Scores of a continuous label stay.
         """
         if not self.classes:
             return scores

@@ -265,12 +265,12 @@ The policy succeeds; whether the answer is used was not tested: run `probe-kit i
 not probed: run `probe-kit train`.
 
 misses | not probed | no swap | failure
-The policy is right less often than guessing; whether the answer is used was not tested: run `probe-kit intervene`. The
-backbone was not probed: run `probe-kit train`.
+The policy is right less often than guessing; whether the answer is used was not tested: run `probe-kit
+intervene`. The backbone was not probed: run `probe-kit train`.
 
 guessing | not probed | no swap | success not shown
-Success is not shown; whether the answer is used was not tested: run `probe-kit intervene`. The
-backbone was not probed: run `probe-kit train`.
+Success is not shown; whether the answer is used was not tested: run `probe-kit
+intervene`. The backbone was not probed: run `probe-kit train`.
 
 none | not probed | no swap | not shown
 The backbone was not probed: run `probe-kit train`.

@@ -142,9 +142,9 @@ def pairs(table: RetentionTable) -> list[tuple[str, str]]:
     return list(dict.fromkeys((row.group, row.minus) for row in table.differences))
 
 
-def test_the_first_run_is_compared_with_every_other_or_every_other_with_the_one_named(tmp_path: Path) -> None:
+def test_every_other_run_is_compared_with_the_first_or_with_the_one_named(tmp_path: Path) -> None:
     runs = [run(tmp_path / name, hits(0.5, at)) for at, name in enumerate("abc")]
-    assert pairs(retention_table(runs)) == [("a", "b"), ("a", "c")]
+    assert pairs(retention_table(runs)) == [("b", "a"), ("c", "a")]
     assert pairs(retention_table(runs, against="b")) == [("a", "b"), ("c", "b")]
     assert pairs(retention_table(runs, against=str(tmp_path / "c"))) == [("a", "c"), ("b", "c")]
     groups = {"x": runs[:1], "y": runs[1:2], "z": runs[2:]}
@@ -318,7 +318,7 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     policies = [run(tmp_path / f"policy-{at}", hits(0.5, at)) for at in range(2)]
     mixed = [policies[0], vlms[0], policies[1], vlms[1]]
     table = retention_table(mixed)
-    assert pairs(table) == [("vlm-0", "vlm-1"), ("policy-0", "policy-1")]
+    assert pairs(table) == [("vlm-1", "vlm-0"), ("policy-1", "policy-0")]
     assert table.unpaired == (
         "VLM runs and policy runs are not compared with each other here; --vlm-vla does that.",
     )
@@ -327,7 +327,7 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     (header, _, *lines) = table.to_markdown().splitlines()[2:]
     columns = [cell.strip() for cell in header.split("|")]
     cells = {line.split("|")[2].strip(): line.split("|") for line in lines if line.startswith("| Mean")}
-    answered, acted = (cells[f"{name}-0 − {name}-1"] for name in ("vlm", "policy"))
+    answered, acted = (cells[f"{name}-1 − {name}-0"] for name in ("vlm", "policy"))
     assert "[" in answered[columns.index("VLM %")]
     assert "[" not in answered[columns.index("success %")]
     assert "[" in acted[columns.index("success %")]
@@ -335,7 +335,7 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     accuracy = [(r.episodes["outcome"] == "correct").mean() for r in vlms]
     gain = next(row.sr for row in table.differences if row.category == "mean")
     right = [row.success.sr for row in table.means if row.run.mode == "answers"]
-    assert gain == pytest.approx(right[0] - right[1])  # type: ignore[operator]
+    assert gain == pytest.approx(right[1] - right[0])  # type: ignore[operator]
     assert accuracy[0] != accuracy[1]
 
 

@@ -43,7 +43,7 @@ def test_without_details_there_is_the_summary_alone_and_every_table_has_a_label_
 
 
 def test_no_tabular_is_wider_than_its_line(table: RetentionTable) -> None:
-    """A box of its natural width, or of that of the line if it is wider; groups of columns stand below each other."""
+    """A box has its natural width, or that of the line; groups of columns stand below each other."""
     text = table.to_latex("all")
     fitted = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%" + "\n" + r"\begin{tabular}"
     assert text.count(r"\begin{tabular}") == text.count(fitted) == text.count(r"\end{tabular}}")

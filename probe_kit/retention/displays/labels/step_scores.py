@@ -30,9 +30,10 @@ _CONTROLS = (Line("black", "", ":"), Line(GREEN, "", (0, (5, 1))))  # type: igno
 class StepScoresDisplay(LabelPanel):
     """The metric at each step, of the best site of a stream; arrays (W,).
 
-    R² is that of the label's spread over all steps. Balanced accuracy is that of the classes at the step. steps: inferences, or places behind the event where
-    windows begin. low, high: 95 % interval over groups. controls: by name, the metric of the best control and
-    of `step`. site: of the largest score above its own chance.
+    R² is that of the label's spread over all steps. Balanced accuracy is that of the classes at the
+    step. steps: inferences, or places behind the event where windows begin. low, high: 95 % interval over groups.
+    controls: by name, the metric of the best control and of `step`. site: of the largest score above its
+    own chance.
     """
 
     target: str
