@@ -134,9 +134,9 @@ def vlm_vla_table(differences: Sequence[VlmVlaDifference]) -> NamedTable:
 
 
 def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
-    """Items that a VLM answers right, a probe decodes and a policy acts on right, each in both layouts.
+    """Return items with the VLM's answer, the probe and success right, each in both layouts.
 
-    Encoded items are counted where probes have signal.
+    Items with the probe right are counted where the answer is shown.
     """
     shown = [(join, row) for join in joins for row in join.rows]
     cells = tuple(

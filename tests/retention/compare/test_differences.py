@@ -120,8 +120,8 @@ def test_groups_of_models_have_a_p_over_models_and_the_least_that_so_few_allow(p
         assert (found.n, found.n_minus) == (3, 3)
         assert found.p == pytest.approx(0.1), "the most extreme of 20 ways, either way round"
         assert found.smallest_p == pytest.approx(0.1)
-        assert found.difference == pytest.approx(np.mean(values[0]) - np.mean(values[1]))
-        welch = stats.ttest_ind(*values, equal_var=False).confidence_interval()
+        assert found.difference == pytest.approx(np.mean(values[1]) - np.mean(values[0]))
+        welch = stats.ttest_ind(*values[::-1], equal_var=False).confidence_interval()
         assert found.ci == pytest.approx((welch.low, welch.high))
     assert color.sr_models is not None
     assert (color.sr_models.p, color.sr_models.difference) == (1, 0), "all did the same"
@@ -134,6 +134,6 @@ def test_a_single_model_against_another_has_no_p_over_models(table: RetentionTab
 def test_a_group_with_a_model_without_probes_has_no_p_of_retention(probed_run: ProbedRun, tmp_path: Path) -> None:
     one, other = (probed_run({"color": SIGNAL}, name) for name in ("one", "other"))
     bare = ArrayRun(tmp_path / "bare", "bare", one.suite, one.episodes, {})
-    rows = retention_table({"a": [one, other], "b": [bare]}).differences
+    rows = retention_table({"b": [bare], "a": [one, other]}).differences
     assert all(row.retention is None and row.retention_models is None for row in rows)
     assert all(row.sr_models is not None and row.sr_models.n_minus == 1 for row in rows)

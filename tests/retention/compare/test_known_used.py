@@ -213,7 +213,7 @@ def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRu
     console = Console(width=150, record=True, file=StringIO())
     console.print(rich_known_used(found))
     text = console.export_text()
-    titles = ("Answered, encoded, acted on", "of these not acted on", "Single episodes", "answered − acted")
+    titles = ("Answer, probe, success", "of these without success", "Single episodes", "answer − success")
     for words in (*titles, "V P a"):
         assert words in text
     frame = found.to_frame()
