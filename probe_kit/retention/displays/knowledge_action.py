@@ -47,8 +47,8 @@ class GapPoint:
 class KnowledgeActionDisplay(Display):
     """Success rate against the best probe of a stream, a point per category and model.
 
-    On the diagonal success equals what can be read; below it, more is decodable than success shows. Both axes run from 0
-    to 100 %, whatever is shown. modes: whether the shares are of policies, of answers or of both.
+    On the diagonal success equals what can be read; below it, more is decodable. Both axes run from 0 to
+    100 %, whatever is shown. modes: whether the shares are of policies, of answers or of both.
     """
 
     stream: str
@@ -181,7 +181,7 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
         yield ReportFigure(
             "knowledge-action", f"Knowledge and {'answers' if answers else 'action'}", "retention",
             "Each point is one category: how well the answer can be read inside the model (across) and how often "
-            f"the model {_DOES[modes]} (up). Points far below the line are knowledge of which "
-            f"no {'answer' if answers else 'success'} is shown.",
+            f"the model {_DOES[modes]} (up). Far below the line, more can be read than "
+            f"{'the answers show' if answers else 'success shows'}.",
             None, lambda: figure_of(KnowledgeActionDisplay.from_table(source.table)),
         )  # fmt: skip
