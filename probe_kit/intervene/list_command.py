@@ -7,6 +7,7 @@ import typer
 
 from probe_kit._terminal.console import out, print_json
 from probe_kit._terminal.options import AsJson
+from probe_kit._terminal.plain_text import terminal_safe
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
@@ -75,8 +76,8 @@ def _print(lines: list[dict[str, Any]]) -> None:
             line["probes"],
             line["interventions"],
         )
-        table.add_row(*(Text(str(cell)) for cell in cells))
+        table.add_row(*(Text(terminal_safe(str(cell))) for cell in cells))
     out.print(table)
     for line in lines:
         if "error" in line:
-            out.print(Text(f"{line['run']} cannot be read: {line['error']}", style="yellow"))
+            out.print(Text(terminal_safe(f"{line['run']} cannot be read: {line['error']}"), style="yellow"))
