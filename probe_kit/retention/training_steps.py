@@ -4,7 +4,6 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from probe_kit._terminal.console import split
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.columns.text import difference_interval, number, percent, with_limits
@@ -56,8 +55,8 @@ def read_steps(text: str, runs: Sequence[RunReader]) -> dict[str, int]:
     if text == STEP:
         steps = [training_step(run) for run in runs]
     else:
-        parts = split(text) or ()
-        if not parts or not all(part.isdecimal() for part in parts):
+        parts = [part.strip() for part in text.split(",")]
+        if not all(part.isdecimal() for part in parts):
             raise UsageError(f"--x {text!r}; expected `step`, or a training step per run such as 1000,2000")
         steps = [int(part) for part in parts]
     if len(steps) != len(runs):

@@ -69,7 +69,9 @@ def test_a_row_has_the_numbers_of_its_run_and_drift_is_that_from_the_first_step(
             row.success.sr, row.backbone.score, row.retention.value,
         )  # fmt: skip
     assert color[0]["drift"] is None
-    assert color[1]["drift"] == pytest.approx(0.9 - 0.8), "the later minus the first"
+    assert color[1]["drift"] == pytest.approx(color[1]["backbone"] - color[0]["backbone"]), (
+        "the later minus the first"
+    )
     shape = [one for one in made.numbers if one["category"] == "shape"]
     assert [one["retention"] for one in shape] == [None, None], "no signal, nothing to retain"
     drawn = draw_training_steps(made, ())

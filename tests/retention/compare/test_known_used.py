@@ -214,7 +214,7 @@ def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRu
     console.print(rich_known_used(found))
     text = console.export_text()
     titles = ("Answer, probe, success", "of these without success", "Single episodes", "answer − success")
-    for words in (*titles, "V P a"):
+    for words in (*titles, "V P s"):
         assert words in text
     frame = found.to_frame()
     assert frame.groupby("category")["items"].sum().to_dict() == {"color": 14, "shape": 12, "all": 26}

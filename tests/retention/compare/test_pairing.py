@@ -219,7 +219,7 @@ def test_runs_on_other_questions_have_no_differences_and_every_form_says_why(
 def test_other_words_are_other_questions(tmp_path: Path) -> None:
     one, other = run(tmp_path / "one", hits(0.5, 0)), run(tmp_path / "other", hits(0.5, 1))
     side = replace(other, episodes=other.episodes.assign(wording="side"))
-    assert "other wordings (side and knowledge)" in retention_table([side, one]).unpaired[0]
+    assert "other wordings (knowledge and side)" in retention_table([side, one]).unpaired[0]
     own = replace(other, episodes=other.episodes.assign(wording="knowledge"))
     assert retention_table([own, one]).differences
 
