@@ -158,7 +158,7 @@ def test_use_is_concluded_from_a_swap_and_knowledge_never_beside_an_interval_tha
         assert ("The answer is used in the first chunk, against the correct picture" in text) == (
             swapped == "reverses"
         ), text
-        if "the policy succeeds" in text.lower():
+        if "the policy succeeds;" in text.lower():
             assert (rate_, swapped) == ("knowledge", "no swap"), text
         assert "in the backbone" not in text or backbone != "not probed", text
         is_untested = "hether the answer is used was not tested" in text
