@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import err, marked, out, print_json_text, print_text, say, split
@@ -142,6 +142,7 @@ def retention(
         with err.status("drawing the report"):
             written = write_report(shown, html, table)
         say_report(written)
+    sections: Collection[Section] | Literal["all"]
     sections = "all" if "all" in details else cast("tuple[Section, ...]", details)
     if style == "table":
         out.print(table.to_rich(sections))
