@@ -29,6 +29,7 @@ from probe_kit.extract.source_commands.dataset_commands import app as dataset_ap
 from probe_kit.extract.source_commands.environment_commands import check_environment
 from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.intervene.commands import KindHelp, intervene
+from probe_kit.intervene.list_command import list_runs
 from probe_kit.intervene.show_command import show
 from probe_kit.retention.commands import retention
 from probe_kit.study.commands import app as study_app
@@ -164,6 +165,7 @@ def _stored_runs_of_study(name: str) -> "list[Run] | None":
 for name, commands in (("suite", suite_app), ("run", run_app), ("study", study_app), ("dataset", dataset_app)):
     app.add_typer(commands, name=name, rich_help_panel=_PANEL_OF[name])
 run_app.command()(show)
+run_app.command("list")(list_runs)
 for command in (
     *(demo, doctor, models, extract, ask, power, train, labels, retention, view),
     *(new_adapter, check_adapter, check_environment, verify),

@@ -69,6 +69,13 @@ def test_what_developers_need_is_left_out_of_what_users_run(checkout: Path, prog
     executable(programs / "uv", RECORDING.format(version="0.9.8", name="theirs"))
     assert " --no-dev probe-kit demo" in with_uv(checkout, programs, "probe-kit", "demo").stdout
     assert "--no-dev" not in with_uv(checkout, programs, "pytest").stdout
+    extras = ("--extra", "remote", "--no-extra=datasets", "-v")
+    assert (
+        f" --no-dev {' '.join(extras)} probe-kit demo"
+        in with_uv(checkout, programs, *extras, "probe-kit", "demo").stdout
+    )
+    assert "--no-dev" not in with_uv(checkout, programs, *extras, "pytest", "-k", "probe-kit").stdout
+    assert "--no-dev" not in with_uv(checkout, programs, "--extra", "probe-kit", "pytest").stdout
 
 
 @pytest.mark.parametrize("old", [None, "0.4.30", "0.8.3"])

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 NamedProgress = Callable[[str], Callable[..., None]]
 Truth = str
-"""A behaviour of `UseVerdict`, or `does not decide`, `absent`, `known` or `unknown`."""
+"""A behaviour of `UseVerdict`, or `does not decide`, `absent`, `known` or `not shown`."""
 Agreement = Literal["true", "inconclusive", "wrong"]
 """Of a verdict with the truth. An inconclusive verdict claims no behaviour: it is neither true nor wrong."""
 DOES_NOT_DECIDE: Truth = "does not decide"
@@ -46,7 +46,7 @@ COMPATIBLE: Mapping[Truth, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Organism:
-    """A model by its name, and the verdict that is true of it per category; `absent` or `unknown` if not named.
+    """A model by its name, and the verdict that is true of it per category; `absent` or `not shown` if not named.
 
     folder: what its run is called. asked: it reads and does not act. max_steps: actions per episode; None for as
     many as its scene has. view: the tokens whose mean is probed.
@@ -64,7 +64,7 @@ class Organism:
 
     def expected(self, category: str) -> Truth:
         """What is true by construction."""
-        return dict(self.truth).get(category, "unknown" if self.asked else "absent")
+        return dict(self.truth).get(category, "not shown" if self.asked else "absent")
 
 
 TRAINED = Organism(

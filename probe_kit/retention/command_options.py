@@ -72,6 +72,15 @@ Against = Annotated[
         help="Run or group that all others are compared with. Default: the first run; of groups every pair.",
     ),
 ]
+TrainingSteps = Annotated[
+    str | None,
+    typer.Option(
+        "--x",
+        metavar="step|N,N,…",
+        help="Table and figure over training checkpoints. step: read from each checkpoint's folder, such as "
+        "checkpoint-500; or a training step per run.",
+    ),
+]
 LabelTargets = Annotated[
     list[str] | None,
     typer.Option(
@@ -171,7 +180,7 @@ Stages = Annotated[
     bool,
     typer.Option(
         "--stages",
-        help="Compare VLM_RUN and RUN question by question: answered, encoded, acted on.",
+        help="Compare VLM_RUN and RUN question by question: answer, probe, success.",
         rich_help_panel=VLM_RUNS,
     ),
 ]
@@ -190,7 +199,8 @@ Details = Annotated[
         "--details",
         parser=some_of((*get_args(Section), "all")),
         metavar=f"{choices((*get_args(Section), 'all'))},…",
-        help="Tables to print above the summary, comma-separated.",
+        help="Tables to print above the summary, comma-separated. all: every table, and every figure of "
+        "--figures.",
     ),
 ]
 NO_DETAILS = Names()
@@ -209,5 +219,9 @@ Html = Annotated[
 ]
 Figures = Annotated[
     Path | None,
-    typer.Option("--figures", metavar="FOLDER", help="Write all figures as PNG and PDF."),
+    typer.Option(
+        "--figures",
+        metavar="FOLDER",
+        help="Write the main figures as PNG and PDF; with --details all every figure.",
+    ),
 ]

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping, Sequence
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Literal, cast
 
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import err, marked, out, print_json_text, print_text, say, split
@@ -13,16 +13,20 @@ from probe_kit.retention.label_commands import save_all, say_report
 
 if TYPE_CHECKING:
     from probe_kit.retention.choices import Family, Section, TableFormat
-    from probe_kit.retention.formats.as_paper import PaperTable
+    from probe_kit.retention.formats.numbers_table import NumbersTable
     from probe_kit.retention.table import RetentionTable
 
 WITH_STAGES = ("runs", "probes", "views", "wording", "score", "with_side_words", "style", "figures")
 WITH_TARGET = (
-    "runs", "family", "probes", "views", "iterations", "wording", "partial", "style", "html", "figures",
+    "runs", "family", "probes", "views", "iterations", "wording", "partial", "details", "style", "html", "figures",
 )  # fmt: skip
 WITH_AS_PAPER = (
     "runs", "probes", "views", "iterations", "wording", "partial", "rule", "last_steps", "score",
     "with_side_words", "style",
+)  # fmt: skip
+WITH_X = (
+    "runs", "probes", "views", "iterations", "absent_below", "wording", "partial", "rule", "last_steps", "style",
+    "figures",
 )  # fmt: skip
 """Options of `retention` that go with another table than its own."""
 
@@ -31,6 +35,7 @@ def retention(
     runs: own.Runs = None,
     group: own.Groups = None,
     against: own.Against = None,
+    x: own.TrainingSteps = None,
     target: own.LabelTargets = None,
     family: own.LabelFamily = "label",
     probes: own.ProbeKeys = None,
@@ -56,17 +61,20 @@ def retention(
 
     With `--target COLUMN` the signal is that of a label of your own, see `probe-kit train --target COLUMN`.
 
-    With `--stages` it compares a VLM and a policy question by question: answered, encoded, acted on. Answered: the
-    VLM answers right. Encoded: a probe of the policy reads the answer, above chance and controls. Acted on: the
-    cube ends on the correct picture. Both runs need the same first frames.
+    With `--stages` it compares a VLM and a policy question by question: answer, probe, success. Answer: the VLM
+    answers right. Probe: a held-out probe of the policy is right. Success: the cube ends on the correct picture.
+    Each in both layouts. Both runs need the same first frames.
     """
     given = locals()
     from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
     from probe_kit.extract import open_run
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
+    from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+    from probe_kit.retention.displays.training_steps import training_step_figure
     from probe_kit.retention.rows.outcome_rules import check_epsilons
     from probe_kit.retention.stages_command import show_stages
+    from probe_kit.retention.training_steps import read_steps, step_table
 
     if stages:
         _check_only(given, WITH_STAGES)
@@ -79,13 +87,18 @@ def retention(
         return
     if target:
         _check_only(given, WITH_TARGET)
-        _show_labels(runs or (), target, family, probes, views, iterations, wording, partial, style, html, figures)
+        _show_labels(
+            runs or (), target, family, probes, views, iterations, wording, partial, style, html, figures,
+            "all" in details,
+        )  # fmt: skip
         return
     if family != "label":
         raise UsageError("--family is for labels of your own; give --target COLUMN too, or leave it out")
     if as_paper:
         _check_only(given, WITH_AS_PAPER)
         common.check_no_others({f"--score {score}": score == "order-balanced"}, "--as-paper")
+    if x is not None:
+        _check_only(given, WITH_X)
     check_epsilons(rule, epsilons is not None)
     if bool(runs) == bool(group):
         raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
@@ -99,6 +112,10 @@ def retention(
     }
     listed = [run for of_group in opened.values() for run in of_group]
     keys = _keys([path for paths in grouped.values() for path in paths], probes or [])
+    if x is not None:
+        training = read_steps(x, listed)
+        order = sorted(range(len(listed)), key=lambda at: training[str(listed[at].location)])
+        listed, keys = [listed[at] for at in order], [keys[at] for at in order]
     table = make_table(
         opened if group else listed, views, iterations=steps, keys=keys, epsilons=epsilons or SENSITIVITY_RADII,
         rule=rule, last_steps=last_steps, absent_below=absent_below, score=score, vlm_vla=vlm_vla,
@@ -107,24 +124,37 @@ def retention(
     if as_paper:
         _print(table.as_paper, style, table.notes)
         return
+    if x is not None:
+        by_step = step_table(table, training)
+        if figures is not None:
+            lines = [ProvenanceLine.of_row(mean) for mean in table.means]
+            save_all([training_step_figure(by_step, lines)], figures)
+        _print(by_step, style, (*table.unpaired, *table.notes))
+        return
     shown = [scored(run, score, with_side_words) for run in listed]
     if figures is not None:
         from probe_kit.retention.displays import collect_figures
 
-        save_all(collect_figures(shown, table), figures)
+        save_all(collect_figures(shown, table), figures, "all" in details)
     if html is not None:
         from probe_kit.retention.report import write_report
 
         with err.status("drawing the report"):
             written = write_report(shown, html, table)
         say_report(written)
+    sections: Collection[Section] | Literal["all"]
+    sections = "all" if "all" in details else cast("tuple[Section, ...]", details)
     if style == "table":
-        out.print(table.to_rich("all" if "all" in details else cast("tuple[Section, ...]", details)))
+        out.print(table.to_rich(sections))
+    elif style == "latex":
+        print_text(table.to_latex(sections))
+        for note in table.notes:
+            say(marked("[yellow]note:[/] {}", note))
     else:
         _print(table, style, table.notes)
 
 
-def _print(table: "RetentionTable | PaperTable", style: "TableFormat", notes: Sequence[str]) -> None:
+def _print(table: "RetentionTable | NumbersTable", style: "TableFormat", notes: Sequence[str]) -> None:
     """Print a table in a format, and its notes beside it, where a program does not read them."""
     if style == "table":
         out.print(table.to_rich())
@@ -147,6 +177,7 @@ def _show_labels(
     style: "TableFormat",
     html: Path | None,
     figures: Path | None,
+    details: bool,
 ) -> None:
     """The retention of labels of one's own, whose columns are given."""
     from probe_kit.extract import open_run
@@ -160,15 +191,16 @@ def _show_labels(
     opened = [open_run(path, allow_partial=partial).in_wording(wording) for path in runs]
     steps, keys = own.read_iterations(iterations), _keys(list(runs), probes or [])
     table = label_retention_table(opened, columns, views, iterations=steps, keys=keys, family=family)
-    show_label_retention(opened, table, style, html, figures)
+    show_label_retention(opened, table, style, html, figures, details)
 
 
 def _check_only(given: Mapping[str, object], allowed: Collection[str]) -> None:
     """Raise UsageError for an option of `retention` that differs from its default and does not go with the table.
 
-    given: the value of every parameter, `stages`, `target` or `as_paper` among them. allowed: what goes with it.
+    given: the value of every parameter, `stages`, `target`, `as_paper` or `x` among them. allowed: what goes
+    with it.
     """
-    what = next(name for name in ("stages", "target", "as_paper") if given[name])
+    what = next(name for name in ("stages", "target", "as_paper", "x") if given[name])
     others = {
         f"--{'format' if name == 'style' else name.replace('_', '-')}": given[name] != parameter.default
         for name, parameter in signature(retention).parameters.items()
@@ -178,6 +210,7 @@ def _check_only(given: Mapping[str, object], allowed: Collection[str]) -> None:
         "stages": "--stages",
         "target": "labels of your own",
         "as_paper": "the paper's own numbers (--as-paper)",
+        "x": "a table of training steps (--x)",
     }
     common.check_no_others(others, words[what])
 

@@ -22,7 +22,7 @@ class Joins:
 
 
 def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
-    """Answered, encoded, acted on of every pair of a VLM run and a policy run.
+    """Answer, probe and success of every pair of a VLM run and a policy run.
 
     runs: those that the table is made of, as it reads them; probes, outcome rule and names are the table's. Tests
     are corrected over all pairs.

@@ -19,12 +19,13 @@ def show_label_retention(
     style: "TableFormat",
     html: Path | None,
     figures: Path | None,
+    details: bool = False,
 ) -> None:
     """Print the retention table of labels, and write its report and figures where that was asked for."""
     if figures is not None:
         from probe_kit.retention.displays.labels import label_figures
 
-        save_all(label_figures(runs, table), figures)
+        save_all(label_figures(runs, table), figures, details)
     if html is not None:
         from probe_kit.retention.report import write_label_report
 
@@ -38,12 +39,18 @@ def show_label_retention(
         show(getattr(table, f"to_{style}")())
 
 
-def save_all(exhibits: "Sequence[ReportFigure]", folder: Path) -> None:
-    """Draw figures into a folder, and say where each is."""
+def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = False) -> None:
+    """Draw the main figures into a folder, and say where each is and how many are left out.
+
+    details: draw every figure.
+    """
     from probe_kit.retention.displays import save_figures
 
-    for path in save_figures(exhibits, folder):
+    drawn = [exhibit for exhibit in exhibits if details or not exhibit.is_detail]
+    for path in save_figures(drawn, folder):
         say(f"figure: {path}")
+    if left_out := len(exhibits) - len(drawn):
+        say(f"{left_out} further figure{'s' * (left_out > 1)}: add --details all")
 
 
 def say_report(written: Path) -> None:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Group
 
-    from probe_kit.retention.formats.as_paper import PaperTable
+    from probe_kit.retention.formats.numbers_table import NumbersTable
 
 
 @dataclass(frozen=True, repr=False)
@@ -171,13 +171,22 @@ class RetentionTable:
             self.all_rows, self.differences, self.notes, self.wordings, self.further_tables, self.unpaired
         )
 
-    def to_latex(self) -> str:
-        """The retention table in LaTeX, with booktabs rules and five heat colours; then controls, differences."""
+    def to_latex(self, details: Collection[Section] | Literal["all"] = ()) -> str:
+        """Return the summary in LaTeX with booktabs rules, each table with a caption, a label and a line's width.
+
+        details: sections whose tables stand below it, as of `to_rich`; all of them by "all".
+        """
         from probe_kit.retention.columns.conditions import wording_tables
         from probe_kit.retention.formats.latex import latex
 
-        further = [*wording_tables(self.wordings), *self.further_tables]
-        return latex(self.all_rows, self.differences, self.notes, further, self.unpaired)
+        chosen: Collection[Section] = get_args(Section) if details == "all" else details
+        wordings = wording_tables(self.wordings) if "success" in chosen else []
+        further = [*wordings, *self._further(chosen)]
+        return latex(self.all_rows, self.differences, self.notes, further, self.unpaired, chosen)
+
+    def _further(self, sections: Collection[Section]) -> list[TextTable]:
+        """Tables of VLM runs below the tables of some sections."""
+        return self.further_tables if "answers" in sections else vlm_vla_tables(self.vlm_vla)
 
     @property
     def summary(self) -> list[RunSummary]:
@@ -185,7 +194,7 @@ class RetentionTable:
         return summarise_runs(self.all_rows)
 
     @property
-    def as_paper(self) -> "PaperTable":
+    def as_paper(self) -> "NumbersTable":
         """The paper's own numbers by its own formulas, see `probe_kit.retention.formats.as_paper`."""
         from probe_kit.retention.formats.as_paper import paper_table
 
@@ -200,9 +209,8 @@ class RetentionTable:
         from probe_kit.retention.formats.terminal import rich_tables
 
         chosen: Collection[Section] = get_args(Section) if details == "all" else details
-        further = self.further_tables if "answers" in chosen else vlm_vla_tables(self.vlm_vla)
         rows, differences, notes = self.all_rows, self.differences, self.notes
-        return rich_tables(rows, differences, notes, self.wordings, further, self.unpaired, chosen)
+        return rich_tables(rows, differences, notes, self.wordings, self._further(chosen), self.unpaired, chosen)
 
     @property
     def further_tables(self) -> list[TextTable]:
@@ -244,9 +252,9 @@ def retention_table(
     `order-balanced`; they stand first. with_side_words: count their items in whose name a side stands. vlm_vla:
     compare every VLM run with every acting one, see `vlm_vla_differences`. labels: names of runs in tables and
     figures by their location, instead of their own. pairs: by location, the runs that are compared, each the first
-    minus the second, instead of the first run with every other; all of them are one family of tests. categories:
-    rows of these alone, and means over them; probes are those of the whole runs. with_behaviour: False leaves
-    empty what the rule `disc` does not need (other rules and behaviour), so that no trajectory is read.
+    minus the second, instead of every other with the first; all of them are one family of tests.
+    categories: rows of these alone, and means over them; probes are those of the whole runs. with_behaviour: False
+    leaves empty what the rule `disc` does not need (other rules and behaviour), so that no trajectory is read.
     Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
     is not that of the runs, for a run that is given twice, or for `against` or `pairs` where they are none of the
     runs; SceneError for overlapping zones.

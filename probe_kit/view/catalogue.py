@@ -8,6 +8,7 @@ from typing import Any
 from probe_kit.extract import Run
 from probe_kit.extract.store.thumbnails import read_sheet
 from probe_kit.hashing import sha256_json
+from probe_kit.retention.columns.glossary import VIEWER_WORDS
 from probe_kit.view.payloads.coding import failure_script, payload_script
 from probe_kit.view.payloads.episode_payload import episode_payload
 from probe_kit.view.payloads.episodes_payload import episodes_payload
@@ -105,4 +106,4 @@ class Catalogue:
             {"key": key, "label": viewed.run.label, "episodes": len(viewed.run.episodes)}
             for key, viewed in self.runs.items()
         ]
-        return {"schema": SCHEMA, "runs": runs}
+        return {"schema": SCHEMA, "runs": runs, "words": list(VIEWER_WORDS.items())}

@@ -22,7 +22,10 @@ RUNS_BY_NAME: "list[Callable[[str], list[Run] | None]]" = []
 def view(
     runs: Annotated[
         list[str],
-        typer.Argument(help="Run folders or URLs, or study files, whose runs are opened.", metavar="RUN…"),
+        typer.Argument(
+            help="Run folders or URLs, folders that hold runs, or study files, whose runs are opened.",
+            metavar="RUN…",
+        ),
     ],
     export: Annotated[
         Path | None,
@@ -71,11 +74,15 @@ def view(
 
 
 def _opened(names: list[str], partial: bool) -> "list[Run]":
-    """The runs of these names, of which each stands for one run, or for several as `RUNS_BY_NAME` knows."""
+    """Return the runs of these names: a run, the runs below a folder, or those that `RUNS_BY_NAME` knows."""
     from probe_kit.extract import open_run
+    from probe_kit.extract.store.locations.run_folders import find_runs, is_run
 
     found: list[Run] = []
     for name in names:
+        if Path(name).is_dir() and not is_run(Path(name)):
+            found += [open_run(path, allow_partial=partial) for path in find_runs(Path(name))]
+            continue
         several = next((runs for find in RUNS_BY_NAME if (runs := find(name)) is not None), None)
         found += [open_run(name, allow_partial=partial)] if several is None else several
     return found

@@ -55,12 +55,12 @@ def row(sr: float, p: float | None, **controls: bool) -> RetentionRow:
 @pytest.mark.parametrize(
     ("sr", "p", "expected"),
     [
-        (0.9, 0.005, "acted on"),
-        (0.64, 0.005, "encoded, not acted on"),
-        (0.02, 0.005, "encoded, not acted on"),
+        (0.9, 0.005, "shown, success"),
+        (0.64, 0.005, "shown, success not shown"),
+        (0.02, 0.005, "shown, failure"),
         (0.5, 0.2, "not shown"),
         (0.5, None, "not shown"),
-        (0.9, 0.2, "acted on, not found"),
+        (0.9, 0.2, "not shown, success"),
     ],
 )
 def test_the_verdict_asks_whether_it_is_in_the_backbone_and_whether_it_is_acted_on(
@@ -78,7 +78,7 @@ def test_absent_is_said_only_where_the_best_site_is_below_the_bound() -> None:
 def test_what_does_not_exceed_a_control_is_not_shown(control: str) -> None:
     """Color of the untrained network had p = 0.005 against chance, and knew nothing."""
     assert verdict(row(0.5, 0.005, **{control: False})) == "not shown"
-    assert verdict(row(0.5, 0.005, **{control: True})) == "encoded, not acted on"
+    assert verdict(row(0.5, 0.005, **{control: True})) == "shown, success not shown"
 
 
 def test_organisms_differ_in_one_truth_at_a_time() -> None:
@@ -180,9 +180,9 @@ def test_every_compatible_verdict_is_one_that_the_instrument_gives() -> None:
     assert {own for verdicts in COMPATIBLE.values() for own in verdicts} <= given
 
 
-@pytest.mark.parametrize(("sr", "expected"), [(0.9, "known"), (0.6, "unknown"), (0.5, "unknown")])
+@pytest.mark.parametrize(("sr", "expected"), [(0.9, "known"), (0.6, "not shown"), (0.5, "not shown")])
 def test_a_vlm_knows_what_it_answers_far_from_one_half(sr: float, expected: str) -> None:
     one = row(sr, None)
     assert verdict(replace(one, run=replace(one.run, mode="answers"))) == expected
     assert VLM.expected("state") == "known"
-    assert VLM.expected("counting") == "unknown"
+    assert VLM.expected("counting") == "not shown"

@@ -87,7 +87,7 @@ def test_success_rates_are_not_there_in_any_table(capture_run: Run, recorded_run
     assert all(row["success"]["sr"] is not None for row in acting)
     screen = StringIO()
     Console(file=screen, width=240).print(table.to_rich("all"))
-    for text in (table.to_markdown(), table.to_latex(), screen.getvalue()):
+    for text in (table.to_markdown(), table.to_latex("all"), screen.getvalue()):
         assert "n/a" in text
         assert "captured" in text
     assert table.to_frame()["success.sr"].isna().sum() == 2

@@ -117,7 +117,7 @@ def test_shares_stay_shares_and_differences_of_shares_differences(table: Retenti
 
 def test_equal_runs_differ_by_nothing_and_not_surely_so(table: RetentionTable) -> None:
     """Two models that agree in all 100 groups may differ in 3.6 % of others, and no more is allowed for."""
-    rows = [row for row in table.differences if (row.group, row.minus) == ("one", "again")]
+    rows = [row for row in table.differences if (row.group, row.minus) == ("again", "one")]
     assert rows
     for row in rows:
         for name in ("sr", "backbone", "action"):

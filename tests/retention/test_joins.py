@@ -1,4 +1,4 @@
-"""Answered, encoded, acted on as a figure and in the report."""
+"""Answer, probe, success as a figure and in the report."""
 
 from pathlib import Path
 
@@ -31,10 +31,10 @@ def test_bars_are_the_counts_of_the_join(tmp_path: Path) -> None:
     assert [patch.get_width() for patch in axes.patches] == [25.0] * 4  # type: ignore[attr-defined]
     labels = [text.get_text() for legend in axes.figure.legends for text in legend.get_texts()]  # type: ignore[union-attr]
     assert labels == [
-        "answered, acted on",
-        "not answered, acted on",
-        "answered, not acted on",
-        "not answered, not acted on",
+        "answer right, success",
+        "answer not, success",
+        "answer right, no success",
+        "answer not, no success",
     ]
 
 

@@ -34,7 +34,7 @@ def test_labels_that_are_given_name_runs_in_tables_figures_and_differences(
     one, other = (probed_run({"color": ([0.5, 0.8], [[0.6]])}, name) for name in ("one", "other"))
     table = retention_table([one, other], labels={str(one.location): "π0", str(other.location): "π0 (SFT)"})
     assert [row.run.label for row in table.rows] == ["π0", "π0 (SFT)"]
-    assert {(row.group, row.minus) for row in table.differences} == {("π0", "π0 (SFT)")}
+    assert {(row.group, row.minus) for row in table.differences} == {("π0 (SFT)", "π0")}
     assert {own.label for own in table.results.values()} == {"π0", "π0 (SFT)"}
     assert one.label == "one"
     alike = retention_table([one, other], labels={str(other.location): "one"})

@@ -43,7 +43,7 @@ def every_form(table: RetentionTable) -> dict[str, str]:
     return {
         "console": console(table).split("Retention, view")[1],
         "markdown": table.to_markdown().split("**Retention (")[1],
-        "latex": table.to_latex().split(r"\caption{Retention")[1],
+        "latex": table.to_latex("all").split(r"\caption{Retention")[1],
         "page": f"{headings(html)}\n{cells}",
     }
 
@@ -90,7 +90,7 @@ def test_the_margin_that_decides_stands_before_the_papers(table: RetentionTable)
     texts = {
         "console": console(table),
         "markdown": table.to_markdown(),
-        "latex": table.to_latex(),
+        "latex": table.to_latex("all"),
         "page": " | ".join(cell.text for cell in page.body[0]),
     }
     for form, text in texts.items():

@@ -37,7 +37,7 @@ def test_it_prints_the_counts_of_match_runs_and_draws_their_figure(runs: tuple[R
         json.dumps(match_runs(scored(asked, "text", False), acted).to_json())
     )
     drawn = CliRunner().invoke(app, [*command, "--figures", str(tmp_path / "figures")])
-    assert "Answered, encoded, acted on" in drawn.stdout
+    assert "Answer, probe, success" in drawn.stdout
     assert list((tmp_path / "figures").glob("*.png"))
 
 

@@ -85,7 +85,7 @@ def test_rows_of_other_settings_are_pointed_out_in_every_format(probed_run: Prob
     key = probed_again(other, **{name: value}).key
     table = retention_table([one, other], keys=[None, key])
     assert words in table.notes[-1]
-    for text in (table.to_markdown(), table.to_latex(), as_text(table), report_html([one, other], table)):
+    for text in (table.to_markdown(), table.to_latex("all"), as_text(table), report_html([one, other], table)):
         assert words in " ".join(text.split())
 
 

@@ -154,8 +154,8 @@ def test_46_of_48_means_of_left_and_right_are_the_printed_rate(tables: dict[str,
 
 
 GROUPS = {
-    "co-trained": ["Magma", "Xiaomi-Robotics-R0", "InternVLA-M1"],
     "robot-only": ["OpenVLA", "SpatialVLA", "pi0"],
+    "co-trained": ["Magma", "Xiaomi-Robotics-R0", "InternVLA-M1"],
 }
 
 

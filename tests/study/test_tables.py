@@ -50,7 +50,7 @@ def test_stages_show_no_encoded_items_where_probes_have_no_signal(tmp_path: Path
     found = probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75)
     made = stages_table([match_runs(scored(vlm, "text"), policy, found)])
     color, shape, whole = made.text.cells
-    assert shape[4:] == ("no signal", shape[5], "–", "–")
+    assert shape[4:] == ("not shown", shape[5], "–", "–")
     assert whole[4] == color[4]
     assert whole[6:] == color[6:]
     assert "probes are not shown to exceed chance" in made.text.note

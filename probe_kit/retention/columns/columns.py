@@ -463,7 +463,7 @@ PUBLISHED = Column(
 PROBE_MINUS_SR = share(
     "controls.probe_minus_sr",
     "probe − SR %",
-    "Backbone score minus success rate, in points: what can be read but is not acted on.",
+    "Backbone score minus success rate, in points: what can be read beyond success.",
     answers=(
         "probe − accuracy %",
         "Backbone score minus the accuracy of the answers, in points: what can be read but is not said.",

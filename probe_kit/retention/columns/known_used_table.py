@@ -1,4 +1,4 @@
-"""Answered, encoded, acted on on a console and in the report."""
+"""Answer, probe and success, item by item, on a console and in the report."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -13,9 +13,10 @@ if TYPE_CHECKING:
 
 Columns = Sequence[tuple[str, Callable[[CategoryCounts], str]]]
 _LEGEND = (
-    "answered: answered right; encoded: the probe's held-out decision right; acted on: acted right; each in "
+    "answer: the VLM answers right; probe: its held-out decision is right; success: the cube ends right; each in "
     "both layouts of an item, which a coin manages in 25 %"
 )
+_NAMES = {"answered": "answer", "encoded": "probe", "acted": "success"}
 _CODES = "a capital letter for what is right, a small one for what is not"
 _TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) over all categories and pairs shown"
 
@@ -25,12 +26,12 @@ def rich_known_used(joined: KnownUsedTable) -> "Group":
     from rich.console import Group
     from rich.text import Text
 
-    title = f"Answered, encoded, acted on: {joined.asked} (by {joined.score}) · {joined.acted}"
-    seen = f"probes in view {joined.view}" if joined.view else "no probes: answered and acted on only"
+    title = f"Answer, probe, success: {joined.asked} (by {joined.score}) · {joined.acted}"
+    seen = f"probes in view {joined.view}" if joined.view else "no probes: answer and success only"
     rows = joined.rows
     tables = [
-        _table(title, f"{_LEGEND}; {seen}", rows, [("Items", _SHARES), ("Answered but not acted on", _LOST)]),
-        _table("Which of them: VLM · probe · action right (expected of coins)", "", rows, [("", _codes(rows))]),
+        _table(title, f"{_LEGEND}; {seen}", rows, [("Items", _SHARES), ("Answer right, without success", _LOST)]),
+        _table("Which of them: VLM · probe · success (expected of coins)", "", rows, [("", _codes(rows))]),
         _table("Equally many?", _TESTS, rows, [("", _tests())]),
         _table("Single episodes (nothing is tested)", "", rows, [("", _episodes(rows))]),
     ]
@@ -39,12 +40,12 @@ def rich_known_used(joined: KnownUsedTable) -> "Group":
 
 def known_used_tables(joined: KnownUsedTable) -> list[TextTable]:
     """The same counts and tests as tables of text, for pages."""
-    seen = f"probes in view {joined.view}" if joined.view else "no probes: answered and acted on only"
-    title = f"Answered, encoded, acted on: {joined.asked} (by {joined.score}) · {joined.acted}"
+    seen = f"probes in view {joined.view}" if joined.view else "no probes: answer and success only"
+    title = f"Answer, probe, success: {joined.asked} (by {joined.score}) · {joined.acted}"
     rows = joined.rows
     return [
         _plain(title, f"{_LEGEND}; {seen}", rows, [*_SHARES, *_LOST]),
-        _plain("Which of them: VLM · probe · action right (expected of coins)", _CODES, rows, _codes(rows)),
+        _plain("Which of them: VLM · probe · success (expected of coins)", _CODES, rows, _codes(rows)),
         _plain("Equally many?", _TESTS, rows, _tests()),
     ]
 
@@ -65,21 +66,21 @@ def _share(count: int | None, row: CategoryCounts) -> str:
 
 _SHARES: Columns = [
     ("items (groups)", lambda row: f"{row.n_items} ({row.n_groups})"),
-    ("answered correctly", lambda row: _share(row.answered_correctly, row)),
-    ("encoded", lambda row: _share(row.encoded, row)),
-    ("acted correctly", lambda row: _share(row.acted_correctly, row)),
-    ("signal", lambda row: {True: "yes", False: "no", None: "–"}[row.has_signal]),
+    ("answer right", lambda row: _share(row.answered_correctly, row)),
+    ("probe right", lambda row: _share(row.encoded, row)),
+    ("success", lambda row: _share(row.acted_correctly, row)),
+    ("shown", lambda row: {True: "yes", False: "no", None: "–"}[row.has_signal]),
 ]
 _LOST: Columns = [
     (
-        "answered and encoded",
+        "answer and probe right",
         lambda row: "–" if row.answered_and_encoded is None else str(row.answered_and_encoded),
     ),
     (
-        "of these not acted on % [95 %]",
+        "of these without success % [95 %]",
         lambda row: with_limits(percent(row.share_not_acted_on), row.share_not_acted_on_ci, percent),
     ),
-    ("answered with acted on, p", lambda row: number(row.p_linked, 4)),
+    ("answer with success, p", lambda row: number(row.p_linked, 4)),
 ]
 
 
@@ -105,14 +106,15 @@ def _episodes_of(code: str) -> Callable[[CategoryCounts], str]:
 
 
 def _spelt(code: str) -> str:
-    """`101` as V p A: a capital for what is right, a small letter for what is not."""
-    letters = zip("VPA", code, strict=True)
+    """`101` as V p S: a capital for what is right, a small letter for what is not."""
+    letters = zip("VPS", code, strict=True)
     return " ".join(letter if mark == "1" else letter.lower() for letter, mark in letters if mark != "-")
 
 
 def _tests() -> Columns:
     return [
-        (f"{first} − {second}: only one of them, p (Holm)", _test_of(first, second)) for first, second in PAIRS
+        (f"{_NAMES[first]} − {_NAMES[second]}: only one of them, p (Holm)", _test_of(first, second))
+        for first, second in PAIRS
     ]
 
 

@@ -1,7 +1,7 @@
 """What a row says in words: its verdict, and the sentence about it."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, cast
 
 from probe_kit.intervene.kinds.image_swap.verdict import UNTESTED, UseVerdict
 from probe_kit.intervene.kinds.image_swap.words import describe_swap
@@ -12,27 +12,48 @@ from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 
+
+def _capital(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}"
+
+
 Readable = Literal[
     "known",
-    "unknown",
-    "encoded",
-    "acted on",
-    "encoded, not acted on",
-    "acted on, not found",
+    "shown",
     "absent",
     "not shown",
+    "success",
+    "failure",
+    "success not shown",
+    "shown, success",
+    "shown, failure",
+    "shown, success not shown",
+    "absent, success",
+    "absent, failure",
+    "not shown, success",
+    "not shown, failure",
 ]
-"""What success rate, answers and probes say where no image swap is stored: these never say *used*."""
-_HELD = "The backbone holds the answer"
+"""The backbone's evidence, then success, where no image swap is stored: these never say *used*."""
+_EVIDENCE = {
+    "shown": "The probes find the answer in the backbone, beyond every control that was run",
+    "absent": "The backbone's best site can be at most as accurate as a stated limit, 65 % by default",
+    "not shown": "Neither shown nor absent: more items would tell",
+}
+_SUCCESS = {
+    "success": "the policy is right more often than guessing explains",
+    "failure": "the policy is right less often than guessing",
+    "success not shown": "the success rate is one that guessing can reach",
+}
 _READABLE_HELP = {
     "known": "The VLM answers right more often than guessing explains.",
-    "unknown": "It is not shown that the VLM answers right more often than guessing explains.",
-    "encoded": f"{_HELD}; the model did not act.",
-    "acted on": f"{_HELD}, and the policy acts on it. Only an intervention shows that what is read is used.",
-    "encoded, not acted on": f"{_HELD}; it is not shown that the policy acts on it. No image swap is stored.",
-    "acted on, not found": "The policy acts on the answer, and the probes do not find it in the backbone.",
-    "absent": "The backbone's best site can be at most as accurate as a stated limit, 65 % by default.",
-    "not shown": "Neither shown nor absent: more items would tell.",
+    **{name: f"{meaning}." for name, meaning in _EVIDENCE.items()},
+    **{name: f"{_capital(meaning)}. No probes are stored." for name, meaning in _SUCCESS.items()},
+    **{
+        f"{evidence}, {success}": f"{read}; {done}. Only an intervention shows whether the answer is used."
+        for evidence, read in _EVIDENCE.items()
+        for success, done in _SUCCESS.items()
+        if evidence == "shown" or success != "success not shown"
+    },
 }
 _BEHAVIOUR_HELP = {
     "used": "A swap turns the action, in at least half of the episodes and by at least half of the reach.",
@@ -62,24 +83,34 @@ def _is_nowhere(row: RetentionRow, use: UseVerdict) -> bool:
 
 
 def readable(row: RetentionRow) -> Readable:
-    """What it says without an intervention.
+    """Return what the row says without an intervention: the backbone's evidence, and success beside it.
 
-    In the backbone: its best site exceeds chance, family-wise, and every control that was run. The SR in the
-    regime of knowledge says *acted on*: only an intervention shows that what is read is used. *Acted on, not
-    found*: the probes missed what the policy acts on. *Absent* is said only where the backbone's best site is
-    below a stated accuracy, else *not shown*. A VLM knows a category in which it answers in the regime of
-    knowledge.
+    *Shown*: the backbone's best site exceeds chance, family-wise, and every control that was run. *Absent*: it is
+    below a stated accuracy, else *not shown*. *Success*: SR in the regime of knowledge; *failure*: SR in that of
+    failure. Success does not say that the answer in the backbone is what the action uses. A VLM knows a category
+    in which it answers in the regime of knowledge, else that is *not shown*.
     """
     if is_vlm(row):
-        return "known" if knows(row) else "unknown"
+        return "known" if knows(row) else "not shown"
     nothing: Readable = "absent" if row.backbone.verdict == "absent" else "not shown"
     if row.image_swap.use is not None and _is_nowhere(row, row.image_swap.use):
         return nothing
+    evidence: Readable = "shown" if row.backbone.has_signal else nothing
     if row.success.sr is None:
-        return "encoded" if row.backbone.has_signal else nothing
+        return evidence
+    success = _success(row)
+    if not _is_probed(row):
+        return success
+    if success == "success not shown" and evidence != "shown":
+        return evidence
+    return cast("Readable", f"{evidence}, {success}")
+
+
+def _success(row: RetentionRow) -> Literal["success", "failure", "success not shown"]:
+    """Return how a policy does against guessing."""
     if knows(row):
-        return "acted on" if row.backbone.has_signal or not _is_probed(row) else "acted on, not found"
-    return "encoded, not acted on" if row.backbone.has_signal else nothing
+        return "success"
+    return "failure" if row.success.regime == Regime.FAILURE else "success not shown"
 
 
 def knows(row: RetentionRow) -> bool:
@@ -133,29 +164,27 @@ def _finding(row: RetentionRow) -> str:
     found = readable(row)
     if not _is_probed(row):
         return _unprobed(row)
-    if found == "encoded":
+    if found == "shown":
         return "Shown in the backbone."
-    if found == "encoded, not acted on":
+    if found.startswith("shown, "):
         return f"Shown in the backbone; {_behaviour(row)}; {_UNTESTED}."
-    if found in ("absent", "not shown"):
+    if not knows(row):
         return _nothing_shown(row)
-    missed = "the probes did not find it; " * (found == "acted on, not found")
-    return f"The policy acts on the answer; {missed}{_UNTESTED}."
+    return f"The policy succeeds; the answer is {_backbone(row)}; {_UNTESTED}."
 
 
 def _unprobed(row: RetentionRow) -> str:
     """Of behaviour alone; empty where the sentence has said all."""
     if row.success.sr is None:
         return ""
-    behaviour = "the policy acts on the answer" if knows(row) else _behaviour(row)
-    return f"{_capitalised(behaviour)}; {_UNTESTED}."
+    return f"{_capital(_behaviour(row))}; {_UNTESTED}."
 
 
 def _nothing_shown(row: RetentionRow) -> str:
     """Of a backbone without signal: what is decided first, then what is open."""
     absent, untested = row.backbone.verdict == "absent", row.backbone.exceeds["chance"] is None
     behaviour = _behaviour(row)
-    backbone = "absent from the backbone" if absent else "not shown in the backbone"
+    backbone = _backbone(row)
     parts = [backbone, behaviour] if absent or behaviour == _NOT_SHOWN else [behaviour, backbone]
     said = "; ".join(filter(None, parts))
     remedy = ""
@@ -163,18 +192,27 @@ def _nothing_shown(row: RetentionRow) -> str:
         remedy = f": {'train probes with permutations' if untested else _MORE_ITEMS}"
     elif behaviour == _NOT_SHOWN:
         remedy = f": {_MORE_ITEMS}"
-    return f"{_capitalised(said)}{remedy}."
+    return f"{_capital(said)}{remedy}."
 
 
-_NOT_SHOWN = "not shown that the policy acts on the answer"
+_NOT_SHOWN = "success is not shown"
+
+
+def _backbone(row: RetentionRow) -> str:
+    """Return the evidence of a backbone without signal, in words."""
+    return "absent from the backbone" if row.backbone.verdict == "absent" else "not shown in the backbone"
 
 
 def _behaviour(row: RetentionRow) -> str:
-    """What a policy does that is not in the regime of knowledge; empty if it did not act."""
+    """Return in words how the policy does; empty if it did not act, or a swap says more."""
     if row.image_swap.use is not None or row.success.sr is None:
         return ""
-    failed = row.success.regime == Regime.FAILURE
-    return "the policy is right less often than guessing" if failed else _NOT_SHOWN
+    words = {
+        "success": "the policy succeeds",
+        "failure": "the policy is right less often than guessing",
+        "success not shown": _NOT_SHOWN,
+    }
+    return words[_success(row)]
 
 
 def _is_probed(row: RetentionRow) -> bool:
@@ -294,10 +332,6 @@ def _agrees(row: RetentionRow) -> bool:
 
 
 # -- text ---------------------------------------------------------------------------------------------------
-
-
-def _capitalised(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}"
 
 
 def _whole(value: float | None) -> str:

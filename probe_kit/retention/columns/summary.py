@@ -32,10 +32,15 @@ _LEGENDS = {
     "success %": "Success: the cube ends on the correct picture",
     "retention": "Retention: share of the backbone's signal left in the action",
 }
+_TESTS = {
+    "p (Holm)": "p: exact, of a difference in success or answers, (corrected for all categories and pairs)",
+    "p over models (least)": "p over models: exact, models as the unit (the least that so few models allow)",
+}
+"""The columns of differences only."""
 """What a column shows."""
 HEADING_HELP = {
     heading: f"{meaning[:1].upper()}{meaning[1:]}."
-    for heading, legend in _LEGENDS.items()
+    for heading, legend in (_LEGENDS | _TESTS).items()
     for meaning in [legend.partition(": ")[2]]
 } | {"verdict": "What all numbers of the category say together."}
 """The same as entries of the glossary."""
@@ -131,13 +136,14 @@ def summary_table(
     for name in names:
         for run in found:
             own = [one for one in (*run.categories, run.mean) if one.row.category == name]
-            lines += [(one.name, run.run, *one.cells(intervals)) for one in own]
+            lines += [(one.name, run.run, *one.cells(intervals), *[""] * len(_TESTS)) for one in own]
         gaps = [row for row in differences if row.category == name]
         lines += [(_name(name), f"{row.group} − {row.minus}", *_difference_cells(row, intervals)) for row in gaps]
-    headings = ("category", "run", *HEADINGS)
+    headings = ("category", "run", *HEADINGS, *_TESTS)
     shown = [at for at in range(len(headings)) if at == 0 or (at == 1 and (several or differences))]
     shown += [at for at in range(2, len(headings)) if any(line[at] not in ("–", "") for line in lines)]
-    legend = [_LEGENDS[headings[at]] for at in shown if headings[at] in _LEGENDS]
+    legends = _LEGENDS | _TESTS
+    legend = [legends[headings[at]] for at in shown if headings[at] in legends]
     readouts = describe_readouts(one.row.image_swap.use for run in found for one in run.categories)
     legend += [f"{readouts[0].upper()}{readouts[1:]}"] if readouts else []
     return TextTable(
@@ -163,14 +169,9 @@ def _difference_cells(row: Difference, intervals: bool) -> tuple[str, ...]:
     )
     answered, acted = (sr, "") if row.mode == "answers" else ("", sr)
     ratio = ratio_difference(row.retention, row.retention_ci if intervals else None)
-    return answered, backbone, action, acted, ratio, _difference_p(row)
-
-
-def _difference_p(row: Difference) -> str:
-    """Over models where a side is a group of several, else over items."""
-    if row.sr_models is not None:
-        return f"over models p {p_text(row.sr_models.p)} (least {p_text(row.sr_models.smallest_p)})"
-    return "" if row.p is None else f"p {difference_test(row)}"
+    models = row.sr_models
+    over_models = "" if models is None else f"{p_text(models.p)} ({p_text(models.smallest_p)})"
+    return answered, backbone, action, acted, ratio, "", "" if over_models else difference_test(row), over_models
 
 
 def _name(category: str) -> str:

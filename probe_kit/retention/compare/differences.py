@@ -135,12 +135,12 @@ class ComparedSides:
 
 
 def group_pairs(groups: Sequence[str], against: str | None = None) -> list[tuple[str, str]]:
-    """Every group and every later one, or every other group and `against`.
+    """Return every group with every earlier one, or every other group with `against`: minuend, subtrahend.
 
     Raises UsageError for a group that is none of them.
     """
     if against is None:
-        return list(combinations(groups, 2))
+        return [(later, earlier) for earlier, later in combinations(groups, 2)]
     if against not in groups:
         raise UsageError(f"there is no group {against!r} to compare with; there are {', '.join(groups)}")
     return [(name, against) for name in groups if name != against]

@@ -1,4 +1,4 @@
-"""Answered, encoded, acted on: what a VLM answers, a probe reads and a policy does, question by question.
+"""Answer, probe, success: what a VLM answers, a probe reads and a policy does, question by question.
 
 answered: the VLM answers right. encoded: the probe's held-out decision is right, where probes beat chance,
 random-features and untrained. acted on: the cube ends right. The unit is the item, right in both layouts. A fixed
@@ -415,6 +415,6 @@ def without_signal(rows: Sequence[CategoryCounts]) -> list[str]:
     if not dull:
         return []
     return [
-        f"In {', '.join(dull)} probes are not shown to exceed chance and every control: nothing is shown to be "
-        "encoded there, and counts of encoded items can be those of a probe that guesses."
+        f"In {', '.join(dull)} probes are not shown to exceed chance and every control: the answer is not shown "
+        "there, and counts of items with the probe right can be those of a probe that guesses."
     ]

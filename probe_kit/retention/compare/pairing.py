@@ -52,7 +52,7 @@ def compare_runs(
     vlm_vla: bool = False,
     chosen: Sequence[tuple[str, str]] | None = None,
 ) -> PairedRuns:
-    """The first run minus every other, or every other minus the run `against`; VLM runs and policy runs apart.
+    """Return every other run minus the run `against`, by default the first; VLM runs and policy runs apart.
 
     runs: in the order in which they were named. drawn: their rows. labels: what runs are called, by location.
     against: a run's name in tables, its folder's name or its location. vlm_vla: whether VLM runs are compared with
@@ -89,7 +89,7 @@ def compare_groups(
     rescore: Rescore,
     against: str | None = None,
 ) -> PairedRuns:
-    """Every group of runs minus every later one, or minus the group `against`; see `compare_runs`.
+    """Return every group of runs minus every earlier one, or minus the group `against`; see `compare_runs`.
 
     Two groups count as pairs in categories in which all of their runs have at least 80 % of the items in common,
     and then on these items alone. In other categories each group has its own items.
@@ -167,7 +167,7 @@ def _pairs(
     found = []
     for asked in (True, False):
         alike = [run for run in runs if _asked(run) == asked]
-        found += [(alike[0], other) for other in alike[1:]]
+        found += [(other, alike[0]) for other in alike[1:]]
     return found
 
 

@@ -132,5 +132,5 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
                 "How much of the attention that the acting stream pays lies on the pictures, the words and its "
                 "own tokens, by the block whose keys are read. Dots: single heads; bars: from the least to the "
                 "most of any iteration. Descriptive: attended tokens need not be used, and no verdict reads this.",
-                one.position, partial(attention_curve, one.run),
+                one.position, partial(attention_curve, one.run), is_detail=True,
             )  # fmt: skip

@@ -233,7 +233,7 @@ def _of_run(name: str, position: int, run: RunReader, results: ProbeResults) -> 
             f"The best site of each part at every inference that was captured, counted from 0. {ONLY_FILLED}; "
             "dotted: what the best site of permuted labels stays below. An answer that is not there at "
             "call 0 may not be needed yet: upright lines say when the arm set off, grasped, chose a side, let go.",
-            position, partial(call_curves, calls, view, events),
+            position, partial(call_curves, calls, view, events), is_detail=view != views[0],
         )  # fmt: skip
     curves = [CallCurves.of(calls, category, views[0], events) for category in results.settings.categories]
     for event in EVENTS:
@@ -242,5 +242,5 @@ def _of_run(name: str, position: int, run: RunReader, results: ProbeResults) -> 
                 f"{name}-calls-{event.replace(' ', '-')}", f"Around an event: {event}", "probes",
                 "The same, with every episode's inferences counted from its own event: 0 is the last one "
                 "before it.",
-                position, partial(aligned_curves, calls, event, views[0], events),
+                position, partial(aligned_curves, calls, event, views[0], events), is_detail=True,
             )  # fmt: skip

@@ -207,5 +207,5 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
                 f"{one.stem}-final-positions", "Where the cube ended", "behaviour",
                 "The table from above, the robot below the picture. An episode counts as an answer if the middle "
                 "of the cube ends inside a dashed line; “unmoved” means that the cube was never carried anywhere.",
-                one.position, partial(final_positions, run),
+                one.position, partial(final_positions, run), is_detail=True,
             )  # fmt: skip

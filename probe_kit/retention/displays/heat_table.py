@@ -180,7 +180,7 @@ class RetentionTableDisplay(HeatTableDisplay):
     """Bounded retention and the published ratio by model and category; empty where the backbone knows nothing."""
 
     title = "Retention | published ratio"
-    note = "dash: no backbone signal, so the ratio has no meaning"
+    note = "dash: the backbone's signal is not shown, so the ratio has no meaning"
     parts = ("retention", "published")
     scale, digits = 1.0, 2
 
@@ -218,7 +218,10 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
         shown.append((RetentionTableDisplay, "retention", "Retention", "retention"))
     for display, name, title, subject in shown:
         note = display.notes.get(modes, display.note)
-        yield ReportFigure(name, title, subject, note, None, partial(_drawn, display, table), is_table=True)
+        yield ReportFigure(
+            name, title, subject, note, None, partial(_drawn, display, table), is_table=True,
+            is_detail=display is SideTableDisplay,
+        )  # fmt: skip
 
 
 def _drawn(

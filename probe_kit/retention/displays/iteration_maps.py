@@ -181,7 +181,7 @@ def draw_scale(
 ) -> None:
     """The colour bar of maps in one view; where chance differs between them it is named instead of numbered."""
     bar = figure.colorbar(drawn, ax=grid, extend="min", aspect=30, shrink=0.9, pad=0.01)
-    bar.set_label(f"held-out accuracy (%), view {displays[0].view}", fontsize=8)
+    bar.set_label("held-out accuracy (%)", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     bar.outline.set_visible(False)
     chances = {round(display.chance, 6) for display in displays}
@@ -212,5 +212,5 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
                         "The action is made in several iterations (flow-matching steps or action tokens). The "
                         "further a cell's colour is from that of chance, the better the answer can be read "
                         f"there. {DOTS}.",
-                        one.position, partial(iteration_maps, one.results, view, stream),
+                        one.position, partial(iteration_maps, one.results, view, stream), is_detail=True,
                     )  # fmt: skip

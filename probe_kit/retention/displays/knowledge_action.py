@@ -47,8 +47,8 @@ class GapPoint:
 class KnowledgeActionDisplay(Display):
     """Success rate against the best probe of a stream, a point per category and model.
 
-    On the diagonal the policy acts on what can be read; below it, it knows more than it does. Both axes run from 0
-    to 100 %, whatever is shown. modes: whether the shares are of policies, of answers or of both.
+    On the diagonal success equals what can be read; below it, more is decodable. Both axes run from 0 to
+    100 %, whatever is shown. modes: whether the shares are of policies, of answers or of both.
     """
 
     stream: str
@@ -131,7 +131,7 @@ def _draw_ground(axes: "Axes") -> None:
     axes.text(
         99,
         2,
-        "knows more than it does",
+        "more decodable than success shows",
         ha="right",
         fontsize=8,
         style="italic",
@@ -167,7 +167,7 @@ def _arms(value: float, limits: Limits) -> list[list[float]] | None:
     return [[max(0.0, 100 * (value - limits[0]))], [max(0.0, 100 * (limits[1] - value))]]
 
 
-_DOES: dict[Modes, str] = {"acts": "acts on it", "answers": "says it", "both": "acts on it or says it"}
+_DOES: dict[Modes, str] = {"acts": "succeeds", "answers": "says it", "both": "succeeds or says it"}
 PLACE = 2
 """Of its figures in the report."""
 
@@ -181,7 +181,7 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
         yield ReportFigure(
             "knowledge-action", f"Knowledge and {'answers' if answers else 'action'}", "retention",
             "Each point is one category: how well the answer can be read inside the model (across) and how often "
-            f"the model {_DOES[modes]} (up). Points far below the line are knowledge that does not reach the "
-            f"{'answer' if answers else 'action'}.",
+            f"the model {_DOES[modes]} (up). Far below the line, more can be read than "
+            f"{'the answers show' if answers else 'success shows'}.",
             None, lambda: figure_of(KnowledgeActionDisplay.from_table(source.table)),
         )  # fmt: skip

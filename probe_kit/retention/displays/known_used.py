@@ -1,4 +1,4 @@
-"""Answered, encoded, acted on: what becomes of the items of each category, as one bar of shares."""
+"""Answer, probe, success: what becomes of the items of each category, as one bar of shares."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -42,7 +42,7 @@ _LOOKS: Mapping[str, tuple[str, str]] = {
     "1-0": (VERMILION, "///"),
     "0-0": ("#D9D9D9", ""),
 }
-"""Colour and hatch of what is answered, encoded, acted on: acted on first, then what is not."""
+"""Colour and hatch by answer, probe and success: items with success first."""
 _LEAST = 6.0  # percent of a bar that has room for a number
 
 
@@ -50,7 +50,7 @@ _LEAST = 6.0  # percent of a bar that has room for a number
 class KnownUsedDisplay(Display):
     """A bar per category: shares of its items by what is known, encoded and used, in both layouts each.
 
-    counts: items by category and code, such as `101` for answered, not encoded, acted on (`1-1` without probes).
+    counts: items by category and code, such as `101` for answer right, probe not, success (`1-1` without probes).
     title: who was asked and who acted.
     """
 
@@ -91,9 +91,10 @@ class KnownUsedDisplay(Display):
 
 
 def words_of(code: str) -> str:
-    """`101` as "answered, not encoded, acted on"."""
-    parts = zip(("answered", "encoded", "acted on"), code, strict=True)
-    return ", ".join(name if mark == "1" else f"not {name}" for name, mark in parts if mark != "-")
+    """Return `101` as "answer right, probe not, success"."""
+    names = (("answer right", "answer not"), ("probe right", "probe not"), ("success", "no success"))
+    parts = zip(names, code, strict=True)
+    return ", ".join(right if mark == "1" else wrong for (right, wrong), mark in parts if mark != "-")
 
 
 def _draw_bar(axes: "Axes", place: int, counts: Mapping[str, int]) -> None:
@@ -125,9 +126,9 @@ def known_used_figures(joins: Sequence[KnownUsedTable]) -> Iterator[ReportFigure
     """A figure per pair of a VLM run and a policy run."""
     for number, joined in enumerate(joins, 1):
         yield ReportFigure(
-            f"known-used-{number}", "Answered, encoded, acted on", "join",
-            "Every question once: does the VLM answer right, does a probe read it in the policy, and does "
-            "the action follow, each in both layouts. What is answered and encoded, but not acted on, is lost.",
+            f"known-used-{number}", "Answer, probe, success", "join",
+            "Every question once: does the VLM answer right, is the probe of the policy right, and does the cube "
+            "end right, each in both layouts. An item with both and without success may be lost on the way.",
             None, partial(_known_used, joined),
         )  # fmt: skip
 

@@ -165,7 +165,7 @@ def _complete(figure: "Figure", grid: "list[list[Axes]]", displays: Sequence[Lay
         display.plot_beside(axes)
         for unused in axes[len(display.streams) :]:
             unused.set_visible(False)
-    figure.supylabel(f"held-out accuracy (%), view {displays[0].view}", fontsize=9)
+    figure.supylabel("held-out accuracy (%)", fontsize=9)
     caption(figure, displays[0].certificate)
     handles: dict[str, Artist] = {}
     for ax in grid[0]:
@@ -295,4 +295,5 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
                 "the best layer of permuted labels. The grey band is what no knowledge looks like; a caret "
                 "marks the best layer, or all that tie.",
                 one.position, partial(layer_curve, one.results, view, source.table.iterations),
+                is_detail=view != views[0],
             )  # fmt: skip

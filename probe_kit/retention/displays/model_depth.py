@@ -135,7 +135,7 @@ def model_depths(
     for axes in grid:
         handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     legend_above(figure, list(handles.values()))
-    figure.supylabel("above chance (points, mean of categories)", fontsize=8)
+    figure.supylabel("above chance\n(points, mean of categories)", fontsize=8)
     caption(figure, *(certificate for display in displays for certificate in display.certificates))
     return figure
 
@@ -187,5 +187,5 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
             "model-depths", "Models by depth", "probes",
             "How far above chance the answer can be read, against depth as a fraction, so that models with "
             "different numbers of layers can be compared.",
-            None, partial(model_depths, results, iterations=source.table.iterations, names=names),
+            None, partial(model_depths, results, iterations=source.table.iterations, names=names), is_detail=True,
         )  # fmt: skip

@@ -121,5 +121,5 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
             "What counts as an answer decides the success rate. An upright mark is what a policy that does "
             "nothing would score by that rule: where there is one, the untouched cube already counts as put on a "
             "picture.",
-            None, lambda: figure_of(OutcomeRulesDisplay.from_runs(runs)),
+            None, lambda: figure_of(OutcomeRulesDisplay.from_runs(runs)), is_detail=True,
         )  # fmt: skip

@@ -102,7 +102,7 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
                 "Every question is asked twice, with the two images swapped. Knowing the answer means right "
                 "both times; always choosing one side means right once. Bold p: more items are right twice than "
                 "wrong twice, beyond luck.",
-                one.position, partial(_drawn, run),
+                one.position, partial(_drawn, run), is_detail=True,
             )  # fmt: skip
 
 

@@ -143,4 +143,5 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
                     "The same probes on the mean of one kind of token at a time.",
                     one.position,
                     partial(role_curves, one.results, str(stream), iterations=source.table.iterations),
+                    is_detail=True,
                 )  # fmt: skip

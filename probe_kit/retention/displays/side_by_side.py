@@ -82,7 +82,7 @@ def curves_side_by_side(
         handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     order = {name: at for at, name in enumerate(["chance", *names])}
     legend_above(figure, [*(handles[n] for n in sorted(handles, key=order.__getitem__)), *significance_handles()])
-    figure.supylabel(f"held-out accuracy (%), view {view}", fontsize=9)
+    figure.supylabel("held-out accuracy (%)", fontsize=9)
     caption(figure, *(ProvenanceLine.of_results(one, view) for _, one in known))
     return figure
 
@@ -182,6 +182,7 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
             f"on one scale; of several iterations the best of every layer. {ONLY_FILLED}. "
             "The table says whether two runs differ.",
             None, partial(curves_side_by_side, known, called, view, source.table.iterations),
+            is_detail=view != views[0],
         )  # fmt: skip
         if sum(has_maps(one, view) for one in known) > 1:
             yield ReportFigure(
@@ -189,5 +190,5 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
                 in_view("Layer × iteration side by side", view, views), "probes",
                 "Where and when the answer can be read while the action is made, a column per run. Colours "
                 f"run from chance to 100 % in every map. {DOTS}.",
-                None, partial(maps_side_by_side, known, called, view),
+                None, partial(maps_side_by_side, known, called, view), is_detail=True,
             )  # fmt: skip

@@ -6,22 +6,16 @@ signal is not shown. Here nothing is left out and nothing is corrected. Source: 
 arXiv 2606.19297, sections 4.4 (Δ and regimes) and 4.5 (retention).
 """
 
-import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from probe_kit._system.csv_text import csv_of_frame
-from probe_kit._system.markdown_text import markdown_safe
 from probe_kit.retention.behaviour.success_rate import Regime, normalised_score, regime
 from probe_kit.retention.columns.text import NOT_ACTED, model_name, number, percent
 from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.formats.numbers_table import NumbersTable
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.statistics.estimates.balanced import CHANCE
-
-if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import ResponsiveTable
 
 EPSILON = 1e-6
 """The ε of the paper's denominator. The paper prints no value: this one only keeps the ratio finite."""
@@ -46,50 +40,11 @@ def paper_retention(action: float, backbone: float) -> float:
     return (action - CHANCE) / (backbone - CHANCE + EPSILON)
 
 
-@dataclass(frozen=True)
-class PaperTable:
-    """The paper's numbers of several runs.
-
-    text: the table that people read. numbers: one object per row, shares in [0, 1]. Its keys are `run`, `model`,
-    `view`, `category` (`mean` for the category mean), `episodes`, `sr`, `margin` (Δ over episodes), `regime`,
-    `normalised_score` (of means), `backbone`, `action` (maxima over sites) and `retention`; None where a run lacks
-    what a number needs.
-    """
-
-    text: TextTable
-    numbers: tuple[dict[str, Any], ...]
-
-    def to_json(self) -> str:
-        """Return the numbers as a JSON list of objects."""
-        return json.dumps(self.numbers, indent=1, ensure_ascii=False)
-
-    def to_csv(self) -> str:
-        """Return the numbers as comma-separated values with a header."""
-        import pandas as pd
-
-        return csv_of_frame(pd.DataFrame(self.numbers))
-
-    def to_markdown(self) -> str:
-        """Return the table in Markdown, with its note below."""
-        from probe_kit.retention.formats.markdown import markdown_table
-
-        return f"{markdown_table(self.text)}\n{markdown_safe(self.text.note)}."
-
-    def to_latex(self) -> str:
-        """Return the table as a LaTeX `table` environment."""
-        from probe_kit.retention.formats.latex import latex_table
-
-        return latex_table(self.text)
-
-    def to_rich(self) -> "ResponsiveTable":
-        """Return the table for a rich console."""
-        from probe_kit.retention.formats.terminal import responsive_table
-
-        return responsive_table(self.text)
-
-
-def paper_table(rows: Sequence[RetentionRow], means: Sequence[RetentionRow], outcome_rule: str) -> PaperTable:
+def paper_table(rows: Sequence[RetentionRow], means: Sequence[RetentionRow], outcome_rule: str) -> NumbersTable:
     """Return the paper's numbers, category by category and as a mean.
+
+    Keys are `run`, `model`, `view`, `category` (`mean` for the category mean), `episodes`, `sr`, `margin` (Δ over
+    episodes), `regime`, `normalised_score` (of means), `backbone`, `action` (maxima over sites) and `retention`.
 
     rows, means: of a retention table, one mean per run and view. outcome_rule: how episodes were judged, in words.
     """
@@ -98,7 +53,7 @@ def paper_table(rows: Sequence[RetentionRow], means: Sequence[RetentionRow], out
         of_run = [row for row in rows if (*row.key, row.view) == (*mean.key, mean.view)]
         of_categories = [_category_numbers(row) for row in of_run]
         numbers += [*of_categories, _mean_numbers(mean, of_categories)]
-    return PaperTable(_text(numbers, outcome_rule), tuple(numbers))
+    return NumbersTable(_text(numbers, outcome_rule), tuple(numbers))
 
 
 def _category_numbers(row: RetentionRow) -> dict[str, Any]:

@@ -1,10 +1,12 @@
-"""The retention tables in LaTeX: booktabs rules, and five heat colours."""
+"""The retention tables in LaTeX: booktabs rules, five heat colours, and no tabular wider than its line."""
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from itertools import accumulate, pairwise
 
-from probe_kit.retention.columns.columns import Column
+from probe_kit.retention.choices import Section
+from probe_kit.retention.columns.columns import Column, ColumnGroup
 from probe_kit.retention.columns.lines import TableRow
 from probe_kit.retention.columns.row_names import named_cells, row_headings, titled
 from probe_kit.retention.columns.summary import summarise_runs, summary_table
@@ -47,46 +49,72 @@ def latex(
     notes: Sequence[str] = (),
     further: Sequence[TextTable] = (),
     unpaired: Sequence[str] = (),
+    details: Collection[Section] = (),
 ) -> str:
-    """Complete `table` environments: success rates with differences between runs, retention, then controls.
+    """Return complete `table` environments: the summary, then the tables of some sections, then `further` ones.
 
-    The summary and `further` tables stand behind these. notes: sentences for the author, as comments. unpaired:
-    why runs have no differences, a part of the caption. Needs the packages booktabs and xcolor with its option
-    `table`.
+    notes: sentences for the author, as comments. unpaired: why runs have no differences, comments too, and a part
+    of the caption of success rates. Needs the packages booktabs and graphicx, with details also xcolor with its
+    option `table`.
     """
-    colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT]
-    parts = ["% needs: \\usepackage{booktabs} \\usepackage[table]{xcolor}", *colours]
-    found = summarise_runs(rows)
-    whole = summary_table(found, differences)
-    further = [whole, *further]
-    parts += [_table(table.without_details()) for table in tables_of(rows, differences, unpaired)]
-    parts += map(latex_table, further)
-    return "\n".join([*parts, *(f"% {note}" for note in notes)])
+    chosen = [own for table in tables_of(rows, differences, unpaired) if (own := table.only(details)) is not None]
+    needs = r"% needs: \usepackage{booktabs} \usepackage{graphicx}" + r" \usepackage[table]{xcolor}" * bool(chosen)
+    colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT] if chosen else []
+    texts = [
+        latex_table(summary_table(summarise_runs(rows), differences)),
+        *(_table(table.without_details()) for table in chosen),
+        *map(latex_table, further),
+    ]
+    return "\n".join([needs, *colours, *_with_own_labels(texts), *(f"% {note}" for note in (*unpaired, *notes))])
+
+
+def _with_own_labels(texts: Sequence[str]) -> list[str]:
+    """Return the tables, a label that comes again with a number behind it."""
+    seen: dict[str, int] = {}
+    numbered = []
+    for text in texts:
+        (label,) = re.findall(r"\\label\{(.*)\}", text)
+        seen[label] = seen.get(label, 0) + 1
+        again = f"-{seen[label]}" if seen[label] > 1 else ""
+        numbered.append(text.replace(rf"\label{{{label}}}", rf"\label{{{label}{again}}}"))
+    return numbered
 
 
 def _table(table: Table) -> str:
-    columns = (*row_headings(table), *(column.heading for column in table.columns))
+    """A tabular per group of columns below each other, each with the names of its rows."""
+    tabulars = [_tabular_of_part(table, part) for part in table.parts]
+    return _in_table(" ".join([f"{titled(table)}.", *table.captions]), table.title, tabulars)
+
+
+def _tabular_of_part(table: Table, part: ColumnGroup) -> list[str]:
+    names = row_headings(table)
+    columns = (*names, *(column.heading for column in part.columns))
     lines: list[str] = []
     for before, row in pairwise([None, *table.rows]):
         assert row is not None
         if before is not None and (before.category == MEAN) != (row.category == MEAN):
             lines.append(r"\midrule")
-        names = map(escape, named_cells(table, row))
-        lines.append(_line([*names, *(_cell(column, row) for column in table.columns)]))
-    return _environment(" ".join([f"{titled(table)}.", *table.captions]), columns, lines)
+        cells = map(escape, named_cells(table, row))
+        lines.append(_line([*cells, *(_cell(column, row) for column in part.columns)]))
+    texts = [[cell_text(column, row) for row in table.rows] for column in part.columns]
+    return _tabular(columns, lines, "l" * len(names) + "".join(map(_alignment, texts)))
 
 
 def latex_table(table: TextTable) -> str:
-    """A table of text as a `table` environment; needs the package booktabs.
+    """A table of text as a `table` environment; needs the packages booktabs and graphicx.
 
     Its heads span their columns. A table of more than MOST_COLUMNS is divided between heads.
     """
-    return _in_table(f"{table.title} ({table.note})", [_tabular_of(part) for part in _parts(table)])
+    tabulars = [_tabular_of(part) for part in _parts(table)]
+    return _in_table(f"{table.title} ({table.note})", table.title.partition(":")[0], tabulars)
 
 
 def _tabular_of(table: TextTable) -> list[str]:
     lines = [_line(map(_marked, cells)) for cells in table.cells]
-    return _tabular(table.columns, lines, _heads(table.heads))
+    names = "l" * min(table.names, len(table.columns))
+    numbers = "".join(map(_alignment, [*zip(*table.cells, strict=True)][len(names) :])) if table.cells else ""
+    alignment = f"{names}{numbers}".ljust(len(table.columns), "l")
+    return _tabular(table.columns, lines, alignment, _heads(table.heads))
 
 
 def _heads(heads: Sequence[tuple[str, int]]) -> list[str]:
@@ -124,25 +152,36 @@ def _part(table: TextTable, first: tuple[str, int], heads: Sequence[tuple[int, t
     return replace(table, columns=columns, cells=tuple(cells), heads=shown)
 
 
-def _environment(caption: str, columns: Sequence[str], lines: Sequence[str]) -> str:
-    return _in_table(caption, [_tabular(columns, lines)])
-
-
-def _in_table(caption: str, tabulars: Sequence[Sequence[str]]) -> str:
+def _in_table(caption: str, title: str, tabulars: Sequence[Sequence[str]]) -> str:
     body = [line for at, tabular in enumerate(tabulars) for line in ([r"\par\medskip"] if at else []) + [*tabular]]
-    return "\n".join([r"\begin{table}", rf"\caption{{{escape(caption)}}}", *body, r"\end{table}", ""])
+    label = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-") or "table"
+    named = [rf"\caption{{{escape(caption)}}}", rf"\label{{tab:{label}}}"]
+    return "\n".join([r"\begin{table}", r"\centering", *named, *body, r"\end{table}", ""])
 
 
-def _tabular(columns: Sequence[str], lines: Sequence[str], heads: Sequence[str] = ()) -> list[str]:
+_NUMBER = re.compile(r"[-+−]?\d|< \d|n/a|–|$")
+"""The beginning of a cell of numbers."""
+_FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
+"""Before a tabular: one that is wider than its line becomes as wide as it."""
+
+
+def _alignment(cells: Iterable[str]) -> str:
+    """Return `r` for a column of numbers, else `l`."""
+    texts = list(cells)
+    return "r" if any(texts) and all(_NUMBER.match(text) for text in texts) else "l"
+
+
+def _tabular(columns: Sequence[str], lines: Sequence[str], alignment: str, heads: Sequence[str] = ()) -> list[str]:
     return [
-        rf"\begin{{tabular}}{{{'l' * len(columns)}}}",
+        _FITTED,
+        rf"\begin{{tabular}}{{{alignment}}}",
         r"\toprule",
         *heads,
         _line(map(_heading, columns)),
         r"\midrule",
         *lines,
         r"\bottomrule",
-        r"\end{tabular}",
+        r"\end{tabular}}",
     ]
 
 

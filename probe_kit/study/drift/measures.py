@@ -59,7 +59,7 @@ class SiteDrift:
 class CategoryDrift:
     """One category of two runs; `before` and `after` are their rows of the retention table.
 
-    difference: before minus after. sites: of the backbone, empty where frames or words differ; best: the position
+    difference: after minus before. sites: of the backbone, empty where frames or words differ; best: the position
     of the one at which the first run's own probes are best. why_alone: why nothing is transferred, empty if it is.
     """
 
@@ -84,8 +84,8 @@ class CategoryDrift:
             return "not shown in either"
         low, high = (self.difference and self.difference.backbone_ci) or (None, None)
         if here:
-            return "forgotten" if low is not None and low > 0 else "not clear"
-        return "learned" if high is not None and high < 0 else "not clear"
+            return "forgotten" if high is not None and high < 0 else "not clear"
+        return "learned" if low is not None and low > 0 else "not clear"
 
     @property
     def p_transfer(self) -> float:
@@ -113,7 +113,7 @@ def measure_drift(
         for run, results in zip((before, after), probes, strict=True)
     ]
     places = str(before.location), str(after.location)
-    runs, pairs = ([before, after], [places]) if places[0] != places[1] else ([before], [])
+    runs, pairs = ([before, after], [places[::-1]]) if places[0] != places[1] else ([before], [])
     keys = [side.results.key for side in sides[: len(runs)]]
     table = retention_table(runs, [view], labels=labels, pairs=pairs, keys=keys)
     rows = {(row.run.location, row.category): row for row in table.rows if row.view == view}

@@ -134,9 +134,9 @@ def vlm_vla_table(differences: Sequence[VlmVlaDifference]) -> NamedTable:
 
 
 def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
-    """Items that a VLM answers right, a probe decodes and a policy acts on right, each in both layouts.
+    """Return items with the VLM's answer, the probe and success right, each in both layouts.
 
-    Encoded items are counted where probes have signal.
+    Items with the probe right are counted where the answer is shown.
     """
     shown = [(join, row) for join in joins for row in join.rows]
     cells = tuple(
@@ -145,7 +145,7 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
             row.category if row.category == OVERALL else category_of(row.category).title,
             str(row.n_items),
             _count(row.answered_correctly),
-            "no signal" if row.has_signal is False else _count(_encoded(join, row)),
+            "not shown" if row.has_signal is False else _count(_encoded(join, row)),
             _count(row.acted_correctly),
             _count(row.answered_and_encoded),
             with_limits(percent(row.share_not_acted_on), row.share_not_acted_on_ci or (None, None), percent),
@@ -170,11 +170,20 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
         for join, row in shown
     ]
     note = "items right in both layouts, which guessing manages in 25 %; lost: share of answered and encoded ones"
-    columns = ("systems", "category", "items", "answered", "encoded", "acted on", "answered and encoded", "lost %")
+    columns = (
+        "systems",
+        "category",
+        "items",
+        "answer right",
+        "probe right",
+        "success",
+        "answer and probe right",
+        "of these without success %",
+    )
     made = NamedTable(TextTable("Stages", note, columns, cells, names=2), tuple(numbers))
     notes = [text for join in joins for text in join.notes if text not in without_signal(join.rows)]
     dull = any(row.has_signal is False for _, row in shown)
-    said = ["no signal: probes are not shown to exceed chance and every control"] if dull else []
+    said = ["not shown: probes are not shown to exceed chance and every control"] if dull else []
     return made.with_note([*said, *dict.fromkeys(text.removesuffix(".") for text in notes)])
 
 

@@ -17,7 +17,7 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.student import student_interval, unbounded_student_interval
 from probe_kit.train.choices import Task
 from probe_kit.train.labels.label_settings import LabelSettings
-from probe_kit.train.labels.task_scores import fold_spearman
+from probe_kit.train.labels.task_scores import balanced_scores, fold_spearman
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -86,7 +86,7 @@ class LabelControl:
 
     score, ci: its metric with a 95 % interval over groups. chance, p: by the label permutations, None without any.
     stream: whose width `random-features` have, or whose best site that of `untrained` is; empty for others.
-    view: of `untrained`. by_step: mean score of the samples at each of `LabelResults.steps`, in order.
+    view: of `untrained`. by_step: metric at each of `LabelResults.steps`, in order.
     """
 
     name: str
@@ -195,9 +195,26 @@ class LabelResults:
         """(W,) the different places, in order."""
         return np.unique(self.places)
 
+    def step_scores(self, scores: Matrix) -> Matrix:
+        """Return (n,) scores whose mean over the samples of a step is the metric at that step.
+
+        scores: (n,) as in `LabelCurve`. Classes are balanced within each step, over those that occur there.
+        Weights of the whole window would lift a step of rare classes above 1. Scores of a continuous label stay.
+        """
+        if not self.classes:
+            return scores
+        found: Matrix = np.empty(scores.size)
+        for step in self.steps:
+            at_step = self.places == step
+            truth = self.labels[at_step][:, None]
+            right = (scores[at_step] > 0)[:, None]
+            found[at_step] = balanced_scores(np.where(right, truth, truth + 1), truth)[:, 0]
+        return found
+
     def by_step(self, scores: Matrix) -> Matrix:
-        """(W,) mean of (n,) scores at each of the steps."""
-        found: Matrix = np.array([scores[self.places == step].mean() for step in self.steps])
+        """Return the (W,) metric of (n,) scores at each of the steps, see `step_scores`."""
+        balanced = self.step_scores(scores)
+        found: Matrix = np.array([balanced[self.places == step].mean() for step in self.steps])
         return found
 
     @property

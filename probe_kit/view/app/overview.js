@@ -1,4 +1,4 @@
-// Overview: the rows of the table, what is in the network and not acted on, and the surest of those episodes.
+// Overview: the rows of the table, episodes with the probe right and the arm wrong, and the surest of those episodes.
 "use strict";
 const WORTH = 6;
 function Interval({ cell, chance, kind }) {

@@ -60,8 +60,8 @@ function App() {
       ${live && html`<span class="live">${grown && html`<i></i>`}${live}</span>`}<span class="sr" role="status">${spoken}</span>
       ${run.random_weights && html`<span class="random">RANDOM WEIGHTS</span>`}
       <nav aria-label="Views">${Object.entries(VIEWS).map(([view, words]) => html`<a href=${link({ view })} aria-current=${view === place.view ? "page" : null}>${view === "map" ? html`<span class="wide-only">${words}</span><span class="narrow-only">Map</span>` : words}</a>`)}</nav>
-      <button type="button" class="plain" onClick=${toggleTheme} aria-label="Light or dark">◐</button><button type="button" class="plain" onClick=${() => help.current.showModal()} aria-label="Keys">?</button></header>
+      <button type="button" class="plain" onClick=${toggleTheme} aria-label="Light or dark">◐</button><button type="button" class="plain" onClick=${() => help.current.showModal()} aria-label="Keys and words">?</button></header>
     <main id="main">${run.probes_of && html`<p class="remark">This run has no probes of its own. Log-odds are those of the probes of “<${Text}>${run.probes_of}<//>”, and accuracies are of that run.</p>`}${list.length ? html`<${View} key=${`${run.key} ${place.view}`} run=${run} runs=${index.runs} list=${list} place=${place} />` : html`<p class="empty">No episode is committed yet.</p>`}</main>
-    <dialog ref=${help} onClick=${(e) => e.target === e.currentTarget && e.currentTarget.close()}><h2>Keys</h2><dl class="keys">${HELP.map(([keys, words]) => html`<dt><kbd>${keys}</kbd></dt><dd>${words}</dd>`)}</dl><form method="dialog"><button>Close</button></form></dialog>`;
+    <dialog ref=${help} onClick=${(e) => e.target === e.currentTarget && e.currentTarget.close()}><h2>Keys</h2><dl class="keys">${HELP.map(([keys, words]) => html`<dt><kbd>${keys}</kbd></dt><dd>${words}</dd>`)}</dl><h2>Words</h2><dl class="words">${(index.words ?? []).map(([word, meaning]) => html`<dt>${word}</dt><dd>${meaning}</dd>`)}</dl><form method="dialog"><button>Close</button></form></dialog>`;
 }
 render(html`<${App} />`, document.getElementById("app"));

@@ -36,7 +36,7 @@ def every_form(table: RetentionTable) -> dict[str, str]:
     return {
         "terminal": console.file.getvalue(),  # type: ignore[attr-defined]
         "markdown": table.to_markdown(),
-        "latex": table.to_latex(),
+        "latex": table.to_latex("all"),
         "page": page.replace("\u00a0", " "),
     }
 

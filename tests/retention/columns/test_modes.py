@@ -47,7 +47,7 @@ def formats(runs: list[SaidRun]) -> Mapping[str, str]:
     return {
         "terminal": console.export_text(),
         "markdown": table.to_markdown(),
-        "latex": table.to_latex(),
+        "latex": table.to_latex("all"),
         "notebook": table._repr_html_(),
         "report": text_of(report_html(runs, table)),
         "captions": "\n".join(f"{one.title}: {one.reading}" for one in exhibits),

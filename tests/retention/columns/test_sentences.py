@@ -159,13 +159,13 @@ def test_use_is_concluded_from_a_swap_and_knowledge_never_beside_an_interval_tha
         assert ("The answer is used in the first chunk, against the correct picture" in text) == (
             swapped == "reverses"
         ), text
-        if "The policy acts on the answer" in text:
+        if "the policy succeeds;" in text.lower():
             assert (rate_, swapped) == ("knowledge", "no swap"), text
-        assert "probes did not find it" not in text or backbone != "not probed", text
-        is_untested = "hether it is used was not tested" in text
+        assert "in the backbone" not in text or backbone != "not probed", text
+        is_untested = "hether the answer is used was not tested" in text
         assert is_untested <= (swapped == "no swap"), text
         if swapped == "no swap" and rate_ != "none":
-            assert is_untested or verdict(row) in ("absent", "not shown"), text
+            assert is_untested or verdict(row).split(",")[0] in ("absent", "not shown"), text
 
 
 def test_a_rate_that_is_no_knowledge_beside_an_interval_without_one_half_says_by_which_margin() -> None:
@@ -214,8 +214,8 @@ def test_absence_is_said_of_a_bounded_backbone_only_and_more_items_are_asked_for
             ("guessing", "at chance", "absent", "no swap"),
             "(24 items): the backbone is not shown to hold the answer (52 %; its best site could have up to 78 "
             "%); the action expert does not hold it (50 %; its best site has at most 62 %); the cube ends on the "
-            "correct picture in 54 %, 34 to 74. Not shown in the backbone; not shown that the policy acts on "
-            "the answer: more items would tell.",
+            "correct picture in 54 %, 34 to 74. Not shown in the backbone; success is not "
+            "shown: more items would tell.",
         ),
     ],
 )
@@ -224,28 +224,29 @@ def test_a_sentence_says_numbers_uncertainty_items_and_what_follows(parts: Any, 
 
 
 CONCLUSIONS = """
-knowledge | shown | no swap | acted on
-The policy acts on the answer; whether it is used was not tested: run `probe-kit intervene`.
-
-guessing | shown | no swap | encoded, not acted on
-Shown in the backbone; not shown that the policy acts on the answer; whether it is used was not tested: run
-`probe-kit intervene`.
-
-wrong | shown | no swap | encoded, not acted on
-Shown in the backbone; the policy is right less often than guessing; whether it is used was not tested: run
-`probe-kit intervene`.
-
-knowledge | at chance | no swap | acted on, not found
-The policy acts on the answer; the probes did not find it; whether it is used was not tested: run `probe-kit
+knowledge | shown | no swap | shown, success
+Shown in the backbone; the policy succeeds; whether the answer is used was not tested: run `probe-kit
 intervene`.
 
-guessing | absent | no swap | absent
-Absent from the backbone; not shown that the policy acts on the answer: more items would tell.
+guessing | shown | no swap | shown, success not shown
+Shown in the backbone; success is not shown; whether the answer is used was not tested: run
+`probe-kit intervene`.
 
-misses | absent | no swap | absent
+wrong | shown | no swap | shown, failure
+Shown in the backbone; the policy is right less often than guessing; whether the answer is used was not tested: run
+`probe-kit intervene`.
+
+knowledge | at chance | no swap | not shown, success
+The policy succeeds; the answer is not shown in the backbone; whether the answer is used was not tested: run
+`probe-kit intervene`.
+
+guessing | absent | no swap | absent
+Absent from the backbone; success is not shown: more items would tell.
+
+misses | absent | no swap | absent, failure
 Absent from the backbone; the policy is right less often than guessing.
 
-misses | at chance | no swap | not shown
+misses | at chance | no swap | not shown, failure
 The policy is right less often than guessing; not shown in the backbone: more items would tell.
 
 none | absent | no swap | absent
@@ -257,20 +258,20 @@ Not shown in the backbone: more items would tell.
 none | no permutations | no swap | not shown
 Not shown in the backbone: train probes with permutations.
 
-none | shown | no swap | encoded
+none | shown | no swap | shown
 Shown in the backbone.
 
-knowledge | not probed | no swap | acted on
-The policy acts on the answer; whether it is used was not tested: run `probe-kit intervene`. The backbone was
+knowledge | not probed | no swap | success
+The policy succeeds; whether the answer is used was not tested: run `probe-kit intervene`. The backbone was
 not probed: run `probe-kit train`.
 
-misses | not probed | no swap | not shown
-The policy is right less often than guessing; whether it is used was not tested: run `probe-kit intervene`. The
-backbone was not probed: run `probe-kit train`.
+misses | not probed | no swap | failure
+The policy is right less often than guessing; whether the answer is used was not tested: run `probe-kit
+intervene`. The backbone was not probed: run `probe-kit train`.
 
-guessing | not probed | no swap | not shown
-Not shown that the policy acts on the answer; whether it is used was not tested: run `probe-kit intervene`. The
-backbone was not probed: run `probe-kit train`.
+guessing | not probed | no swap | success not shown
+Success is not shown; whether the answer is used was not tested: run `probe-kit
+intervene`. The backbone was not probed: run `probe-kit train`.
 
 none | not probed | no swap | not shown
 The backbone was not probed: run `probe-kit train`.

@@ -198,7 +198,7 @@ def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:
     color, shape = found.sentences
     assert color.endswith("the model did not act. Shown in the backbone.")
     assert shape.endswith("the model did not act. Not shown in the backbone: more items would tell.")
-    assert "acted on" not in " ".join(cell for line in summary_table([found]).cells for cell in line)
+    assert "success" not in " ".join(cell for line in summary_table([found]).cells for cell in line)
 
 
 def test_a_category_goes_by_its_title() -> None:

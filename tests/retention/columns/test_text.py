@@ -38,7 +38,7 @@ def test_a_baseline_above_chance_is_red_in_every_format(table: RetentionTable) -
     assert "\x1b[1;31m75.0 above chance" in printed
     assert "31m51.0" not in printed
     assert "🔴 **75.0 above chance**" in table.to_markdown()
-    assert r"\textcolor{red}{75.0 above chance}" in table.to_latex()
+    assert r"\textcolor{red}{75.0 above chance}" in table.to_latex("all")
 
 
 def test_json_has_controls_by_name_and_csv_a_column_each(table: RetentionTable) -> None:
@@ -57,4 +57,4 @@ def test_json_has_controls_by_name_and_csv_a_column_each(table: RetentionTable) 
 
 def test_controls_take_no_room_where_there_are_none(probed_run: Callable[..., ArrayRun]) -> None:
     bare = retention_table([probed_run({"color": ([0.9], [[0.7]])})])
-    assert "Controls" not in bare.to_markdown() + bare.to_latex()
+    assert "Controls" not in bare.to_markdown() + bare.to_latex("all")

@@ -21,14 +21,14 @@ NONE = ([0.5, 0.55, 0.5], [[0.58, 0.5]])
 def table(probed_run: ProbedRun) -> RetentionTable:
     vqa = probed_run({"color": SIGNAL, "shape": SIGNAL}, "vqa")
     plain = probed_run({"color": WEAK, "shape": NONE}, "plain")
-    return retention_table({"with VQA": [vqa], "without": [plain]})
+    return retention_table({"without": [plain], "with VQA": [vqa]})
 
 
-def test_a_difference_is_the_first_group_minus_the_second(table: RetentionTable) -> None:
+def test_a_difference_is_the_later_group_minus_the_earlier(table: RetentionTable) -> None:
     color, shape, mean = table.differences
     assert [row.category for row in table.differences] == ["color", "shape", "mean"]
     assert (color.group, color.minus, color.view) == ("with VQA", "without", "mean")
-    one, _, other, weaker = table.rows
+    other, weaker, one, _ = table.rows
     assert color.backbone == pytest.approx(0.9 - 0.8)
     assert color.action == pytest.approx(one.action.score - other.action.score)  # type: ignore[operator]
     assert color.retention == pytest.approx(one.retention.value - other.retention.value)  # type: ignore[operator]
@@ -43,7 +43,7 @@ def test_retention_is_compared_only_where_both_groups_have_it(table: RetentionTa
     color, shape, mean = table.differences
     assert (shape.retention, shape.retention_ci) == (None, None)
     assert color.retention is not None
-    first, second = (row.retention.value for row in table.means)
+    second, first = (row.retention.value for row in table.means)
     assert mean.retention == pytest.approx(first - second)  # type: ignore[operator]
     assert mean.retention_ci is not None
     assert mean.retention_ci[0] < mean.retention < mean.retention_ci[1]  # type: ignore[operator]
@@ -74,7 +74,7 @@ def test_a_group_is_the_mean_of_its_runs(probed_run: ProbedRun) -> None:
     strong, weak = probed_run({"color": SIGNAL}, "strong"), probed_run({"color": WEAK}, "weak")
     alone = probed_run({"color": SIGNAL}, "alone")
     table = retention_table({"both": [strong, weak], "strong": [alone]})
-    assert table.differences[0].backbone == pytest.approx((0.9 + 0.8) / 2 - 0.9)
+    assert table.differences[0].backbone == pytest.approx(0.9 - (0.9 + 0.8) / 2)
     assert table.differences[0].paired
     assert [(mean.group, mean.run.model) for mean in table.means] == [
         ("both", "strong"), ("both", "weak"), ("strong", "alone"),
@@ -84,11 +84,11 @@ def test_a_group_is_the_mean_of_its_runs(probed_run: ProbedRun) -> None:
 
 def test_every_format_shows_groups_and_differences(table: RetentionTable) -> None:
     content = json.loads(table.to_json())
-    assert [row["group"] for row in content["rows"]] == ["with VQA"] * 3 + ["without"] * 3
+    assert [row["group"] for row in content["rows"]] == ["without"] * 3 + ["with VQA"] * 3
     assert content["differences"][0]["sr_ci"][0] < 0
     assert "| with VQA − without | color | +0.0 [" in table.to_markdown()
     assert "| with VQA: vqa |" in table.to_markdown()
-    assert "with VQA $-$ without & mean & 0 & color" in table.to_latex()
+    assert "with VQA $-$ without & mean & 0 & color" in table.to_latex("all")
     frame = table.differences_frame()
     assert frame["backbone"].tolist() == [row.backbone for row in table.differences]
     assert frame["backbone"][0] == pytest.approx(0.1)
@@ -120,8 +120,8 @@ def test_groups_of_models_have_a_p_over_models_and_the_least_that_so_few_allow(p
         assert (found.n, found.n_minus) == (3, 3)
         assert found.p == pytest.approx(0.1), "the most extreme of 20 ways, either way round"
         assert found.smallest_p == pytest.approx(0.1)
-        assert found.difference == pytest.approx(np.mean(values[0]) - np.mean(values[1]))
-        welch = stats.ttest_ind(*values, equal_var=False).confidence_interval()
+        assert found.difference == pytest.approx(np.mean(values[1]) - np.mean(values[0]))
+        welch = stats.ttest_ind(*values[::-1], equal_var=False).confidence_interval()
         assert found.ci == pytest.approx((welch.low, welch.high))
     assert color.sr_models is not None
     assert (color.sr_models.p, color.sr_models.difference) == (1, 0), "all did the same"
@@ -134,6 +134,6 @@ def test_a_single_model_against_another_has_no_p_over_models(table: RetentionTab
 def test_a_group_with_a_model_without_probes_has_no_p_of_retention(probed_run: ProbedRun, tmp_path: Path) -> None:
     one, other = (probed_run({"color": SIGNAL}, name) for name in ("one", "other"))
     bare = ArrayRun(tmp_path / "bare", "bare", one.suite, one.episodes, {})
-    rows = retention_table({"a": [one, other], "b": [bare]}).differences
+    rows = retention_table({"b": [bare], "a": [one, other]}).differences
     assert all(row.retention is None and row.retention_models is None for row in rows)
     assert all(row.sr_models is not None and row.sr_models.n_minus == 1 for row in rows)

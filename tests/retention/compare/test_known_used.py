@@ -213,8 +213,8 @@ def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRu
     console = Console(width=150, record=True, file=StringIO())
     console.print(rich_known_used(found))
     text = console.export_text()
-    titles = ("Answered, encoded, acted on", "of these not acted on", "Single episodes", "answered − acted")
-    for words in (*titles, "V P a"):
+    titles = ("Answer, probe, success", "of these without success", "Single episodes", "answer − success")
+    for words in (*titles, "V P s"):
         assert words in text
     frame = found.to_frame()
     assert frame.groupby("category")["items"].sum().to_dict() == {"color": 14, "shape": 12, "all": 26}

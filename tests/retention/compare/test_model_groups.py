@@ -36,7 +36,7 @@ def test_three_models_against_three_cannot_be_below_one_tenth(table: RetentionTa
 def test_every_format_shows_the_p_over_models_and_the_least_possible_one(table: RetentionTable) -> None:
     console = Console(width=400, file=StringIO())
     console.print(table.to_rich("all"))
-    for text in (console.file.getvalue(), table.to_markdown(), table.to_latex(), table._repr_html_()):  # type: ignore[attr-defined]
+    for text in (console.file.getvalue(), table.to_markdown(), table.to_latex("all"), table._repr_html_()):  # type: ignore[attr-defined]
         assert "over models" in text
         assert "(0.100)" in text
 

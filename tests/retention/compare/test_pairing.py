@@ -37,8 +37,9 @@ def run(folder: Path, right: Hits, suite: str = SUITE, called: str = "", **setti
     return SaidRun(folder, folder.name, suite, episodes(right), {}, settings=settings, called=called)
 
 
-def difference(table: RetentionTable, minus: str, category: str) -> Difference:
-    (found,) = [row for row in table.differences if (row.minus, row.category) == (minus, category)]
+def difference(table: RetentionTable, side: str, category: str) -> Difference:
+    """The difference of this category that `side` is the minuend or the subtrahend of."""
+    (found,) = [row for row in table.differences if side in (row.group, row.minus) and row.category == category]
     return found
 
 
@@ -66,7 +67,7 @@ def oracle(gains: pd.Series, groups: pd.Series) -> tuple[float, float, float, fl
 
 def test_a_success_rate_less_another_is_what_a_plain_loop_over_groups_says(tmp_path: Path) -> None:
     one, other = run(tmp_path / "one", hits(0.8, 0)), run(tmp_path / "other", hits(0.5, 1))
-    table = retention_table([one, other])
+    table = retention_table([other, one])
     for category in ("color", "shape"):
         mine, theirs = (r.episodes[r.episodes["category"] == category].reset_index() for r in (one, other))
         gains = (mine["outcome"] == "correct").astype(float) - (theirs["outcome"] == "correct")
@@ -83,7 +84,7 @@ def test_a_success_rate_less_another_is_what_a_plain_loop_over_groups_says(tmp_p
 @pytest.mark.slow
 def test_an_accuracy_less_another_is_what_a_plain_loop_over_groups_says(probed_run: ProbedRun) -> None:
     one, other = probed_run({"color": SIGNAL}, "one"), probed_run({"color": WEAK}, "other")
-    found = difference(retention_table([one, other]), "other", "color")
+    found = difference(retention_table([other, one]), "other", "color")
     best = []
     for probed in (one, other):
         curve = load_results(probed).curves["color", "mean"]
@@ -125,7 +126,7 @@ def test_holm_holds_over_all_categories_of_all_pairs(tmp_path: Path) -> None:
 
 def test_a_group_of_runs_is_tested_by_its_mean_on_the_same_items(tmp_path: Path) -> None:
     first, second, third = (run(tmp_path / name, hits(0.7, at)) for at, name in enumerate("abc"))
-    table = retention_table({"two": [first, second], "one": [third]})
+    table = retention_table({"one": [third], "two": [first, second]})
     right = [(r.episodes["outcome"] == "correct").astype(float) for r in (first, second, third)]
     of_color = first.episodes["category"] == "color"
     gains = ((right[0] + right[1]) / 2 - right[2])[of_color]
@@ -142,13 +143,13 @@ def pairs(table: RetentionTable) -> list[tuple[str, str]]:
     return list(dict.fromkeys((row.group, row.minus) for row in table.differences))
 
 
-def test_the_first_run_is_compared_with_every_other_or_every_other_with_the_one_named(tmp_path: Path) -> None:
+def test_every_other_run_is_compared_with_the_first_or_with_the_one_named(tmp_path: Path) -> None:
     runs = [run(tmp_path / name, hits(0.5, at)) for at, name in enumerate("abc")]
-    assert pairs(retention_table(runs)) == [("a", "b"), ("a", "c")]
+    assert pairs(retention_table(runs)) == [("b", "a"), ("c", "a")]
     assert pairs(retention_table(runs, against="b")) == [("a", "b"), ("c", "b")]
     assert pairs(retention_table(runs, against=str(tmp_path / "c"))) == [("a", "c"), ("b", "c")]
     groups = {"x": runs[:1], "y": runs[1:2], "z": runs[2:]}
-    assert pairs(retention_table(groups)) == [("x", "y"), ("x", "z"), ("y", "z")]
+    assert pairs(retention_table(groups)) == [("y", "x"), ("z", "x"), ("z", "y")]
     assert pairs(retention_table(groups, against="y")) == [("x", "y"), ("z", "y")]
 
 
@@ -206,21 +207,21 @@ def test_runs_on_other_questions_have_no_differences_and_every_form_says_why(
     from rich.console import Console
 
     there = {"right": hits(0.5, 1), "seed": 0} | other
-    table = retention_table([run(tmp_path / "one", hits(0.5, 0), seed=0), run(tmp_path / "other", **there)])
+    table = retention_table([run(tmp_path / "other", **there), run(tmp_path / "one", hits(0.5, 0), seed=0)])
     assert table.differences == []
     assert table.unpaired == (f"one and other are not compared: {why}.",)
     console = Console(width=200, record=True, file=StringIO())
     console.print(table.to_rich("all"))
-    for text in (table.to_markdown(), table.to_latex().replace("\\#", "#"), console.export_text()):
+    for text in (table.to_markdown(), table.to_latex("all").replace("\\#", "#"), console.export_text()):
         assert table.unpaired[0] in text
 
 
 def test_other_words_are_other_questions(tmp_path: Path) -> None:
     one, other = run(tmp_path / "one", hits(0.5, 0)), run(tmp_path / "other", hits(0.5, 1))
     side = replace(other, episodes=other.episodes.assign(wording="side"))
-    assert "other wordings (knowledge and side)" in retention_table([one, side]).unpaired[0]
+    assert "other wordings (knowledge and side)" in retention_table([side, one]).unpaired[0]
     own = replace(other, episodes=other.episodes.assign(wording="knowledge"))
-    assert retention_table([one, own]).differences
+    assert retention_table([own, one]).differences
 
 
 def with_content(one: SaidRun, changed: frozenset[str] = frozenset()) -> SaidRun:
@@ -232,7 +233,7 @@ def with_content(one: SaidRun, changed: frozenset[str] = frozenset()) -> SaidRun
 def test_items_that_only_one_run_has_are_left_out_and_counted(tmp_path: Path) -> None:
     one = run(tmp_path / "one", hits(0.8, 0))
     other = run(tmp_path / "other", hits(0.5, 1, {"color": 20, "shape": 10}))
-    table = retention_table([one, other])
+    table = retention_table([other, one])
     assert [row.category for row in table.differences] == ["color", "shape", "mean"]
     shape = difference(table, "other", "shape")
     assert (shape.paired, shape.n_items, shape.of_items) == (True, 10, 24)
@@ -253,7 +254,7 @@ def test_items_that_only_one_run_has_are_left_out_and_counted(tmp_path: Path) ->
 def test_a_category_without_an_item_in_common_alone_is_left_out(tmp_path: Path) -> None:
     one, other = (with_content(run(tmp_path / name, hits(0.5, at))) for at, name in enumerate(("one", "other")))
     new = with_content(other, frozenset(other.episodes.loc[other.episodes["category"] == "shape", "item_id"]))
-    table = retention_table([one, new])
+    table = retention_table([new, one])
     assert [row.category for row in table.differences] == ["color", "mean"]
     assert table.differences[1].categories == ("color",)
     assert table.unpaired == ("one and other are not compared in shape: no item in common.",)
@@ -265,13 +266,13 @@ def test_selections_of_one_suite_are_pairs_by_what_their_items_hold(tmp_path: Pa
         with_content(run(tmp_path / "whole", right)),
         with_content(run(tmp_path / "part", {"color": left["color"]}, suite="suite@1#ba9876543210")),
     )
-    found = retention_table([whole, part])
-    same = retention_table([whole, with_content(run(tmp_path / "same", {"color": left["color"]}))])
+    found = retention_table([part, whole])
+    same = retention_table([with_content(run(tmp_path / "same", {"color": left["color"]})), whole])
     both = [difference(table, name, "color") for table, name in ((found, "part"), (same, "same"))]
     assert both[0].paired
     assert replace(both[0], minus="", minus_run="") == replace(both[1], minus="", minus_run="")
     changed = with_content(part, frozenset({"color-0", "color-1"}))
-    fewer = difference(retention_table([whole, changed]), "part", "color")
+    fewer = difference(retention_table([changed, whole]), "part", "color")
     assert (fewer.n_items, fewer.of_items) == (18, 22)  # two items of one id are two items
 
 
@@ -285,20 +286,20 @@ def test_probes_on_the_same_items_of_another_selection_are_pairs(probed_run: Pro
         for name, suite in (("same", one.suite), ("part", "suite@1#ba9876543210"))
     )
     apart = replace(part, episodes=part.episodes.drop(columns="item_content_sha256"))
-    tables = [retention_table([one, other]) for other in (same, part)]
+    tables = [retention_table([other, one]) for other in (same, part)]
     found = [difference(table, name, "color") for table, name in zip(tables, ("same", "part"), strict=True)]
     widths = [(row.backbone_ci or (0, 0))[1] - (row.backbone_ci or (0, 0))[0] for row in found]  # type: ignore[operator]
     assert widths[1] == pytest.approx(widths[0], rel=0.05)
     rows = tables[1].rows
-    assert found[1].backbone == pytest.approx(rows[0].backbone.score - rows[1].backbone.score)  # type: ignore[operator]
-    assert retention_table([one, apart]).differences == []
+    assert found[1].backbone == pytest.approx(rows[1].backbone.score - rows[0].backbone.score)  # type: ignore[operator]
+    assert retention_table([apart, one]).differences == []
 
 
 def test_probes_are_not_compared_where_items_differ(probed_run: ProbedRun) -> None:
     one, other = probed_run({"color": SIGNAL}, "one"), probed_run({"color": WEAK}, "other")
     fewer = replace(other, episodes=other.episodes.iloc[:160], features={})
     save_results(load_results(other), fewer.path)
-    row = difference(retention_table([one, fewer], keys=[None, load_results(other).key]), "other", "color")
+    row = difference(retention_table([fewer, one], keys=[load_results(other).key, None]), "other", "color")
     assert (row.n_items, row.of_items, row.backbone, row.retention) == (80, 100, None, None)
 
 
@@ -306,7 +307,7 @@ def test_groups_are_pairs_on_the_items_that_most_of_their_runs_have(tmp_path: Pa
     full = {"color": 20, "shape": 24}
     runs = [run(tmp_path / name, hits(0.7, at, full)) for at, name in enumerate("abc")]
     nearly = run(tmp_path / "d", hits(0.5, 4, {"color": 18, "shape": 4}))
-    table = retention_table({"x": runs[:2], "y": [runs[2], nearly]})
+    table = retention_table({"y": [runs[2], nearly], "x": runs[:2]})
     color, shape = (difference(table, "y", name) for name in ("color", "shape"))
     assert (color.paired, color.n_items, color.of_items) == (True, 18, 20)
     assert (shape.paired, shape.n_items) == (False, None)  # 4 of 24 are too few to give up the others
@@ -318,7 +319,7 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     policies = [run(tmp_path / f"policy-{at}", hits(0.5, at)) for at in range(2)]
     mixed = [policies[0], vlms[0], policies[1], vlms[1]]
     table = retention_table(mixed)
-    assert pairs(table) == [("vlm-0", "vlm-1"), ("policy-0", "policy-1")]
+    assert pairs(table) == [("vlm-1", "vlm-0"), ("policy-1", "policy-0")]
     assert table.unpaired == (
         "VLM runs and policy runs are not compared with each other here; --vlm-vla does that.",
     )
@@ -327,7 +328,7 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     (header, _, *lines) = table.to_markdown().splitlines()[2:]
     columns = [cell.strip() for cell in header.split("|")]
     cells = {line.split("|")[2].strip(): line.split("|") for line in lines if line.startswith("| Mean")}
-    answered, acted = (cells[f"{name}-0 − {name}-1"] for name in ("vlm", "policy"))
+    answered, acted = (cells[f"{name}-1 − {name}-0"] for name in ("vlm", "policy"))
     assert "[" in answered[columns.index("VLM %")]
     assert "[" not in answered[columns.index("success %")]
     assert "[" in acted[columns.index("success %")]
@@ -335,7 +336,7 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     accuracy = [(r.episodes["outcome"] == "correct").mean() for r in vlms]
     gain = next(row.sr for row in table.differences if row.category == "mean")
     right = [row.success.sr for row in table.means if row.run.mode == "answers"]
-    assert gain == pytest.approx(right[0] - right[1])  # type: ignore[operator]
+    assert gain == pytest.approx(right[1] - right[0])  # type: ignore[operator]
     assert accuracy[0] != accuracy[1]
 
 
@@ -371,8 +372,8 @@ def test_json_of_plain_runs_is_a_list_whose_rows_hold_their_differences(tmp_path
     both = json.loads(retention_table([one, other]).to_json())
     assert [row["run"]["location"] for row in both] == [str(tmp_path / "one")] * 3 + [str(tmp_path / "other")] * 3
     assert [{name: row[name] for name in alone[0]} for row in both[:3]] == alone
-    (found,) = both[0]["differences"]
-    assert found["minus_run"] == str(tmp_path / "other")
-    assert found["category"] == both[0]["category"] == "color"
-    assert found["sr"] == pytest.approx(both[0]["success"]["sr"] - both[3]["success"]["sr"])
-    assert [row["differences"] for row in both[3:]] == [[], [], []]
+    (found,) = both[3]["differences"]
+    assert found["minus_run"] == str(tmp_path / "one")
+    assert found["category"] == both[3]["category"] == "color"
+    assert found["sr"] == pytest.approx(both[3]["success"]["sr"] - both[0]["success"]["sr"])
+    assert [row["differences"] for row in both[:3]] == [[], [], []]

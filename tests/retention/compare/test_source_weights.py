@@ -143,5 +143,5 @@ def test_every_format_says_whether_the_vlm_is_the_source(tmp_path: Path, card: M
     table = retention_table(runs, vlm_vla=True)
     console = Console(width=300, record=True, file=StringIO())
     console.print(table.to_rich("all"))
-    pages = (table.to_markdown(), table.to_latex(), report_html(runs, table), console.export_text())
+    pages = (table.to_markdown(), table.to_latex("all"), report_html(runs, table), console.export_text())
     assert [words in " ".join(page.split()) for page in pages] == [True] * 4

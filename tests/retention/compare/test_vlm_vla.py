@@ -180,7 +180,7 @@ def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path
     markdown = table.to_markdown()
     for words in ("accuracy % [95 %]", "**Accuracy of answers", "**VLM − VLA: ", "| qwen3-vl | seen |"):
         assert words in markdown
-    latex = table.to_latex()
+    latex = table.to_latex("all")
     assert "accuracy \\,\\%".replace(" ", "") in latex
     assert "VLM $-$ VLA" in latex
     content = json.loads(table.to_json())

@@ -111,6 +111,22 @@ def test_scores_by_step_are_means_of_the_samples_and_their_mean_is_the_metric(ru
         step_scores(load_label_results(run, target="a/b: <i>"))
 
 
+def test_scores_of_classes_by_step_are_balanced_accuracies_of_the_step_and_within_their_interval(run: Run) -> None:
+    results = load_label_results(run, target="sim.phase")
+    display = StepScoresDisplay.from_results(results, "backbone")
+    curve = results.curves["mean"]
+    row = [str(site) for site in curve.sites].index(display.site)
+    right = curve.predictions[row] == results.labels
+    frame = pd.DataFrame({"step": results.inferences, "phase": results.labels, "right": right})
+    of_phases = frame.groupby(["step", "phase"])["right"].mean()
+    assert display.score == pytest.approx(of_phases.groupby("step").mean().to_numpy())
+    assert curve.scores[row].max() > 1, "weights of the whole window exceed 1 at a rare phase"
+    for score in (display.score, *display.controls.values()):
+        assert ((score >= 0) & (score <= 1)).all()
+    assert (display.low <= display.score + 1e-12).all()
+    assert (display.score <= display.high + 1e-12).all()
+
+
 def test_places_behind_an_event_are_stored_and_shown_as_such(run: Run) -> None:
     event = Labels.of_run(run, "sim.phase").equal_to("holding")
     labels = Labels.of_run(run, "sim.cube_x")

@@ -121,10 +121,10 @@ def test_a_heading_and_a_verdict_lead_to_their_meaning(page: Page) -> None:
         entry = page.named(link.attributes["href"].removeprefix("#"))
         assert entry.tag == "dt"
         assert entry.text.replace(" ", "") == link.text.replace("\u00a0", "").replace(" ", "")
-    (verdict,) = [one for one in page.all("a") if one.inside("td") and one.text == "encoded, not acted on"]
+    (verdict,) = [one for one in page.all("a") if one.inside("td") and one.text == "shown, success not shown"]
     place = page.named(verdict.attributes["href"].removeprefix("#"))
     siblings = place.parents[-1].children
-    assert siblings[siblings.index(place) + 1].text == VERDICT_HELP["encoded, not acted on"]
+    assert siblings[siblings.index(place) + 1].text == VERDICT_HELP["shown, success not shown"]
 
 
 def test_keyboard_and_screen_readers_reach_everything(page: Page) -> None:

@@ -72,7 +72,7 @@ def test_every_format_shows_the_verdicts(probed_run: ProbedRun) -> None:
     color, counting = table.rows
     for words in (verdict_text(color.backbone), verdict_text(counting.backbone), "in the backbone"):
         assert words in table.to_markdown()
-        assert words.replace("%", r"\%") in table.to_latex()
+        assert words.replace("%", r"\%") in table.to_latex("all")
     frame = table.to_frame()
     assert frame["backbone.verdict"][0] == "not shown"
     assert frame["backbone.at_most"][0] == pytest.approx(color.backbone.at_most)

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from probe_kit._terminal.notebook import facts_html
-from probe_kit.extract.run_layout import CAPTURE_ONLY, RUN_FILE
+from probe_kit.extract.run_layout import CAPTURE_ONLY
+from probe_kit.extract.store.locations.run_folders import runs_in
 from probe_kit.hooks.contract.summary import streams_text
 
 if TYPE_CHECKING:
@@ -102,18 +103,12 @@ def what_to_open(address: str) -> str:
     """What to do where there is no run: the runs inside, one of nearly that name, or how to make one."""
     folder = Path(address).expanduser()
     if "://" not in address:
-        if inside := _runs_in(folder):
+        if inside := runs_in(folder):
             more = f" and {len(inside) - MOST} more" if len(inside) > MOST else ""
             return (
                 f"It holds {len(inside)} run{'s' * (len(inside) > 1)}: {', '.join(map(str, inside[:MOST]))}{more}"
             )
-        beside = {path.name: path for path in _runs_in(folder.parent)}
+        beside = {path.name: path for path in runs_in(folder.parent, deep=False)}
         if near := get_close_matches(folder.name, beside, n=1):
             return f"Did you mean {beside[near[0]]}?"
     return "Make one with `probe-kit extract`"
-
-
-def _runs_in(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        return []
-    return [path.parent for path in sorted(folder.glob(f"*/{RUN_FILE}"))]

@@ -47,7 +47,7 @@ NOT_LOCATED = "no place that was tried carries half of it"
 _READOUTS: Mapping[str, str] = MappingProxyType(
     {FIRST_CHUNK: "in the first chunk", PER_STEP: "over the whole episode"}
 )
-UNTESTED = "whether it is used was not tested"
+UNTESTED = "whether the answer is used was not tested"
 """What is said without an image swap."""
 
 

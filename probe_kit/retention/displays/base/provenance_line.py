@@ -44,7 +44,7 @@ class ProvenanceLine:
         """Of probes in one view."""
         settings = results.settings
         sizes = [curve.labels.size for (_, name), curve in results.curves.items() if name == view]
-        n = f"n = {_span(sizes)} episodes per category"
+        n = f"n = {_span(sizes)} episodes per category, view {view}"
         return cls(
             results.label, settings.random_weights, settings.weights, settings.suite, n, settings.run_settings,
             results.key, settings.target, settings.call,

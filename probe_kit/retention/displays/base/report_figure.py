@@ -57,7 +57,7 @@ class ReportFigure:
 
     name: file stem. subject: which numbers it shows, such as `behaviour` or `probes`. run: its position among the
     runs, None if it shows all of them. reading: how to read it, in plain language. is_table: its numbers are a
-    table that is printed as such elsewhere.
+    table that is printed as such elsewhere. is_detail: the main figures can be read without it.
     """
 
     name: str
@@ -67,6 +67,7 @@ class ReportFigure:
     run: int | None
     draw: "Callable[[], Figure]"
     is_table: bool = False
+    is_detail: bool = False
 
     @contextmanager
     def drawn(self) -> "Iterator[Figure]":

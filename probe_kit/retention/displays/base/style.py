@@ -191,5 +191,5 @@ def significance_handles(colour: str = "0.3") -> "list[Line2D]":
 
 SIGNAL = f"above chance and every control run, p < {SIGNIFICANCE}"
 """What every filled marker and every dot of a probe is; the same words in legends and captions."""
-FILLED = f"filled: signal ({SIGNAL})"
-OPEN = "open: no signal"
+FILLED = f"filled: shown ({SIGNAL})"
+OPEN = "open: not shown"

@@ -61,26 +61,26 @@ def _of_view(results: LabelResults, view: str, stem: str, position: int, target:
         "How well a linear probe decodes the label in groups it has not seen, layer by layer, with 95 % intervals "
         f"over groups. {ONLY_FILLED}. Grey: what the same probes reach with labels exchanged between groups. "
         "Dotted: the best control.",
-        position, partial(label_curves, results, view),
+        position, partial(label_curves, results, view), is_detail=view != views[0],
     )  # fmt: skip
     if results.steps.size > 1:
         yield ReportFigure(
             f"{stem}-steps{suffix}", in_view("Score by step", view, views), target,
-            "The same by inference, at the best site of each part, beside controls. The mean over all samples is "
-            "the metric. Samples of a frequent class weigh less, so compare with the controls at that step.",
-            position, partial(step_scores, results, view),
+            "The same by inference, at the best site of each part, beside controls. Classes are balanced among "
+            "those of the step. A step of one class is easy, so compare with the controls at that step.",
+            position, partial(step_scores, results, view), is_detail=view != views[0],
         )  # fmt: skip
     if results.classes:
         yield ReportFigure(
             f"{stem}-confusion{suffix}", in_view("Confusion matrix", view, views), target,
             "Which class the best site of each part predicts for which, in groups it has not seen. Each row sums "
             "to 100 %; the mean of the diagonal is the balanced accuracy.",
-            position, partial(class_confusions, results, view),
+            position, partial(class_confusions, results, view), is_detail=view != views[0],
         )  # fmt: skip
     else:
         yield ReportFigure(
             f"{stem}-predicted{suffix}", in_view("Predicted against true", view, views), target,
             "A point per sample, predicted by the best site of each part in groups it has not seen. Colours are "
             "groups. Predictions are clipped to the range of the training labels.",
-            position, partial(predicted_values, results, view),
+            position, partial(predicted_values, results, view), is_detail=view != views[0],
         )  # fmt: skip

@@ -28,11 +28,12 @@ _CONTROLS = (Line("black", "", ":"), Line(GREEN, "", (0, (5, 1))))  # type: igno
 
 @dataclass
 class StepScoresDisplay(LabelPanel):
-    """Mean score of the samples at each step, of the best site of a stream; arrays (W,).
+    """The metric at each step, of the best site of a stream; arrays (W,).
 
-    The mean over all samples is the metric of the label. steps: inferences, or places behind the event where
-    windows begin. low, high: 95 % interval over groups. controls: by name, the mean scores of the best control and
-    of `step`. site: of the largest score above its own chance.
+    R² is that of the label's spread over all steps. Balanced accuracy is that of the classes at the
+    step. steps: inferences, or places behind the event where windows begin. low, high: 95 % interval over groups.
+    controls: by name, the metric of the best control and of `step`. site: of the largest score above its
+    own chance.
     """
 
     target: str
@@ -61,9 +62,10 @@ class StepScoresDisplay(LabelPanel):
             raise UsageError(f"the label {results.settings.target!r} has one step; expected several to show")
         curve, row = results.curves[view], best_row(results, view, stream)
         own, scores = results.settings, curve.scores[row]
+        balanced = results.step_scores(scores)
         limits = [
-            score_interval(scores[here], results.groups[here], own.task, own.seed)
-            for here in (results.places == step for step in results.steps)
+            score_interval(balanced[at_step], results.groups[at_step], own.task, own.seed)
+            for at_step in (results.places == step for step in results.steps)
         ]
         return cls(
             target=own.target,
@@ -88,13 +90,15 @@ class StepScoresDisplay(LabelPanel):
 
     @property
     def measure(self) -> str:
-        """Their mean is the metric."""
-        return f"mean score (over all steps: {self.metric})"
+        """The metric, at each step by itself."""
+        return f"{self.metric} at each step"
 
     def draw(self, axes: "Axes") -> None:
         """The site's and the controls' scores."""
         line = PARTS[self.part]
-        arms = np.array([self.score - self.low, self.high - self.score]).clip(min=0)
+        arms = np.array([self.score - self.low, self.high - self.score]).clip(
+            min=0
+        )  # rounding, where groups agree
         axes.errorbar(self.steps, self.score, yerr=arms, fmt="none", ecolor=line.colour, elinewidth=0.8, alpha=0.7)
         axes.plot(
             self.steps,

@@ -1,0 +1,134 @@
+"""Retention, success and drift of several checkpoints of one training, against the training step."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from probe_kit.errors import UsageError
+from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.columns.text import difference_interval, number, percent, with_limits
+from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.formats.numbers_table import NumbersTable
+from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.table import RetentionTable
+from probe_kit.retention.text import spell
+from probe_kit.train.data.run_reader import RunReader
+
+STEP = "step"
+_STEP = re.compile(r"(?:^|.*(?:step|checkpoint|ckpt|iter|iteration)s?[-_=]?)0*(\d+)$", re.IGNORECASE)
+"""A folder of a training: `020000`, `checkpoint-500`, `step_20000`, `ckpt-3`."""
+_INNER = ("pretrained_model", "model", "params", "weights")
+"""Folders that trainers put below that of a step. Others are not skipped: a folder above may be a date."""
+_NOTE = (
+    "step: of the training; success: the cube ends on the correct picture; drift: the backbone's accuracy minus "
+    "that of the first step, paired by items where both ran the same; each with its 95 % interval"
+)
+
+
+def training_step(run: RunReader) -> int:
+    """Return the training step of the run's checkpoint, from the last folder of its path.
+
+    Raises UsageError for a run whose checkpoint is unknown or names no step.
+    """
+    certificate: Mapping[str, Any] = getattr(run, "certificate", {})
+    checkpoint = str(certificate.get("policy", {}).get("checkpoint", ""))
+    folders = [name for name in re.split(r"[/\\]", checkpoint) if name]
+    while folders and folders[-1] in _INNER:
+        folders.pop()
+    if folders and (match := _STEP.match(folders[-1])):
+        return int(match[1])
+    raise UsageError(
+        f"the training step of {run.location} is unknown: its checkpoint is {checkpoint or 'not stored'!r}; "
+        "expected a folder such as checkpoints/020000 or checkpoint-500. Give the steps in the order of the runs, "
+        "such as --x 1000,2000"
+    )
+
+
+def read_steps(text: str, runs: Sequence[RunReader]) -> dict[str, int]:
+    """Return the training step of every run by its location, from `step` or comma-separated numbers.
+
+    Raises UsageError for another text, a number of steps that is not that of the runs, runs of one step, or VLM
+    runs, which have no retention.
+    """
+    if asked := [str(run.location) for run in runs if ask_of(run) is not None]:
+        raise UsageError(f"--x is for policy runs; {asked[0]} is a VLM run. Leave it out")
+    if text == STEP:
+        steps = [training_step(run) for run in runs]
+    else:
+        parts = [part.strip() for part in text.split(",")]
+        if not all(part.isdecimal() for part in parts):
+            raise UsageError(f"--x {text!r}; expected `step`, or a training step per run such as 1000,2000")
+        steps = [int(part) for part in parts]
+    if len(steps) != len(runs):
+        raise UsageError(f"--x gives {len(steps)} steps for {len(runs)} runs; give one per run, in their order")
+    if len(runs) < 2 or len(set(steps)) < len(steps):
+        raise UsageError(
+            f"--x needs several runs of different training steps; these are of {', '.join(map(str, steps))}"
+        )
+    return {str(run.location): step for run, step in zip(runs, steps, strict=True)}
+
+
+def step_table(table: RetentionTable, steps: Mapping[str, int]) -> NumbersTable:
+    """Return success, backbone, action, retention and drift by category and training step.
+
+    table: of runs in the order of their steps, the first of which all others are compared with. steps: by
+    location. Keys of a row's numbers: `category`, `step`, `run`, `view`, `sr`, `backbone`, `action`, `retention`,
+    `drift` (of the backbone) and, for each of them, its limits under the name with `_ci`.
+    """
+    first: dict[str, str | None] = {}
+    rows = [row for row in table.all_rows if first.setdefault(row.run.location, row.view) == row.view]
+    drifts = {(gap.run, gap.category): gap for gap in table.differences if gap.view in (*first.values(), None)}
+    names = list(dict.fromkeys(row.category for row in rows))
+    ordered = sorted(rows, key=lambda row: (names.index(row.category), steps[row.run.location]))
+    numbers = [_numbers(row, steps, drifts) for row in ordered]
+    columns = (
+        "category",
+        "step",
+        "success %",
+        "backbone %",
+        "action %",
+        "retention",
+        "drift of the backbone, points",
+    )
+    cells = tuple(_cells(one) for one in numbers)
+    shown = [at for at in range(len(columns)) if at < 2 or any(line[at] != "–" for line in cells)]
+    view = next((row.view for row in rows if row.view is not None), None)
+    text = TextTable(
+        "Training steps",
+        _NOTE + ("" if view is None else f"; view {view}"),
+        tuple(columns[at] for at in shown),
+        tuple(tuple(line[at] for at in shown) for line in cells),
+        names=2,
+    )
+    return NumbersTable(text, tuple(numbers))
+
+
+def _numbers(
+    row: RetentionRow, steps: Mapping[str, int], drifts: Mapping[tuple[str | None, str], Any]
+) -> dict[str, Any]:
+    drift = drifts.get((row.run.location, row.category))
+    defined = row.retention.defined
+    return {
+        "category": row.category,
+        "step": steps[row.run.location],
+        "run": row.run.location,
+        "view": row.view,
+        "sr": row.success.sr,
+        "sr_ci": row.success.ci,
+        "backbone": row.backbone.score,
+        "backbone_ci": row.backbone.ci,
+        "action": row.action.score,
+        "action_ci": row.action.ci,
+        "retention": row.retention.value if defined else None,
+        "retention_ci": row.retention.ci if defined else None,
+        "drift": None if drift is None else drift.backbone,
+        "drift_ci": None if drift is None else drift.backbone_ci,
+    }
+
+
+def _cells(one: Mapping[str, Any]) -> tuple[str, ...]:
+    shares = (with_limits(percent(one[name]), one[f"{name}_ci"], percent) for name in ("sr", "backbone", "action"))
+    ratio = with_limits(number(one["retention"]), one["retention_ci"], number)
+    lacks = one["retention"] is None and one["backbone"] is not None and one["action"] is not None
+    drift = difference_interval(one["drift"], one["drift_ci"])
+    return (spell(one["category"]), str(one["step"]), *shares, "n/a" if lacks else ratio, drift)
