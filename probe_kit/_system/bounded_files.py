@@ -3,8 +3,8 @@
 import errno
 import os
 import stat
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 MOST_BYTES = 256 << 20
 """The largest configuration or picture that is read; the vocabularies of tokenizers are a tenth of it."""
@@ -24,7 +24,7 @@ def check_regular(path: Path, most: int = MOST_BYTES) -> None:
     _check(path, path.stat(), most)
 
 
-def open_regular(path: Path, most: int = MOST_BYTES) -> BinaryIO:
+def open_regular(path: Path, most: int = MOST_BYTES) -> BufferedReader:
     """Open a regular file of at most `most` bytes. Raises OSError, with `strerror` in words, for another one."""
     check_regular(path, most)
     # The file may have been exchanged since: opening a pipe would wait for its writer.

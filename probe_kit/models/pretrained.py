@@ -11,8 +11,8 @@ _REMOTE_CODE = "trust_remote_code"
 def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
     """Return `loader.from_pretrained(source, **options)` of a class of transformers.
 
-    A configuration can name Python code in its `auto_map`; transformers asks on the terminal whether to run it
-    unless the caller forbids it. source: a folder or a hub id.
+    A configuration can name Python code in its `auto_map`; without `trust_remote_code=False`, transformers asks on
+    the terminal whether to run it. source: a folder or a hub id.
     Raises CheckpointError where the object needs such code, OSError for missing files, ValueError for others.
     """
     try:

@@ -1,16 +1,18 @@
 """Named tables from runs whose outcomes are known."""
 
+import csv
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from probe_kit._system.csv_text import rows_of_csv
 from probe_kit.cli import app
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
@@ -90,18 +92,15 @@ def test_a_caption_says_rule_call_and_episodes_of_what_is_in_the_table() -> None
     table = retention_table(drawn(["one"]), pairs=())
     assert caption(table, ["first", "second"]) == "first; second; outcome rule disc; 40 episodes per category"
 
-    def changed(
-        row: RetentionRow, call: int | None = None, episodes: int = 40, **success: float | None
-    ) -> RetentionRow:
-        run, own = replace(row.run, call=call), replace(row.success, n_episodes=episodes, **success)
-        return replace(row, run=run, success=own)
+    def changed(row: RetentionRow, call: int | None = None, **success: Any) -> RetentionRow:
+        return replace(row, run=replace(row.run, call=call), success=replace(row.success, **success))
 
     first, *others = table.rows
     of_calls = replace(table, rows=(changed(first, 2), *(changed(row, 0) for row in others)))
     assert caption(of_calls, []) == "outcome rule disc; captured inference 0, 2; 40 episodes per category"
     at_first = replace(table, rows=tuple(changed(row, 0) for row in table.rows))
     assert caption(at_first, []) == "outcome rule disc; 40 episodes per category"
-    uneven = replace(table, rows=(changed(first, episodes=12), *others))
+    uneven = replace(table, rows=(changed(first, n_episodes=12), *others))
     assert caption(uneven, []) == "outcome rule disc; 12 to 40 episodes per category"
     never_acted = replace(table, rows=tuple(changed(row, sr=None) for row in table.rows))
     assert caption(never_acted, []) == "40 episodes per category"
@@ -202,7 +201,7 @@ def test_a_table_is_also_rows_of_csv_with_both_ends_of_intervals(played: LoadedS
     run = CliRunner()
     numbers = make_table(played, "score").numbers
     printed = run.invoke(app, ["study", "table", str(played.file), "score", "--format", "csv"])
-    rows = rows_of_csv(printed.stdout)
+    rows = list(csv.DictReader(io.StringIO(printed.stdout, newline="")))
     assert [row["system"] for row in rows] == [number["system"] for number in numbers]
     assert [float(row["score"]) for row in rows] == [number["score"] for number in numbers]
     assert [(row["score_ci_low"], row["score_ci_high"]) for row in rows] == [
