@@ -59,7 +59,7 @@ def weights_needed(model: str, checkpoint: str | None, options: Mapping[str, Any
     every = (
         held["float32"] if family.always_float32 else " or ".join(f"{own} in {name}" for name, own in held.items())
     )
-    memory = held[dtype] if dtype in DTYPES else every
+    memory = next((own for name, own in held.items() if name == dtype), every)
     download = "nothing to download"
     if not family.is_here(checkpoint, options):
         download = f"download {sizes['bfloat16']} or {sizes['float32']}, as stored"
