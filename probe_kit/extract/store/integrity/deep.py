@@ -63,9 +63,12 @@ def reading_problems(root: Root) -> Iterator[str]:
             yield from _complaints(partial(run.trajectory, row))
     for name in RESULT_READERS.values():
         module, _, function = name.partition(":")
-        listing = getattr(import_module(module), function)
-        readers = list[Callable[[], object]]()
-        yield from _complaints(lambda listing=listing, readers=readers: readers.extend(listing(run)))
+        listing: Callable[[Run], Iterator[Callable[[], object]]] = getattr(import_module(module), function)
+        try:
+            readers = list(listing(run))
+        except RunDamagedError as error:
+            yield str(error)
+            continue
         for reader in readers:
             yield from _complaints(reader)
 
