@@ -49,18 +49,9 @@ def site_table(rows: Sequence[PatchEffect], context: TableContext) -> "Responsiv
     )
 
 
-def site_sentences(rows: Sequence[PatchEffect], context: TableContext) -> list[str]:
+def site_sentences(rows: Sequence[PatchEffect], _: TableContext) -> list[str]:
     """One per category: which edits carry half of what the image swap does, or move the action at all."""
-    unread = context.measurement.certificate.get("unread", ())
-    return [
-        f"{category_of(name).title}: {_finding(own)}{_unread(own, unread)}."
-        for name, own in by_category(rows).items()
-    ]
-
-
-def _unread(rows: Sequence[PatchEffect], unread: Sequence[str]) -> str:
-    places = [place for place in unread if any(row.place == place for row in rows)]
-    return f"; unread: {', '.join(places)}" if places else ""
+    return [f"{category_of(name).title}: {_finding(own)}." for name, own in by_category(rows).items()]
 
 
 def _finding(rows: Sequence[PatchEffect]) -> str:
