@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from probe_kit.retention.choices import Family, Section, TableFormat
     from probe_kit.retention.formats.numbers_table import NumbersTable
     from probe_kit.retention.table import RetentionTable
+    from probe_kit.train.data.run_reader import RunReader
 
 WITH_STAGES = ("runs", "probes", "views", "wording", "score", "with_side_words", "style", "figures")
 WITH_TARGET = (
@@ -70,11 +71,9 @@ def retention(
     from probe_kit.extract import open_run
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
-    from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-    from probe_kit.retention.displays.training_steps import training_step_figure
     from probe_kit.retention.rows.outcome_rules import check_epsilons
     from probe_kit.retention.stages_command import show_stages
-    from probe_kit.retention.training_steps import read_steps, step_table
+    from probe_kit.retention.training_steps import read_steps
 
     if stages:
         _check_only(given, WITH_STAGES)
@@ -123,25 +122,47 @@ def retention(
     )  # fmt: skip
     if as_paper:
         _print(table.as_paper, style, table.notes)
-        return
-    if x is not None:
-        by_step = step_table(table, training)
-        if figures is not None:
-            lines = [ProvenanceLine.of_row(mean) for mean in table.means]
-            save_all([training_step_figure(by_step, lines)], figures)
-        _print(by_step, style, (*table.unpaired, *table.notes))
-        return
-    shown = [scored(run, score, with_side_words) for run in listed]
+    elif x is not None:
+        _show_steps(table, training, style, figures)
+    else:
+        shown = [scored(run, score, with_side_words) for run in listed]
+        _write_files(shown, table, figures, html, "all" in details)
+        _print_sections(table, style, details)
+
+
+def _print(table: "RetentionTable | NumbersTable", style: "TableFormat", notes: Sequence[str]) -> None:
+    """Print a table in a format, and its notes beside it, where a program does not read them."""
+    if style == "table":
+        out.print(table.to_rich())
+    else:
+        show = print_json_text if style == "json" else print_text
+        show(getattr(table, f"to_{style}")())
+    for note in notes:
+        say(marked("[yellow]note:[/] {}", note))
+
+
+def _write_files(
+    runs: "Sequence[RunReader]",
+    table: "RetentionTable",
+    figures: Path | None,
+    html: Path | None,
+    every_figure: bool,
+) -> None:
+    """Draw the figures into a folder and the report into a file, each where it is asked for."""
     if figures is not None:
         from probe_kit.retention.displays import collect_figures
 
-        save_all(collect_figures(shown, table), figures, "all" in details)
+        save_all(collect_figures(runs, table), figures, every_figure)
     if html is not None:
         from probe_kit.retention.report import write_report
 
         with err.status("drawing the report"):
-            written = write_report(shown, html, table)
+            written = write_report(runs, html, table)
         say_report(written)
+
+
+def _print_sections(table: "RetentionTable", style: "TableFormat", details: Sequence[str]) -> None:
+    """Print the table in a format, with the sections that are asked for where the format has any."""
     sections: Collection[Section] | Literal["all"]
     sections = "all" if "all" in details else cast("tuple[Section, ...]", details)
     if style == "table":
@@ -154,15 +175,19 @@ def retention(
         _print(table, style, table.notes)
 
 
-def _print(table: "RetentionTable | NumbersTable", style: "TableFormat", notes: Sequence[str]) -> None:
-    """Print a table in a format, and its notes beside it, where a program does not read them."""
-    if style == "table":
-        out.print(table.to_rich())
-    else:
-        show = print_json_text if style == "json" else print_text
-        show(getattr(table, f"to_{style}")())
-    for note in notes:
-        say(marked("[yellow]note:[/] {}", note))
+def _show_steps(
+    table: "RetentionTable", training: Mapping[str, int], style: "TableFormat", figures: Path | None
+) -> None:
+    """Print the table over training steps, and draw its figure. training: steps by the location of a run."""
+    from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+    from probe_kit.retention.displays.training_steps import training_step_figure
+    from probe_kit.retention.training_steps import step_table
+
+    by_step = step_table(table, training)
+    if figures is not None:
+        lines = [ProvenanceLine.of_row(mean) for mean in table.means]
+        save_all([training_step_figure(by_step, lines)], figures)
+    _print(by_step, style, (*table.unpaired, *table.notes))
 
 
 def _show_labels(

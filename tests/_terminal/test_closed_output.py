@@ -19,7 +19,11 @@ def run_command(words: tuple[str, ...], run: Path, redirection: str) -> subproce
     command = " ".join([sys.executable, "-m", "probe_kit", *(word.format(run=run) for word in words)])
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.run(
-        ["bash", "-c", f"{command} {redirection}"], capture_output=True, text=True, env=environment, check=False
+        ["bash", "-c", f"{command} {redirection}"],
+        capture_output=True,
+        encoding="utf-8",
+        env=environment,
+        check=False,
     )
 
 

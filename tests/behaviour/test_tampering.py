@@ -400,18 +400,6 @@ def test_a_picture_that_no_commit_names_is_not_shown(run: Path) -> None:
     assert verify_run(run, deep=True).ok
 
 
-def test_pictures_of_runs_whose_commits_do_not_name_them_are_shown_as_before(run: Path) -> None:
-    for path in (run / "commits").iterdir():
-        commit = json.loads(path.read_text(encoding="utf-8"))
-        del commit["pictures"]
-        write_record(path, commit)
-    shutil.rmtree(run / "probes")
-    rehash(run)
-    shutil.copy(run / thumbnail_key(0), run / thumbnail_key(7))
-    assert read_thumbnail(run, 7) == read_thumbnail(run, 0) != read_thumbnail(run, 1)
-    assert verify_run(run, deep=True).ok
-
-
 # -- probes ------------------------------------------------------------------------------------------------
 
 

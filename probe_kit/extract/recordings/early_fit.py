@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import InstructionError, RecordingError
 from probe_kit.extract.recordings.lerobot_source import IMAGES, STATE
@@ -21,7 +22,7 @@ def declared_inputs(
     """Cameras and numbers of the state that a checkpoint in lerobot's layout declares; None where none is here."""
     folder = family.folder_here(checkpoint, options)
     try:
-        inputs = parse_json((folder / CONFIG_FILE).read_bytes())["input_features"]
+        inputs = parse_json(read_regular(folder / CONFIG_FILE))["input_features"]
         cameras = [name.removeprefix(IMAGES) for name in inputs if name.startswith(IMAGES)]
         state = int(inputs[STATE]["shape"][0]) if STATE in inputs else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from probe_kit._system.bounded_files import MOST_BYTES, check_regular, read_regular
+from probe_kit._system.bounded_files import MOST_BYTES, check_regular, read_regular, read_regular_text
 from probe_kit._system.bounded_json import load_json
 from probe_kit._system.bounded_yaml import load_yaml
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
@@ -82,7 +82,7 @@ def _cached_commit(named: HubName) -> str | None:
     if (cache / "snapshots" / revision).is_dir() and len(revision) == COMMIT_DIGITS:
         return revision
     ref = cache / "refs" / revision
-    return ref.read_text(encoding="utf-8").strip() if ref.is_file() else None
+    return read_regular_text(ref).strip() if ref.is_file() else None
 
 
 def _cache_of(repository: str) -> Path:

@@ -72,6 +72,8 @@ def report_html(
     labels = stored_label_sections(runs, names, places)
     question, curve = _opening(table, runs, shown_names, grid, places)
     label_tables = [table for label in labels for table in label.tables]
+    further = plain_tables(table.further_tables)
+    joined = plain_tables([one for joined in joins.found for one in known_used_tables(joined)])
     return render(
         "page.html.jinja",
         places,
@@ -91,8 +93,8 @@ def report_html(
         notes=table.notes,
         tables=tables,
         wordings=plain_tables(wording_tables(table.wordings)),
-        further=plain_tables(table.further_tables),
-        joined=plain_tables([one for joined in joins.found for one in known_used_tables(joined)]),
+        further=further,
+        joined=joined,
         join_notes=[*joins.refused, *dict.fromkeys(note for joined in joins.found for note in joined.notes)],
         pictures={
             subject: arranged(exhibits, subject, names, places)
@@ -105,7 +107,9 @@ def report_html(
             for name, run in zip(names, runs, strict=True)
         ],
         labels=labels,
-        words=words_of([*summary, *(one for own in tables.values() for one in own), *label_tables]),
+        words=words_of(
+            [*summary, *(one for own in tables.values() for one in own), *label_tables, *further, *joined]
+        ),
         heat=heat_key(),
         sentence=sentence,
         bibtex=bibtex,

@@ -39,11 +39,11 @@ def test_two_runs_are_compared_on_their_common_items_with_a_corrected_p(runs: St
     (color,) = [one for one in differences(answer) if one["category"] == "color"]
     first, second = correct(runs.trained, "color"), correct(runs.untrained, "color")
     assert sorted(first.index) == sorted(second.index)
-    assert color["sr"] == pytest.approx(first.mean() - second.mean())
+    assert color["sr"] == pytest.approx(second.mean() - first.mean())  # the other run minus the first
     assert color["sr_ci"][0] <= color["sr"] <= color["sr_ci"][1]
     labels = ("trained", "untrained")
     for part in ("backbone", "action"):
-        expected = rows[labels[0], "color"][part]["score"] - rows[labels[1], "color"][part]["score"]
+        expected = rows[labels[1], "color"][part]["score"] - rows[labels[0], "color"][part]["score"]
         assert color[part] == pytest.approx(expected, abs=1e-9)
     assert color["n_items"] == 12
     assert color["p"] <= color["p_holm"] <= 1
@@ -60,12 +60,12 @@ def test_against_names_the_run_that_is_subtracted_and_the_table_prints_the_diffe
     straight = color(runs.trained, runs.untrained)
     turned = color(runs.untrained, runs.trained)
     against = color(runs.untrained, runs.trained, "--against", runs.untrained)
-    assert straight["sr"] > 0.5
-    assert turned["sr"] == pytest.approx(-straight["sr"])
-    assert against["sr"] == pytest.approx(straight["sr"])
-    assert against["backbone"] == pytest.approx(straight["backbone"]) == pytest.approx(-turned["backbone"])
-    text = probe_kit("retention", runs.trained, runs.untrained, "--format", "markdown").out
-    assert f"+{100 * straight['sr']:.1f}" in text
+    assert turned["sr"] > 0.5
+    assert straight["sr"] == pytest.approx(-turned["sr"])
+    assert against["sr"] == pytest.approx(turned["sr"])
+    assert against["backbone"] == pytest.approx(turned["backbone"]) == pytest.approx(-straight["backbone"])
+    text = probe_kit("retention", runs.untrained, runs.trained, "--format", "markdown").out
+    assert f"+{100 * turned['sr']:.1f}" in text
 
 
 def test_a_group_of_models_is_compared_with_another_with_the_exact_p_over_models(runs: StoredRuns) -> None:
@@ -73,15 +73,15 @@ def test_a_group_of_models_is_compared_with_another_with_the_exact_p_over_models
     typed = [word for group in groups for word in ("--group", group)]
     answer = probe_kit("retention", *typed, "--format", "json").json()
     (color,) = [one for one in differences(answer) if one["category"] == "color"]
-    assert (color["group"], color["minus"]) == ("right", "wrong")
+    assert (color["group"], color["minus"]) == ("wrong", "right")
     rates = {row["run"]["label"]: row["success"]["sr"] for row in rows_of(answer) if row["category"] == "color"}
-    assert color["sr"] == pytest.approx(rates["expert"] - (rates["expert-mirrored"] + rates["idle"]) / 2)
+    assert color["sr"] == pytest.approx((rates["expert-mirrored"] + rates["idle"]) / 2 - rates["expert"])
     models = color["sr_models"]
-    assert (models["n"], models["n_minus"]) == (1, 2)
+    assert (models["n"], models["n_minus"]) == (2, 1)
     # Three labelings of one model against two; the observed one is the most extreme.
     assert models["smallest_p"] == pytest.approx(1 / 3)
     assert models["smallest_p"] <= models["p"] <= 1
-    assert "right - wrong" in probe_kit("retention", *typed).text.replace("−", "-")
+    assert "wrong - right" in probe_kit("retention", *typed).text.replace("−", "-")
 
 
 def test_vlm_minus_vla_is_the_paired_difference_on_the_same_first_frames(runs: StoredRuns) -> None:

@@ -235,7 +235,9 @@ def test_escape_sequences_of_outside_text_never_reach_the_terminal(runs: StoredR
 def test_an_error_of_the_simulated_world_names_the_environments_author(tmp_path: Path) -> None:
     """An environment of one's own that raises is exit code 3, by name."""
     module = tmp_path / "broken_world.py"
-    module.write_text("class World:\n    def __init__(self):\n        raise RuntimeError('no such robot')\n")
+    module.write_text(
+        "class World:\n    def __init__(self):\n        raise RuntimeError('no such robot')\n", encoding="utf-8"
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(tmp_path))
         typed = ("extract", "--model", "pi0-tiny", "--env", "broken_world:World", "--out", tmp_path / "run")

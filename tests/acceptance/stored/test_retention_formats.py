@@ -62,8 +62,9 @@ def test_the_backbones_peak_is_the_best_accuracy_that_train_printed(
 
 @pytest.mark.parametrize("style", ["table", "markdown", "latex"])
 def test_every_text_format_shows_the_values_of_the_json(
-    style: str, runs: StoredRuns, rows: list[dict[str, Any]]
+    style: str, runs: StoredRuns, rows: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "120")  # a narrower console has the intervals in the sentences alone
     text = probe_kit("retention", runs.trained, "--format", style).out
     for row in rows:
         printed = intervals(rows_with(text, row["category"]))

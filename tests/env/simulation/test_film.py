@@ -54,8 +54,8 @@ def test_tiles_that_settle_on_the_table_are_drawn_within_a_few_pixels(make_env):
 
 def alternating_frames(env, count):
     """Frames of a posture of the Panda in which one pixel in 17,000 alternates between two drawings."""
-    random = np.random.default_rng(1)
-    env.reset(seed=1)
+    random = np.random.default_rng(22)
+    env.reset(seed=22)
     for _ in range(2):
         env.advance(
             np.r_[random.uniform(-0.08, 0.08, 3), random.uniform(-0.5, 0.5, 3), float(random.random() > 0.5)]

@@ -62,7 +62,7 @@ def change(file: Path, column: str, of: Callable[[list[Any]], list[Any]], **type
 
 def edit_info(folder: Path, **parts: Any) -> None:
     path = folder / "meta/info.json"
-    path.write_text(json.dumps({**json.loads(path.read_text("utf-8")), **parts}), "utf-8")
+    path.write_text(json.dumps({**json.loads(path.read_text(encoding="utf-8")), **parts}), encoding="utf-8")
 
 
 WRITTEN = np.concatenate([[one.state for one in episode] for episode in observations()])
@@ -322,7 +322,7 @@ CONTRADICTIONS: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 def rename(folder: Path, names: Any) -> None:
-    features = json.loads((folder / "meta/info.json").read_text("utf-8"))["features"]
+    features = json.loads((folder / "meta/info.json").read_text(encoding="utf-8"))["features"]
     features[STATE]["names"] = names
     edit_info(folder, features=features)
 
@@ -472,7 +472,7 @@ VIDEOS: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 def edit_rate(folder: Path, rate: float) -> None:
-    features = json.loads((folder / "meta/info.json").read_text("utf-8"))["features"]
+    features = json.loads((folder / "meta/info.json").read_text(encoding="utf-8"))["features"]
     features[CAMERA]["info"]["video.fps"] = rate
     edit_info(folder, features=features)
 
@@ -538,7 +538,7 @@ def test_actions_are_compared_with_recorded_ones_of_the_same_names_in_the_same_o
     copy: Path, pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch, recorded: Any, own: Any, reason: str
 ) -> None:
     """The recorded numbers themselves lie outside the statistics."""
-    features = json.loads((copy / "meta/info.json").read_text("utf-8"))["features"]
+    features = json.loads((copy / "meta/info.json").read_text(encoding="utf-8"))["features"]
     features["action"]["names"] = recorded
     edit_info(copy, features=features)
     monkeypatch.setattr(Pi0, "action_names", property(lambda _self: own))

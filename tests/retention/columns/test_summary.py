@@ -128,7 +128,11 @@ def test_nothing_is_marked_where_no_control_was_run_and_a_warning_names_the_run(
     both = summary_table(summarise_runs([*ACTED, *bare]))
     assert "No control was run for bare:" in both.note
     assert "No control" not in summary_table(summarise_runs(ACTED)).note
-    assert any("No control was run" in warning for warning in read_run([*bare[:3], bare[3]]).warnings)
+    deep = [
+        replace(one, backbone=replace(one.backbone, depth=0.5), action=replace(one.action, depth=1.0))
+        for one in bare
+    ]
+    assert any("No control was run" in warning for warning in read_run(deep).warnings)
 
 
 def test_several_runs_stand_in_one_table_by_category() -> None:

@@ -8,7 +8,7 @@ import pytest
 from probe_kit.intervene import ClosedLoopEffect, ConditionOutcomes
 from probe_kit.intervene.kinds.closed_loop.effects import closed_loop_effects
 from probe_kit.intervene.kinds.site_effects import PatchEffect
-from probe_kit.intervene.results.best_targets import _best
+from probe_kit.intervene.results.best_targets import best_cell
 
 NAMES = (
     "clean",
@@ -126,6 +126,9 @@ def test_the_best_cell_is_the_last_located_place_in_its_narrowest_role() -> None
         place("backbone.00", "all", 1.0), place("backbone.02", "all", 0.99), place("backbone.02", "image", 0.9),
         place("backbone.02", "language", 0.1), place("backbone.03", "all", 0.0, 1.0),
     ]  # fmt: skip
-    assert _best(rows) == "backbone.02|image"
-    assert _best(rows[:2]) == "backbone.02|all"
-    assert _best(rows[3:]) is None
+    cells = [best_cell(rows), best_cell(rows[:2])]
+    assert [cell and (cell.place, cell.role) for cell in cells] == [
+        ("backbone.02", "image"),
+        ("backbone.02", "all"),
+    ]
+    assert best_cell(rows[3:]) is None
