@@ -1,7 +1,7 @@
 """`probe-kit suite`: build, convert, check and show suites."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +11,9 @@ from probe_kit._terminal.options import AsJson, Categories, Seed, choices, one_o
 from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
+
+if TYPE_CHECKING:
+    from probe_kit.suite import Suite
 
 app = typer.Typer(help="Build, convert, check and show suites of questions.", no_args_is_help=True)
 
@@ -89,6 +92,9 @@ def show(
     folder: ShownSuite = None,
     categories: Categories = None,
     n: Annotated[int, typer.Option("--n", min=1, help="Number of items per category, the first ones.")] = 4,
+    counts: Annotated[
+        bool, typer.Option("--counts", help="List the categories with their item counts instead.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """List items of a suite: the instruction, the picture that answers it, and the other picture."""
@@ -98,6 +104,9 @@ def show(
 
     suite = default_suite() if folder is None else load_suite(folder)
     suite = suite.select(categories)
+    if counts:
+        _list_categories(suite, as_json)
+        return
     rows = [
         {
             "category": item.category,
@@ -120,18 +129,12 @@ def show(
     out.print(table)
 
 
-@app.command("list")
-def list_categories(
-    folder: ShownSuite = None,
-    as_json: AsJson = False,
-) -> None:
-    """List the categories of a suite with their item counts."""
+def _list_categories(suite: "Suite", as_json: bool) -> None:
+    """Print the categories of a suite with their item counts."""
     from rich.table import Table
 
-    from probe_kit.suite import default_suite, load_suite
     from probe_kit.suite.categories import category_of
 
-    suite = default_suite() if folder is None else load_suite(folder)
     counts = {c: sum(item.category == c for item in suite.items) for c in suite.categories}
     if as_json:
         print_json({"suite": suite.identity, "items": counts})

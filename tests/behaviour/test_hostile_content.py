@@ -53,7 +53,7 @@ def test_a_run_of_a_hostile_name_is_shown_as_text(run: Path, words: tuple[str, .
     "words",
     [
         ("run", "show", NAME), ("retention", NAME), ("train", NAME), ("run", "export", NAME, "--format", "h5"),
-        ("models", "--run", NAME), ("suite", "list", NAME), ("suite", "validate", NAME), ("suite", "show", NAME),
+        ("models", "--run", NAME), ("suite", "show", "--counts", NAME), ("suite", "validate", NAME), ("suite", "show", NAME),
         ("extract", "--model", "expert", "--suite", NAME),
     ],
     ids=lambda words: " ".join(words[:2]),
@@ -65,7 +65,7 @@ def test_a_path_that_is_not_there_is_named_as_text(words: tuple[str, ...], tmp_p
 
 def test_a_suite_in_a_folder_of_a_hostile_name_is_shown_as_text(small_suite: Suite, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(small_suite.folder, tmp_path / NAME))
-    said("suite", "list", folder)
+    said("suite", "show", "--counts", folder)
     (folder / "suite.json").write_text(f'{{"schema_version": "{SHOWN}"}}', encoding="utf-8")
     assert "[bold]x[red] [no-end]" in said("suite", "validate", folder)
 

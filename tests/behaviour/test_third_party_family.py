@@ -41,7 +41,7 @@ def test_no_command_that_needs_no_model_imports_torch_or_a_third_party(
     suite, run = str(small_suite.folder), str(recorded_run.path)
     commands = [
         ("--help",), ("models",), ("models", "--json"), ("models", "pi0-tiny"), ("extract", "--help"),
-        ("suite", "list", suite), ("suite", "show", suite),
+        ("suite", "show", "--counts", suite), ("suite", "show", suite),
         ("run", "show", run), ("run", "verify", run),
         ("extract", "--model", "no-such-model", "--dry-run"), ("new-adapter", "heavy-vla"),
     ]  # fmt: skip

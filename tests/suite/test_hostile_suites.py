@@ -88,7 +88,7 @@ def test_any_value_in_the_card_is_refused_or_changes_no_item(
         assert not UNSAFE.search(refused)
     else:
         assert loaded.items == small_suite.items
-    answer = CliRunner().invoke(app, ["suite", "list", str(place)])
+    answer = CliRunner().invoke(app, ["suite", "show", "--counts", str(place)])
     assert answer.exit_code in (0, 1, 2), answer.output
     assert "InternalError" not in answer.output
 
