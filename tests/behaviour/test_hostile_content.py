@@ -53,8 +53,8 @@ def test_a_run_of_a_hostile_name_is_shown_as_text(run: Path, words: tuple[str, .
     "words",
     [
         ("run", "show", NAME), ("retention", NAME), ("train", NAME), ("run", "export", NAME, "--format", "h5"),
-        ("models", "--run", NAME), ("suite", "show", "--counts", NAME), ("suite", "validate", NAME), ("suite", "show", NAME),
-        ("extract", "--model", "expert", "--suite", NAME),
+        ("models", "--run", NAME), ("suite", "show", "--counts", NAME), ("suite", "validate", NAME),
+        ("suite", "show", NAME), ("extract", "--model", "expert", "--suite", NAME),
     ],
     ids=lambda words: " ".join(words[:2]),
 )  # fmt: skip
