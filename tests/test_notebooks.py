@@ -44,7 +44,10 @@ def shortened(source: str) -> str:
     return source if "env_workers" in source else source.replace(SCENE, f"{SCENE}env_workers=0, ")
 
 
-@pytest.fixture(scope="module", params=["short", pytest.param("whole", marks=pytest.mark.slow)])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param("short", marks=pytest.mark.slow), pytest.param("whole", marks=pytest.mark.slow)],
+)
 def made(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, dict[str, NotebookNode]]:

@@ -32,6 +32,7 @@ def planted_run(recorded_run: Run, tmp_path: Path) -> Run:
     return open_run(copy)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> None:
     scores = train_probes(planted_run, ["shape"], permutations=20, controls=(), jobs=1).scores.set_index("site")

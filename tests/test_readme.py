@@ -15,7 +15,11 @@ SHORT = {
 }
 
 
-@pytest.mark.parametrize("changes", [SHORT, pytest.param({}, marks=pytest.mark.slow)], ids=["short", "as it is"])
+@pytest.mark.parametrize(
+    "changes",
+    [pytest.param(SHORT, marks=pytest.mark.slow), pytest.param({}, marks=pytest.mark.slow)],
+    ids=["short", "as it is"],
+)
 def test_the_python_example_runs(
     changes: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -37,6 +37,9 @@ def test_no_command_ends_in_a_traceback(little_runs: Path, words: tuple[str, ...
     assert "Exception ignored" not in done.stderr
 
 
-@pytest.mark.parametrize("redirection", ["| true", ">&-", "> /dev/full"])
+@pytest.mark.parametrize(
+    "redirection",
+    ["| true", pytest.param(">&-", marks=pytest.mark.slow), pytest.param("> /dev/full", marks=pytest.mark.slow)],
+)
 def test_a_table_without_a_reader_ends_without_a_traceback(little_runs: Path, redirection: str) -> None:
     test_no_command_ends_in_a_traceback(little_runs, ("retention", "{run}"), redirection)

@@ -641,6 +641,7 @@ def test_no_file_of_a_run_is_without_protection(little_runs: Path) -> None:
     assert unprotected(open_run(little_runs / "run")) == set()
 
 
+@pytest.mark.slow
 def test_no_file_of_a_real_run_is_without_protection(recorded_run: Run) -> None:
     assert unprotected(recorded_run) == set()
 

@@ -83,6 +83,7 @@ def test_a_refusal_is_said_at_once_and_no_message_holds_the_token(
     assert any(TOKEN in token for *_, token in server.requests), "it was sent to the hub alone"
 
 
+@pytest.mark.slow
 def test_a_pull_request_is_opened_once_and_creates_and_tags_nothing(folder: Path, server: Hub) -> None:
     server.failures = [0, 503]
     address = publish_data_set(folder, "lab/study", pull_request=True, pause=0.01)

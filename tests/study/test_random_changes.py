@@ -182,6 +182,7 @@ def test_no_change_of_a_study_folder_is_silent(played: LoadedStudy, tmp_path: Pa
     assert_none_silent(copied(played, tmp_path), tmp_path / "out", range(FEW))
 
 
+@pytest.mark.slow
 def test_no_change_of_an_archive_is_silent(played: LoadedStudy, tmp_path: Path) -> None:
     pack_study(played, tmp_path / "pack")
     assert_none_silent(tmp_path / "pack", tmp_path / "pack", range(FEW))

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 import probe_kit as pk
-from tests.acceptance.product import probe_kit
+from tests.acceptance.product import probe_kit, probe_kit_process
 from tests.acceptance.stored.conftest import StoredRuns
 from tests.acceptance.stored.printed_tables import (
     QUANTITIES,
@@ -62,10 +62,10 @@ def test_the_backbones_peak_is_the_best_accuracy_that_train_printed(
 
 @pytest.mark.parametrize("style", ["table", "markdown", "latex"])
 def test_every_text_format_shows_the_values_of_the_json(
-    style: str, runs: StoredRuns, rows: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+    style: str, runs: StoredRuns, rows: list[dict[str, Any]]
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "120")  # a narrower console has the intervals in the sentences alone
-    text = probe_kit("retention", runs.trained, "--format", style).out
+    # A console of fewer columns has the intervals in the sentences alone.
+    text = probe_kit_process("retention", runs.trained, "--format", style, COLUMNS="120").out
     for row in rows:
         printed = intervals(rows_with(text, row["category"]))
         assert set(quantities_of(row)) == set(QUANTITIES)

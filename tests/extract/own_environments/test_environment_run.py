@@ -52,6 +52,7 @@ def test_a_run_holds_outcomes_states_actions_and_facts_of_the_environment(played
     assert played.certificate["hooks_on_equals_hooks_off"]
 
 
+@pytest.mark.slow
 def test_facts_are_labels_and_a_run_without_sides_refuses_them(played: Run, tmp_path: Path) -> None:
     table = label_frame(played)
     assert {"control_step", "instruction", "env.block", "env.left", "env.state.0", "env.action.dx"} <= set(table)
@@ -77,6 +78,7 @@ def check_equal(some: Run, played: Run, rows: list[int]) -> None:
             np.testing.assert_allclose(some.rows(name)[ours], played.rows(name)[row], atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_activations_of_an_episode_do_not_depend_on_which_others_are_played(
     played: Run, pi0_tiny: Pi0, tmp_path: Path
 ) -> None:

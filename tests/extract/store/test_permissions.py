@@ -13,7 +13,10 @@ from probe_kit.suite import Suite
 from tests.support.little_run import intervene_on_little_run, probe_little_run, write_little_run
 
 
-@pytest.fixture(params=[0o002, 0o027, 0o077], ids=oct)
+@pytest.fixture(
+    params=[pytest.param(0o002, marks=pytest.mark.slow), 0o027, pytest.param(0o077, marks=pytest.mark.slow)],
+    ids=oct,
+)
 def umask(request: pytest.FixtureRequest) -> Iterator[int]:
     mask: int = request.param
     before = os.umask(mask)

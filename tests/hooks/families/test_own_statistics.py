@@ -96,6 +96,7 @@ def test_the_default_checkpoint_alone_has_default_units(family: str) -> None:
     assert not own.check("someone/fine-tune", random_weights=True, fetch=False).keys() & DEFAULTS[family].keys()
 
 
+@pytest.mark.slow
 def test_the_plan_prints_whose_units_are_used(tmp_path: Path) -> None:
     place = tuned("openvla", tmp_path / "tuned", "my_arm")
     command = [

@@ -194,6 +194,7 @@ def test_names_of_files_differ_where_columns_do() -> None:
     assert file_names(["a b", "a-b", "A-b", "../x", "…"]) == ["a-b", "a-b-2", "A-b-3", "x", "label"]
 
 
+@pytest.mark.slow
 def test_the_command_writes_figures_and_a_page_of_several_labels(run: Run, tmp_path: Path) -> None:
     page, folder = tmp_path / "report.html", tmp_path / "figures"
     targets = ["--target", "sim.tool_y", "--target", "a/b: <i>"]
@@ -222,6 +223,7 @@ def test_the_command_writes_figures_and_a_page_of_several_labels(run: Run, tmp_p
         assert message in " ".join(done.stderr.split())
 
 
+@pytest.mark.slow
 def test_the_report_of_sides_has_a_section_of_stored_labels(run: Run) -> None:
     text = report_html([run])
     assert '<details class="part" id="labels">' in text

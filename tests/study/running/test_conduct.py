@@ -172,6 +172,7 @@ def test_a_file_that_asks_for_more_items_plays_the_missing_ones_alone(file: Path
     assert shown["expert"] == 2
 
 
+@pytest.mark.slow
 def test_a_whole_study_is_entered_in_its_ledger_again_if_that_was_deleted(file: Path) -> None:
     conduct_study(plan_study(load_study(file)), env_workers=0)
     study = load_study(file)
@@ -233,6 +234,7 @@ def test_every_scene_is_built_before_the_first_run_is_played(file: Path, tmp_pat
     assert states(changed)["idle/short"] == states(changed)["idle/dark"] == ("whole", 4)
 
 
+@pytest.mark.slow
 def test_what_fails_while_it_plays_is_kept_with_its_traceback_and_tried_again_on_request(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

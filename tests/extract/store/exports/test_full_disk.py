@@ -27,8 +27,14 @@ def full_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", str(disk)], check=True)
 
 
-@pytest.mark.parametrize("words", ["export --format h5", "export --format safetensors", "export --format sae",
-                                   "export --format parquet", "copy"])  # fmt: skip
+@pytest.mark.parametrize(
+    "words",
+    ["export --format h5", "export --format sae"]
+    + [
+        pytest.param(words, marks=pytest.mark.slow)
+        for words in ("export --format safetensors", "export --format parquet", "copy")
+    ],
+)
 def test_a_full_disk_is_named_and_nothing_is_left(little_runs: Path, full_disk: Path, words: str) -> None:
     name, *options = words.split()
     out = ["--out", str(full_disk / "out")] if name == "export" else [str(full_disk / "out")]
