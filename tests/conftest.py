@@ -101,8 +101,22 @@ def _changed_files() -> str:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What tests the tool as a whole comes first: it is long, and no core shall end up alone with it."""
-    items.sort(key=lambda item: item.path.parent != Path(__file__).parent)
+    """Sort long files first, so that no core ends up alone with one.
+
+    The files of `acceptance/stored` share runs that one process makes. Only one of them comes early: a second process
+    would wait for it.
+    """
+    tests = Path(__file__).parent
+    first = [tests / "acceptance" / "stored" / "test_error_codes.py", tests / "acceptance" / "test_fence.py"]
+
+    def rank(item: pytest.Item) -> int:
+        if item.path in first:
+            return first.index(item.path)
+        if item.path.parent == first[0].parent:
+            return len(first) + 2
+        return len(first) + (item.path.parent != tests)
+
+    items.sort(key=rank)
 
 
 def pytest_collection_finish() -> None:

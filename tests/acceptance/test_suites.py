@@ -50,7 +50,7 @@ def balanced(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_table_becomes_a_suite_whose_correct_picture_lies_on_the_named_side(balanced: Path) -> None:
     suite = pk.load_suite(balanced)
-    listed = probe_kit("suite", "list", balanced, "--json").json()
+    listed = probe_kit("suite", "show", "--counts", balanced, "--json").json()
     assert "24" in json.dumps(listed)
     assert len(suite.items) == 24
     assert Counter(item.correct_side for item in suite.items) == {"left": 12, "right": 12}
