@@ -103,8 +103,8 @@ def _changed_files() -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Sort long files first, so that no core ends up alone with one.
 
-    The files of `acceptance/stored` share runs that one process makes. Only one of them comes early: a second process
-    would wait for it.
+    The files of `acceptance/stored` share runs that one process makes. Only one of them comes early, because a
+    second process would wait for it.
     """
     tests = Path(__file__).parent
     first = [tests / "acceptance" / "stored" / "test_error_codes.py", tests / "acceptance" / "test_fence.py"]
