@@ -32,12 +32,12 @@ _LEGENDS = {
     "success %": "Success: the cube ends on the correct picture",
     "retention": "Retention: share of the backbone's signal left in the action",
 }
+"""What a column shows."""
 _TESTS = {
     "p (Holm)": "p: exact, of a difference in success or answers, (corrected for all categories and pairs)",
     "p over models (least)": "p over models: exact, models as the unit (the least that so few models allow)",
 }
-"""The columns of differences only."""
-"""What a column shows."""
+"""What a column of differences shows."""
 HEADING_HELP = {
     heading: f"{meaning[:1].upper()}{meaning[1:]}."
     for heading, legend in (_LEGENDS | _TESTS).items()

@@ -210,7 +210,8 @@ def probing_table(table: RetentionTable) -> NamedTable:
 
 def as_paper_table(table: RetentionTable) -> NamedTable:
     """Return the paper's own numbers by its own formulas, see `probe_kit.retention.formats.as_paper`."""
-    return NamedTable(table.as_paper.text, table.as_paper.numbers)
+    made = table.as_paper
+    return NamedTable(made.text, made.numbers)
 
 
 def once_per_run(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
