@@ -74,6 +74,6 @@ def test_what_a_third_party_says_of_its_family_is_shown_as_text(monkeypatch: pyt
     family = Family("mine", NAME, None, "x:y", streams=NAME, notes=NAME)
     package = SimpleNamespace(name="theirs", metadata={"Summary": NAME})
     entry = SimpleNamespace(name="mine", value="x:FAMILY", load=lambda: family, dist=package)
-    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     assert said("models", "mine").count(SHOWN) == 3
     assert "[bold]x" in said("models")

@@ -26,7 +26,7 @@ def test_a_checkpoint_folder_that_is_not_there_is_refused() -> None:
 def test_a_third_party_family_is_found_through_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
     mine = Family("mine", "a family of my own", None, "probe_kit.hooks.families.pi0.adapter:load_pi0_tiny")
     entry = SimpleNamespace(name="mine", load=lambda: mine, dist=None, value="theirs:FAMILY")
-    monkeypatch.setattr(registry, "entry_points", lambda group: [entry] if group == "probe_kit.policies" else [])
+    monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     assert known_families()["mine"] is mine
     assert load_policy("mine", random_weights=True).card.random_weights
 
@@ -34,7 +34,7 @@ def test_a_third_party_family_is_found_through_its_entry_point(monkeypatch: pyte
 def test_a_third_party_cannot_replace_an_embedded_family(monkeypatch: pytest.MonkeyPatch) -> None:
     impostor = Family("pi0", "not pi0", None, "nowhere:nothing")
     entry = SimpleNamespace(name="pi0", load=lambda: impostor, dist=None, value="theirs:FAMILY")
-    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     assert known_families()["pi0"] is not impostor
 
 
@@ -85,7 +85,7 @@ def test_a_third_partys_family_that_breaks_is_named_and_takes_no_other_with_it(
         raise error
 
     entry = SimpleNamespace(load=load, name="broken", value="theirs:FAMILY", dist=None)
-    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     with pytest.warns(registry.BrokenFamilyWarning, match=f"'broken'.*{type(error).__name__}"):
         known = known_families()
     assert "pi0-tiny" in known
@@ -96,7 +96,7 @@ def test_a_third_partys_family_that_breaks_is_named_and_takes_no_other_with_it(
 
 def test_what_is_no_family_is_refused_by_its_type(monkeypatch: pytest.MonkeyPatch) -> None:
     entry = SimpleNamespace(load=lambda: "pi0", name="text", value="theirs:NAME", dist=None)
-    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     with pytest.warns(registry.BrokenFamilyWarning, match="it is a str, not a probe_kit.hooks.Family"):
         known_families()
 
@@ -104,7 +104,7 @@ def test_what_is_no_family_is_refused_by_its_type(monkeypatch: pytest.MonkeyPatc
 def test_a_family_has_the_name_of_its_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
     mine = Family("mine", "a family of my own", None, "nowhere:nothing")
     entry = SimpleNamespace(name="other", load=lambda: mine, value="theirs:FAMILY", dist=None)
-    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     with pytest.raises(UnknownModelError, match="'mine' and its entry point 'other'"):
         load_policy("other")
 
@@ -114,7 +114,7 @@ def test_no_third_party_is_imported_until_its_family_is_named(monkeypatch: pytes
         raise AssertionError("imported")
 
     entry = SimpleNamespace(name="theirs", load=load, value="theirs:FAMILY", dist=None)
-    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     assert registry.get_family("pi0") is not None
     assert registry.get_family("expert") is None
     assert registry.third_party_families() == {"theirs": "theirs:FAMILY"}

@@ -154,7 +154,7 @@ def test_a_family_that_is_wrong_about_itself_breaks_no_page(monkeypatch: pytest.
 
     broken = Family("mine", "theirs", None, "x:y", packages=(("nowhere.at.all", "extra"),))
     entry = SimpleNamespace(name="mine", value="x:y", load=lambda: broken, dist=None)
-    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     (row,) = _model_rows("mine")
     assert "unknown: " in row["ready"]
     rows = {row["model"]: row["ready"] for row in _model_rows(None)}

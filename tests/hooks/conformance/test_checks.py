@@ -342,7 +342,7 @@ def load_sloppily(checkpoint: str, *_: object, **__: object) -> EncoderPolicy:
 def subject_of(loader: str, given: Given, monkeypatch: pytest.MonkeyPatch) -> Subject:
     family = Family("encoder-vla", "", None, loader, needs_checkpoint=True)
     entry = SimpleNamespace(name="encoder-vla", load=lambda: family, value="x:y", dist=None)
-    monkeypatch.setattr(registry, "entry_points", lambda **_: [entry])
+    monkeypatch.setattr(registry, "family_entries", lambda: [entry])
     settings = ContractSettings()
     settings.family = "encoder-vla"
     return PolicySubject(settings, given)
