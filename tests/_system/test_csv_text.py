@@ -19,6 +19,7 @@ from probe_kit.errors import SuiteError
 from probe_kit.suite import Suite
 from probe_kit.suite.converters.curation import read_curation
 from probe_kit.suite.manifest import save_suite
+from tests.support.parsed import package_nodes
 
 ROOT = Path(__file__).parents[2]
 FORMULAS = [
@@ -97,10 +98,8 @@ def test_a_frame_without_such_texts_is_written_as_pandas_writes_it() -> None:
 def test_every_csv_of_the_package_goes_through_one_function() -> None:
     others = [
         f"{path.relative_to(ROOT)}:{call.lineno}"
-        for path in sorted((ROOT / "probe_kit").rglob("*.py"))
+        for path, call in package_nodes(ast.Call)
         if path.name != "csv_text.py"
-        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(call, ast.Call)
         and isinstance(call.func, ast.Attribute)
         and (
             call.func.attr in ("DictWriter", "savetxt")

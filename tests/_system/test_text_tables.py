@@ -16,6 +16,7 @@ from probe_kit.suite.converters.curation import read_curation
 from probe_kit.suite.converters.options import MmbenchOptions
 from probe_kit.suite.custom.from_csv import read_rows
 from probe_kit.train import Labels
+from tests.support.parsed import package_nodes
 
 ROOT = Path(__file__).parents[2]
 Rows = Sequence[Sequence[str]]
@@ -282,10 +283,8 @@ def test_yes_and_no_are_read_in_the_usual_spellings(cell: object, truth: bool | 
 def test_every_table_of_text_is_read_by_one_function() -> None:
     others = [
         f"{path.relative_to(ROOT)}:{call.lineno}"
-        for path in sorted((ROOT / "probe_kit").rglob("*.py"))
+        for path, call in package_nodes(ast.Call)
         if path.name != "text_tables.py"
-        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(call, ast.Call)
         and isinstance(call.func, ast.Attribute)
         and (
             call.func.attr in ("DictReader", "read_csv", "read_table", "genfromtxt", "loadtxt", "Sniffer")

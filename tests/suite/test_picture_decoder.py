@@ -12,6 +12,7 @@ from PIL import Image, ImageFile
 
 from probe_kit.errors import SceneError, SuiteError
 from probe_kit.suite.pictures import FORMATS, decode_bytes, decode_picture, picture_size
+from tests.support.parsed import package_nodes
 
 ROOT = Path(__file__).parents[2]
 LOSSLESS = {"PNG": {}, "GIF": {}, "BMP": {}, "WEBP": {"lossless": True}}
@@ -207,16 +208,11 @@ def test_every_picture_is_decoded_by_one_module() -> None:
     decoder = ROOT / "probe_kit" / "suite" / "pictures.py"
     others = [
         f"{path.relative_to(ROOT)}:{call.lineno}"
-        for path in sorted((ROOT / "probe_kit").rglob("*.py"))
-        for call in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(call, ast.Call) and path != decoder and _decodes(call.func)
+        for path, call in package_nodes(ast.Call)
+        if path != decoder and _decodes(call.func)
     ]
     assert others == []
-    assert any(
-        _decodes(call.func)
-        for call in ast.walk(ast.parse(decoder.read_text(encoding="utf-8")))
-        if isinstance(call, ast.Call)
-    )
+    assert any(path == decoder and _decodes(call.func) for path, call in package_nodes(ast.Call))
 
 
 def _decodes(function: ast.expr) -> bool:

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+from tests.support.parsed import parsed
+
 type Kind = Literal["docstring", "summary", "help", "string", "page", "table", "comment"]
 
 
@@ -22,7 +24,7 @@ class Prose(NamedTuple):
 
 def prose_of_module(path: Path, name: str) -> Iterator[Prose]:
     """Docstrings of the module and of its public names, help texts, and every other string with a space in it."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = parsed(path)
     docstrings: dict[ast.Constant, bool] = {}
     _collect_docstrings(tree, docstrings, public=True)
     helps = {

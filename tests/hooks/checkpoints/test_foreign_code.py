@@ -16,6 +16,7 @@ from probe_kit.hooks.registry import find_family
 from probe_kit.hooks.testing import example_observations
 from probe_kit.models.pretrained import load_pretrained
 from tests.support.every_checkpoint import WRITERS
+from tests.support.parsed import package_nodes
 
 PACKAGE = Path(probe_kit.__file__).parent
 WITHOUT_AUTO_MAP = {"PreTrainedConfig", "PeftConfig"}
@@ -104,9 +105,8 @@ def test_the_planted_code_would_run_with_consent(tmp_path: Path, consent: Callab
 def _calls() -> list[tuple[str, ast.Call, ast.Attribute]]:
     return [
         (f"{path.relative_to(PACKAGE)}:{node.lineno}", node, node.func)
-        for path in sorted(PACKAGE.rglob("*.py"))
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
+        for path, node in package_nodes(ast.Call)
+        if isinstance(node.func, ast.Attribute)
     ]
 
 
@@ -138,10 +138,8 @@ def test_every_call_that_can_run_code_of_a_checkpoint_refuses_it() -> None:
 def test_no_call_allows_code_of_a_checkpoint() -> None:
     allowing = [
         f"{path.relative_to(PACKAGE)}:{node.lineno}"
-        for path in sorted(PACKAGE.rglob("*.py"))
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.keyword)
-        and node.arg == "trust_remote_code"
+        for path, node in package_nodes(ast.keyword)
+        if node.arg == "trust_remote_code"
         and not (isinstance(node.value, ast.Constant) and node.value.value is False)
     ]
     assert not allowing

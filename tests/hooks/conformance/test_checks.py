@@ -27,6 +27,7 @@ from probe_kit.hooks.conformance.subject import AnswerSubject, ContractSettings,
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.testing import AdapterContract, AnswerModelContract
 from tests.support.encoder_vla.policy import CHUNK, STEPS, WIDTH, EncoderPolicy, EncoderVLA, load, write_checkpoint
+from tests.support.parsed import parsed
 from tests.support.position_models import PositionModel, always, likes
 
 CHECKS = {own.name: own for own in (*POLICY_CHECKS, *ANSWER_CHECKS)}
@@ -429,7 +430,7 @@ def test_pytest_is_imported_by_the_contract_classes_alone() -> None:
 
 def imported(path: Path) -> set[str]:
     """Top-level packages that a module imports, wherever the statement stands."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+    tree = parsed(path)
     names = [each.name for node in ast.walk(tree) if isinstance(node, ast.Import) for each in node.names]
     names += [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     return {name.partition(".")[0] for name in names}
