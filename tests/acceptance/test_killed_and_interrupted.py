@@ -54,6 +54,7 @@ def committed(run: Path) -> int:
     return len(list(run.glob("commits/*.json")))
 
 
+@pytest.mark.slow
 def test_a_killed_extract_resumes_to_the_bytes_of_an_undisturbed_one(played: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     typed = ("extract", *PLAYED, "--out", run)

@@ -49,9 +49,9 @@ def play(folder: Path) -> None:
     """Play, ask and fit all of `StoredRuns`."""
     runs = StoredRuns(folder)
     both, color = ("--categories", "color,state"), ("--categories", "color")
-    policy = ("--model", "pi0-tiny", "--items", "12", "--batch", "24", "--env-workers", "0", "--max-steps", "6")
+    policy = ("--model", "pi0-tiny", "--items", "12", "--batch", "8", "--env-workers", "0", "--max-steps", "6")
     policy += ("--execute", "3")
-    probes = ("--permutations", "3", "--controls", "none")
+    probes = ("--permutations", "3", "--controls", "none", "--views", "mean")
     probe_kit("extract", *policy, *both, "--out", runs.trained, "--label", "trained")
     probe_kit("train", runs.trained, *probes)
     probe_kit("intervene", runs.trained, *color)

@@ -61,7 +61,13 @@ def consent(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
 
 
 @pytest.mark.parametrize("unknown_classes", [False, True], ids=["classes of transformers", "unknown classes"])
-@pytest.mark.parametrize("names", FILES.values(), ids=FILES)
+@pytest.mark.parametrize(
+    "names",
+    [
+        pytest.param([name for names in FILES.values() for name in names], id="every file"),
+        *(pytest.param(names, id=file, marks=pytest.mark.slow) for file, names in FILES.items()),
+    ],
+)
 @pytest.mark.parametrize("family", WRITERS)
 @pytest.mark.filterwarnings("ignore")
 def test_a_checkpoint_that_names_python_code_acts_without_it_or_is_refused(

@@ -78,6 +78,7 @@ class TestMagmaDrawn(AdapterContract):
         return load_magma(str(folder), temperature=0.7, unnorm_key="bridge_orig")
 
 
+@pytest.mark.slow
 class TestMagmaAsked(AnswerModelContract):
     """Its own questions, not those for an action; a begun answer behind the frames."""
 

@@ -82,6 +82,7 @@ class TestSingleTowerMistralWithATokenizerFile(AdapterContract):
         return [replace(observation, instruction=f"Put the cube on the {noun}") for noun in ("star", "shape")]
 
 
+@pytest.mark.slow
 class TestGoldenOpenVLA(AdapterContract):
     @pytest.fixture
     def policy(self, golden: OpenVLA) -> OpenVLA:

@@ -46,6 +46,7 @@ def seen() -> Observation:
     return Observation(image, state, "Put the cube on the red shape")
 
 
+@pytest.mark.slow
 class TestTheProtocolsPi0(AdapterContract):
     family = "pi0"
     options: ClassVar[dict[str, Any]] = {"statistics": "bridge"}
