@@ -77,8 +77,8 @@ class Family:
     units: `module:function(checkpoint, **options)` that says whose units the actions get, and where they stand,
     from the small files; it raises UsageError where that has to be chosen. of_default: options that belong to the
     default checkpoint, and to no other; they count where they are not given.
-    files: patterns of the files of a hub repository that are needed. bare_adapters: whether a LoRA adapter needs
-    no config.json of its own, as the family reads its base's. parameters: count of the released sizes, by name.
+    files: patterns of the files of a hub repository that are needed. parameters: count of the released sizes, by
+    name.
     always_float32: whether weights stay in float32 whatever dtype is chosen.
     not_acting: released checkpoints whose actions no arm here can execute.
     home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
@@ -115,7 +115,6 @@ class Family:
     units: str | None = None
     of_default: Mapping[str, Any] = MappingProxyType({})
     files: tuple[str, ...] = PATTERNS
-    bare_adapters: bool = False
     parameters: Mapping[str, int] = MappingProxyType({})
     always_float32: bool = False
     not_acting: tuple[str, ...] = ()
@@ -249,7 +248,6 @@ class Family:
                     self.config_types,
                     weights,
                     self.instead,
-                    self.bare_adapters,
                 )
         return self._with_own(chosen, place)
 

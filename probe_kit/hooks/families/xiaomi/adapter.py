@@ -26,7 +26,6 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     content_hashes,
     side_files,
 )
-from probe_kit.hooks.checkpoints.file_checks import check_own_config
 from probe_kit.hooks.checkpoints.weights import read_weights
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Tap
@@ -265,7 +264,6 @@ def xiaomi_units(checkpoint: str, *, robot: str | None = None, **_: Any) -> str:
     """See `Family.units`; a checkpoint without statistics says so, since it can be captured."""
     folder = checkpoint_folder(checkpoint, SMALL_FILES)
     try:
-        check_own_config(folder)
         units = read_units(folder, robot, XiaomiConfig.from_folder(folder).action_dim)
     except CheckpointError as error:
         return f"none: {error}"
@@ -294,7 +292,6 @@ def load_xiaomi(
         raise UsageError(f"{steps} Euler steps make no action; expected 1 or more")
     name = checkpoint or DEFAULT_CHECKPOINT
     folder = checkpoint_folder(name)
-    check_own_config(folder)
     config = XiaomiConfig.from_folder(folder)
 
     def build(kind: torch.dtype, place: str) -> XiaomiNetwork:

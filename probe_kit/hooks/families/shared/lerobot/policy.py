@@ -22,7 +22,6 @@ from torch import Tensor, nn
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, checkpoint_folder, content_hashes, side_files
-from probe_kit.hooks.checkpoints.file_checks import check_own_config
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Policy
@@ -218,7 +217,6 @@ class LerobotPolicy(Policy):
 
     @classmethod
     def _read_config(cls, folder: Path, evaluation: Evaluation) -> Any:
-        check_own_config(folder)
         if not (folder / "config.json").is_file():
             raise CheckpointError(f"{folder / 'config.json'} is missing; {folder} is not a lerobot checkpoint")
         config: Any = cls.parse_config(folder, evaluation)
