@@ -19,12 +19,15 @@ from probe_kit.hooks.checkpoints.adapter_files import (
 from probe_kit.hooks.checkpoints.checkpoint import ADAPTER_FILE, is_weights
 
 _CONFIGURATIONS = ("config.json", "config.yaml")
-_ONE_PART = (
-    ("policy_preprocessor",),
-    ("policy_postprocessor",),
-    ("tokenizer", "special_tokens_map", "added_tokens", "vocab", "merges", "spiece", "sentencepiece"),
+_READ_TOGETHER = (
+    (("policy_preprocessor.json",), ("policy_preprocessor",)),
+    (("policy_postprocessor.json",), ("policy_postprocessor",)),
+    (
+        ("tokenizer.json", "tokenizer.model", "vocab.json", "spiece.model"),
+        ("tokenizer", "special_tokens_map", "added_tokens", "vocab", "merges", "spiece"),
+    ),
 )
-"""Beginnings of names of files that are read together: an adapter's are never mixed with its base's."""
+"""Files that decide, with the beginnings of names that are read with them: of the adapter alone or its base."""
 _BESIDE = ("dims.json", "tokenizer")
 """What some layouts keep beside the folder of a checkpoint."""
 _RUNS = "checkpoints"
@@ -94,5 +97,5 @@ def _is_left_out(path: Path) -> bool:
 
 def _is_replaced(name: str, own: Sequence[str]) -> bool:
     """Whether the adapter has this file of the base, or one that is read together with such files."""
-    part = next((part for part in _ONE_PART if name.startswith(part)), None)
-    return name in own or (part is not None and any(other.startswith(part) for other in own))
+    parts = (begin for heads, begin in _READ_TOGETHER if any(head in own for head in heads))
+    return name in own or any(name.startswith(begin) for begin in parts)

@@ -98,9 +98,9 @@ def _cached_commit(named: HubName) -> str | None:
 
 def _cache_of(repository: str) -> Path:
     from huggingface_hub import constants
-    from huggingface_hub.file_download import repo_folder_name
 
-    return Path(constants.HF_HUB_CACHE) / repo_folder_name(repo_id=repository, repo_type="model")
+    # Not the hub's own function: it refuses names that no repository can have, and nothing is looked up here.
+    return Path(constants.HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}"
 
 
 def is_on_hub(checkpoint: str) -> bool:
@@ -312,6 +312,22 @@ def check_unambiguous(folder: Path) -> None:
             f"{folder} holds two sets of weights: {WEIGHTS_FILE}, and {INDEX_FILE} with {others[0]}{more}. "
             "Nothing says which one is meant: remove the other one"
         )
+
+
+def weights_sizes(folder: Path) -> int | None:
+    """Bytes of the weights that an index of shards lists and the folder lacks; None where no index says it.
+
+    An index has the size of all tensors, `total_size`.
+    """
+    try:
+        index = load_json(folder / INDEX_FILE)
+        total = index["metadata"]["total_size"]
+        shards = listed_shards(folder / INDEX_FILE)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if type(total) is not int or total < 1:
+        return None
+    return max(0, total - sum((folder / name).stat().st_size for name in shards if (folder / name).is_file()))
 
 
 def missing_weights(folder: Path) -> str:

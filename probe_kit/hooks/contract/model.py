@@ -143,6 +143,13 @@ class Model(ABC):
         del instructions
         return None
 
+    def read_late_files(self) -> None:
+        """Read what is otherwise read at the first inference, such as a tokenizer of another repository.
+
+        Its commit then stands in the card. Raises CheckpointError for what is not here.
+        """
+        return
+
     def sites(self, quantity: str = "residual") -> list[Site]:
         """All sites of one quantity in the stored streams that have it, stream by stream."""
         having = [stream for stream in self.streams.values() if quantity in stream.captured]
@@ -230,6 +237,10 @@ class Policy(Model):
 
     def embodiment_mismatch(self) -> str | None:
         """Why its actions cannot move this arm; None if they can. Its activations can be captured nevertheless."""
+        return None
+
+    def configured_mismatch(self) -> str | None:
+        """As `embodiment_mismatch`, from the configuration alone: its statistics may not be here yet."""
         return None
 
     def zero_filled_inputs(self) -> tuple[str, ...]:

@@ -378,13 +378,17 @@ class LerobotPolicy(Policy):
         """The state, where it has other numbers than the arm's, or no units."""
         return ("state",) if self._state_misfit() else ()
 
-    def _action_misfit(self) -> str | None:
+    def configured_mismatch(self) -> str | None:
+        """Other actions than an end-effector delta."""
         dimensions = self.config.output_features["action"].shape[0]
         if dimensions != _DIMENSIONS:
             return f"{self.checkpoint} acts in {dimensions} dimensions; the arm needs a 7-DoF end-effector delta"
         if self._lacks_state:
             return f"{self.checkpoint} predicts changes relative to the state, and nothing here adds the state"
-        return _problem(lambda: self.action_units)
+        return None
+
+    def _action_misfit(self) -> str | None:
+        return self.configured_mismatch() or _problem(lambda: self.action_units)
 
     def _state_misfit(self) -> str | None:
         example = self.laid_out(np.zeros((1, ARM_NUMBERS), np.float32)).shape[1]
@@ -570,6 +574,10 @@ class LerobotPolicy(Policy):
         special = frozenset(self.tokenizer.all_special_ids)
         labels = ["special" if one in special else "language" for one in ids]
         return [label if kept else PADDING for label, kept in zip(labels, valid, strict=True)]
+
+    def read_late_files(self) -> None:
+        """The tokenizer."""
+        self.tokenizer  # noqa: B018 - read once, and kept
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each instruction, without padding."""
