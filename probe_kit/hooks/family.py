@@ -197,7 +197,7 @@ class Family:
             model.card,
             checkpoint=pinned(model.card.checkpoint),
             settings={**said, **model.card.settings},
-            notes=_notes((*model.card.notes, *([merged] if merged else []))),
+            notes=_notes((*model.card.notes, *([merged] if merged else []), *_unguarded(model))),
             repositories=_others(commits, place),
             **self._source_of(model.card, place),
         )
@@ -432,6 +432,15 @@ class Family:
 
     def _missing_packages(self) -> list[tuple[str, str]]:
         return [(module, extra) for module, extra in self.packages if find_spec(module) is None]
+
+
+def _unguarded(model: "Model") -> tuple[str, ...]:
+    """A note on states that are read and compared with no statistics."""
+    from probe_kit.hooks.contract.model import Policy
+
+    if not isinstance(model, Policy) or model.state_numbers is None or (why := model.unguarded_state) is None:
+        return ()
+    return (f"units of states are not compared with statistics: {why}",)
 
 
 def _notes(notes: Iterable[str]) -> tuple[str, ...]:

@@ -311,6 +311,17 @@ class Policy(Model):
         """
         return np.zeros(states.shape, bool)
 
+    @property
+    def unguarded_state(self) -> str | None:
+        """Why the states of a source are compared with no statistics; None where `unusual_states` compares them.
+
+        A family that reads a state has statistics of it, or says here why not; the card's notes repeat it.
+        """
+        if self.state_numbers is None:
+            return "no state is read"
+        compares = type(self).unusual_states is not Policy.unusual_states
+        return None if compares else "the family has no statistics of states"
+
     def unusual_actions(self, actions: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(n, D) which numbers of recorded actions (n, D) lie far outside the checkpoint's own statistics."""
         return np.zeros(actions.shape, bool)

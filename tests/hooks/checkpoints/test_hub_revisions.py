@@ -123,9 +123,8 @@ def base_of(folder: Path, *_: str) -> dict[str, bytes]:
     module = f"base_model.model.{name.removesuffix('.weight')}"
     shutil.rmtree(folder)
     folder.mkdir()
-    save_file(
-        {f"{module}.lora_A.weight": down, f"{module}.lora_B.weight": up}, folder / "adapter_model.safetensors"
-    )
+    factors = {f"{module}.lora_A.weight": down, f"{module}.lora_B.weight": up}
+    save_file(factors, folder / "adapter_model.safetensors")
     settings = {"peft_type": "LORA", "r": 2, "lora_alpha": 2, "base_model_name_or_path": PART}
     (folder / "adapter_config.json").write_text(json.dumps(settings), encoding="utf-8")
     return files
@@ -136,7 +135,7 @@ PARTS: dict[str, tuple[str, Callable[..., dict[str, bytes]], str, str, str]] = {
     "checkpoint of the network": ("molmoact2", vlm_of, "checkpoint_path", "vlm", "config.json"),
     "base of a policy": ("groot", vlm_of, "base_model_path", "base", "statistics.json"),
     "action tokenizer": ("pi0-fast", vlm_of, "action_tokenizer_name", "fast", "processor_config.json"),
-    "named tokenizer": ("xvla", tokenizer_of, "tokenizer_name", "", "tokenizer.json"),
+    "a step's tokenizer": ("xvla", tokenizer_of, "", "", "tokenizer.json"),
     "default tokenizer": ("pi0", tokenizer_of, "", "", "tokenizer.json"),
     "base of an adapter": ("pi05", base_of, "", "", "config.json"),
 }
@@ -150,7 +149,9 @@ def test_the_card_has_the_commits_of_the_repositories_that_a_checkpoint_names_an
     write, options = WRITERS[family]
     folder = write(tmp_path / "model")
     files = taken(folder, field, part)
-    repo = "google/paligemma-3b-pt-224" if kind == "default tokenizer" else PART
+    repo = {"default tokenizer": "google/paligemma-3b-pt-224", "a step's tokenizer": "facebook/bart-large"}.get(
+        kind, PART
+    )
     server.models[repo] = {OLD: files, NEW: {**files, changed: files[changed] + b"\n"}}
     server.names[repo] = {"main": OLD}
     card = load_model(family, str(folder), **options).card

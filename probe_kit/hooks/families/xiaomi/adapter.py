@@ -173,6 +173,11 @@ class Xiaomi(QwenVLA):
         """The middle of the picture, at the size the robot's pictures have."""
         return look(seen.image, self.robot)
 
+    @property
+    def unguarded_state(self) -> str | None:
+        """The release has statistics of actions alone."""
+        return f"the state is read as it is, and {STATISTICS_FILE} has statistics of actions alone"
+
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:

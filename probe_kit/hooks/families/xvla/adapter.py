@@ -207,6 +207,11 @@ class Xvla(LerobotPolicy):
         batch["domain_id"] = torch.full((len(seen),), self.steps.domain, device=self.config.device)
         return batch
 
+    @property
+    def unguarded_state(self) -> str | None:
+        """Also where its network reads none."""
+        return super().unguarded_state if self.config.use_proprio else "no state is read (use_proprio: false)"
+
     def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
         """The end of the denoising from the noise of the seeds."""
         chunk: NDArray[np.float32] = self.infer(batch, self.noise(seeds)).float().cpu().numpy()

@@ -57,6 +57,8 @@ IMAGES, STATE = "observation.images.", "observation.state"
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 MOST_TOKENS = 1 << 16
 """Of a prompt: far beyond any policy, and no memory without end."""
+UNCOMPARED = ("IDENTITY", "EXCLUDED")
+"""Modes of units without statistics: the state is read as it is, or not at all."""
 _DIMENSIONS = 7
 """Of the arm's actions."""
 
@@ -356,6 +358,17 @@ class LerobotPolicy(Policy):
     def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
         return self.state_units.unusual(states)
+
+    @property
+    def unguarded_state(self) -> str | None:
+        """Also for a checkpoint that reads the state as it is, or without its units."""
+        try:
+            units = self.state_units
+        except CheckpointError as error:
+            return str(error)
+        if units.mode.startswith(UNCOMPARED):
+            return f"the state is {units.mode} by {units.source}"
+        return None
 
     def unusual_actions(self, actions: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
