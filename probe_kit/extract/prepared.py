@@ -47,7 +47,7 @@ from probe_kit.extract.rollout.settings_checks import (
     check_misfit,
     check_unreachable,
 )
-from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.run_layout import RUN_FILE, StoredStream
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import provenance_here
@@ -55,6 +55,7 @@ from probe_kit.extract.store.writer import RunWriter
 from probe_kit.extract.vqa.phrases import phrases
 from probe_kit.hashing import sha256_json
 from probe_kit.suite import Suite, default_suite, load_suite
+from probe_kit.suite.build import ITEMS, default_folder
 
 if TYPE_CHECKING:
     from probe_kit.hooks import AnswerModel, Policy
@@ -314,7 +315,7 @@ def check_run(
     if not loaded:
         check_model(settings, tuple(SCRIPTED), fetch)
     check_meaningless(settings)
-    suite = _suite(settings)
+    suite = _suite(settings, not fetch and _is_only_planned(settings, location))
     texts = _texts(settings, suite)
     if not loaded:
         check_words(settings, texts, tuple(SCRIPTED))
@@ -352,10 +353,32 @@ def _declared_card(settings: RunSettings) -> dict[str, Any]:
     return {"model": settings.model, "random_weights": settings.random_weights, "weights_sha256": None, **known}
 
 
-def _suite(settings: RunSettings) -> Suite:
+def _is_only_planned(settings: RunSettings, location: Location | None) -> bool:
+    """Whether nothing but the items themselves is asked of the suite.
+
+    Names of runs that are known before they are played hold the hash of the whole suite, and so does a run that is
+    there; questions name objects of all its items.
+    """
+    if not isinstance(settings, ExtractSettings):
+        return False
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(settings.model)
+    if location is None:
+        return family is not None and bool(family.declared)
+    with location.in_words():
+        return not location.exists(RUN_FILE)
+
+
+def _suite(settings: RunSettings, planned: bool = False) -> Suite:
+    """The suite of these settings. planned: its first items alone are needed."""
     if settings.suite is None:
-        # Of a category drawn alone every item is the same: drawing all eleven takes half a minute.
-        return default_suite(settings.categories).select(None, settings.items)
+        # Of a category drawn alone every item is the same, and fewer items are the beginning of more: drawing all
+        # eleven takes minutes.
+        drawn = ITEMS
+        if planned and settings.items is not None and not default_folder(settings.categories).is_dir():
+            drawn = min(max(2, settings.items + settings.items % 2), ITEMS)
+        return default_suite(settings.categories, drawn).select(None, settings.items)
     return load_suite(settings.suite).select(settings.categories, settings.items)
 
 

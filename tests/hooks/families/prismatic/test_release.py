@@ -78,6 +78,7 @@ def test_no_other_model_of_the_repository_is_asked_for(cache: Path, monkeypatch:
         return str(folder.parent)
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
+    monkeypatch.setattr("probe_kit.hooks.checkpoints.checkpoint.unreachable", lambda: "")
     find_family("prismatic").check(None)
     ((repository, patterns),) = asked
     assert repository == "TRI-ML/prismatic-vlms"
