@@ -56,6 +56,7 @@ from probe_kit.extract.vqa.phrases import phrases
 from probe_kit.hashing import sha256_json
 from probe_kit.suite import Suite, default_suite, load_suite
 from probe_kit.suite.build import ITEMS, default_folder
+from probe_kit.suite.validation.sufficiency import Smallest
 
 if TYPE_CHECKING:
     from probe_kit.hooks import AnswerModel, Policy
@@ -373,13 +374,21 @@ def _is_only_planned(settings: RunSettings, location: Location | None) -> bool:
 def _suite(settings: RunSettings, planned: bool = False) -> Suite:
     """The suite of these settings. planned: its first items alone are needed."""
     if settings.suite is None:
-        # Of a category drawn alone every item is the same, and fewer items are the beginning of more: drawing all
-        # eleven takes minutes.
-        drawn = ITEMS
+        # Of a category drawn alone every item is the same: drawing all eleven takes minutes.
         if planned and settings.items is not None and not default_folder(settings.categories).is_dir():
-            drawn = min(max(2, settings.items + settings.items % 2), ITEMS)
-        return default_suite(settings.categories, drawn).select(None, settings.items)
+            return _first_items(settings.categories, settings.items)
+        return default_suite(settings.categories).select(None, settings.items)
     return load_suite(settings.suite).select(settings.categories, settings.items)
+
+
+def _first_items(categories: Sequence[str] | None, count: int) -> Suite:
+    """The first items of the embedded suite, drawn alone: fewer items are the beginning of more.
+
+    It is said to be selected from the category that a plan looks at for further items, which is drawn in full.
+    """
+    drawn = min(max(2, count + count % 2), ITEMS)
+    suite = default_suite(categories, drawn).select(None, count)
+    return replace(suite, selected_from=default_suite((Smallest.of(suite).category,)))
 
 
 def _texts(settings: RunSettings, suite: Suite) -> tuple[str, ...]:

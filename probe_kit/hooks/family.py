@@ -24,7 +24,6 @@ from probe_kit.hooks.checkpoints.adapter_files import with_adapters_named
 from probe_kit.hooks.checkpoints.checkpoint import (
     CONFIG_FILE,
     PATTERNS,
-    checkpoint_folder,
     hub_name,
     is_on_hub,
     missing_weights,
@@ -33,6 +32,7 @@ from probe_kit.hooks.checkpoints.checkpoint import (
 )
 from probe_kit.hooks.checkpoints.commits import recorded_commits
 from probe_kit.hooks.checkpoints.file_checks import check_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
 from probe_kit.hooks.contract.card import ModelCard, SourceWeights
 from probe_kit.hooks.contract.declared import DeclaredStream

@@ -14,11 +14,13 @@ from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, prepare
 from probe_kit.extract.extraction import prepare_asks
 from probe_kit.extract.needs import weights_needed
+from probe_kit.extract.plan import Plan
 from probe_kit.extract.store.locations.disk import in_units
 from probe_kit.hooks import load_model
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.registry import own_families
-from probe_kit.suite import Suite, build_suite
+from probe_kit.suite import Suite, build_suite, default_suite, load_suite
+from probe_kit.suite.validation.sufficiency import sufficiencies
 from tests.support.every_checkpoint import WRITERS
 from tests.support.pi0_checkpoints import write_intact
 from tests.support.pi05_checkpoints import write_pi05
@@ -261,6 +263,27 @@ def test_a_folder_that_is_not_there_is_refused_without_the_network(name: str, sm
     """Also of families whose checkpoints only their loader knows."""
     with pytest.raises(CheckpointError, match="does not exist"):
         prepare(settings_of(name, small_suite, checkpoint="./nowhere"), fetch=False)
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_plan_of_a_few_items_draws_these_and_one_category(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The items, their hash and what they are enough for are those of the whole suite."""
+    monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path / "cache"))
+    settings = ExtractSettings("pi05", categories=("color", "shape"), items=4, device="cuda", capture_only=True)
+    first = prepare(settings, fetch=False)
+    assert isinstance(first.plan, Plan)
+    drawn = [len(load_suite(place).items) for place in (tmp_path / "cache" / "suites").iterdir()]
+    assert sorted(drawn) == [8, 150]
+    whole = default_suite(("color", "shape"))
+    again = prepare(settings, fetch=False)
+    assert isinstance(again.plan, Plan)
+    assert again.plan.suite.whole.content_sha256 == whole.content_sha256
+    assert first.plan.suite.items == again.plan.suite.items
+    assert first.plan.suite.identity == again.plan.suite.identity
+    enough = [list(sufficiencies(own.plan.suite, True, True)) for own in (first, again)]
+    assert enough[0] == enough[1]
 
 
 @pytest.mark.slow

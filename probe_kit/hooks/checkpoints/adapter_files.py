@@ -12,8 +12,8 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     CONFIG_FILE,
     PATTERNS,
     NotCachedError,
-    checkpoint_folder,
     missing_weights,
+    plain_folder,
 )
 
 ADAPTER_WEIGHTS = ("adapter_model.safetensors", "adapter_model.bin")
@@ -79,7 +79,7 @@ def base_folder_of(folder: Path, settings: Mapping[str, Any], patterns: Sequence
     base = str(settings["base_model_name_or_path"])
     beside = folder / base
     try:
-        place = beside.resolve() if beside.is_dir() else checkpoint_folder(base, patterns)
+        place = beside.resolve() if beside.is_dir() else plain_folder(base, patterns)
     except CheckpointError as error:
         kind = NotCachedError if isinstance(error, NotCachedError) else CheckpointError
         raise kind(

@@ -108,7 +108,7 @@ def is_on_hub(checkpoint: str) -> bool:
     return hub_name(checkpoint) is not None and not Path(checkpoint).expanduser().exists()
 
 
-def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
+def plain_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
     """The local folder of a folder path or hub id such as `lerobot/pi0_base`, or `owner/repo/folder` for one model
     of a repository that holds several; `@revision` behind it names a branch, a tag or a commit.
 
@@ -121,9 +121,7 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
         raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist ({error})") from None
     if not folder.is_dir():
         folder = _fetched(checkpoint, patterns)
-    from probe_kit.hooks.checkpoints.bare_adapters import with_base_files  # which reads the base by this function
-
-    return with_base_files(_possible(folder), patterns)
+    return _possible(folder)
 
 
 def _fetched(checkpoint: str, patterns: Sequence[str]) -> Path:
@@ -192,7 +190,7 @@ def hub_files(checkpoint: str) -> list[str]:
     repository, inside, revision = _with_pin(named)
     begin = f"{inside}/" if inside else ""
     if unreachable():
-        folder = checkpoint_folder(checkpoint, ())
+        folder = plain_folder(checkpoint, ())
         found = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
         return sorted(found)
     from huggingface_hub import HfApi

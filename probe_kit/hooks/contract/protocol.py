@@ -38,7 +38,10 @@ class ProtocolRow:
         return (self, *self.further)
 
     def of(self, checkpoint: str | None) -> "ProtocolRow":
-        """The row of `checkpoint`, at any revision; this one for None, and for a checkpoint that the protocol does not use."""
+        """The row of `checkpoint`, at any revision.
+
+        This one for None, and for a checkpoint that the protocol does not use.
+        """
         return next((row for row in self.rows if row.checkpoint == _bare(checkpoint)), self)
 
     def options_for(self, checkpoint: str | None) -> dict[str, Any]:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, content_hashes, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Policy, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from probe_kit.errors import UsageError, WeightsError
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype
+from probe_kit.hooks.checkpoints.checkpoint import chosen_dtype
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.magma import UNUSED_WEIGHTS, MagmaConfig, MagmaNetwork, build_magma, shipped_statistics

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks.checkpoints.adapter_files import AdapterFiles, adapter_in
-from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, checkpoint_folder, chosen_dtype
+from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, chosen_dtype
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights, with_adapter
 from probe_kit.hooks.families.prismatic.quantised import check_quantisation, quantise
 from probe_kit.hooks.families.prismatic.release import read_release

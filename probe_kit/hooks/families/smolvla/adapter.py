@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, is_on_hub, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, is_on_hub, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.attention_weights import Note, shares
 from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
 from probe_kit.hashing import sha256_json
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, content_hashes, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture

@@ -9,7 +9,8 @@ import torch
 
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype
+from probe_kit.hooks.checkpoints.checkpoint import chosen_dtype
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.sizes_only import building_device

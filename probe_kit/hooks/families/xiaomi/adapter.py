@@ -19,13 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import (
-    SMALL_FILES,
-    checkpoint_folder,
-    chosen_dtype,
-    content_hashes,
-    side_files,
-)
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, chosen_dtype, content_hashes, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import read_weights
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Tap

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from transformers import AutoTokenizer
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, side_files
+from probe_kit.hooks.checkpoints.checkpoint import side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.pipelines import tokenizer_folder, tokenizer_name
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy

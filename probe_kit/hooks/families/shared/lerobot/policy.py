@@ -21,7 +21,8 @@ from torch import Tensor, nn
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, checkpoint_folder, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, content_hashes, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Policy

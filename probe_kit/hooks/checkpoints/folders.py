@@ -1,6 +1,7 @@
-"""LoRA adapters that hold only what was trained: joined with the other small files of their base. No torch.
+"""The folder of a checkpoint as loaders read it: a LoRA adapter alone is joined with its base's small files.
 
 A loader is given one folder with all files of a checkpoint but the base's weights, which `adapter_files` finds.
+Imports no torch.
 """
 
 import atexit
@@ -16,7 +17,7 @@ from probe_kit.hooks.checkpoints.adapter_files import (
     base_folder_of,
     remember_joined,
 )
-from probe_kit.hooks.checkpoints.checkpoint import ADAPTER_FILE, is_weights
+from probe_kit.hooks.checkpoints.checkpoint import ADAPTER_FILE, PATTERNS, is_weights, plain_folder
 
 _CONFIGURATIONS = ("config.json", "config.yaml")
 _READ_TOGETHER = (
@@ -32,6 +33,14 @@ _BESIDE = ("dims.json", "tokenizer")
 """What some layouts keep beside the folder of a checkpoint."""
 _RUNS = "checkpoints"
 _DONE: dict[tuple[object, ...], Path] = {}
+
+
+def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
+    """The folder of a checkpoint, by path or hub id; that of an adapter alone has its base's files too.
+
+    patterns: see `plain_folder`. Raises CheckpointError as that does, and for a base that cannot be read.
+    """
+    return with_base_files(plain_folder(checkpoint, patterns), patterns)
 
 
 def with_base_files(folder: Path, patterns: Sequence[str]) -> Path:
