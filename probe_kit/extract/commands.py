@@ -128,7 +128,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     source = f" ({extraction.declared}; the weights were not read)" if extraction.declared and plan.streams else ""
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
-        **_weights_row(extraction.settings),
+        **_weights_row(extraction),
         **_units_row(extraction.settings),
         **_protocol_row(identity),
         **_rows_of_plan(extraction),
@@ -149,11 +149,14 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     err.print(table)
 
 
-def _weights_row(settings: "RunSettings") -> dict[str, str]:
+def _weights_row(extraction: "Extraction") -> dict[str, str]:
     """Memory and download of a model whose size is known."""
     from probe_kit.extract.needs import weights_needed
 
-    words = weights_needed(settings.model, settings.checkpoint, settings.options, settings.dtype)
+    settings, controller = extraction.settings, extraction.controller
+    model: Any = getattr(controller, "policy", None) or getattr(controller, "model", None)
+    loaded = None if model is None else model.card.parameters
+    words = weights_needed(settings.model, settings.checkpoint, settings.options, settings.dtype, loaded)
     return {"weights": words} if words else {}
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import RowPlan
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import RunSettings
@@ -13,7 +14,7 @@ from probe_kit.hooks.contract.views import view_names
 from probe_kit.hooks.family import DTYPES
 
 if TYPE_CHECKING:
-    from probe_kit.hooks import Model
+    from probe_kit.hooks import Family, Model
     from probe_kit.hooks.outline import Outline
 
 EPISODE = 40_000
@@ -118,10 +119,28 @@ def _tokens(model: "Model", instructions: Sequence[str]) -> dict[str, int]:
     return {name: max(len(row) for row in rows) for name, rows in roles.items()}
 
 
-def weights_needed(model: str, checkpoint: str | None, options: Mapping[str, Any], dtype: str | None) -> str:
+def _parameters(
+    family: "Family", checkpoint: str | None, options: Mapping[str, Any], dtype: str | None
+) -> int | None:
+    """Parameters of a network of the configuration that is here; None where it is not, or cannot be built."""
+    try:
+        outline = family.outline(checkpoint, options, dtype)
+    except ProbeKitError:  # a plan or a run of this checkpoint says what is wrong with it
+        return None
+    return None if outline is None or outline.model is None else outline.model.card.parameters
+
+
+def weights_needed(
+    model: str,
+    checkpoint: str | None,
+    options: Mapping[str, Any],
+    dtype: str | None,
+    parameters: int | None = None,
+) -> str:
     """Memory for the weights and the size of a download, in words; empty for a model that declares no size.
 
-    Of the checkpoint's configuration where it is here, else of the released size. dtype: None for both. No network
+    Of the checkpoint's configuration where it is here, else of the released size. dtype: None for both.
+    parameters: of a model that is loaded; None for one that is not. No network
     is asked: a download is counted from the index of the weights in the cache, else estimated from the number of
     parameters, whose stored precision is not known.
     """
@@ -131,8 +150,7 @@ def weights_needed(model: str, checkpoint: str | None, options: Mapping[str, Any
     family = get_family(model)
     if family is None or family.weights_bytes(options) is None:
         return ""
-    outline = family.outline(checkpoint, options)
-    count = None if outline is None or outline.model is None else outline.model.card.parameters
+    count = _parameters(family, checkpoint, options, dtype) if parameters is None else parameters
     sizes = {name: in_units(family.weights_bytes(options, name, count) or 0) for name in DTYPES}
     held = {name: in_units(family.memory_bytes(options, name, count) or 0) for name in DTYPES}
     every = (

@@ -188,7 +188,7 @@ class Family:
         with while_loading(self.name, str(place or "what it brings")), recorded_commits() as commits:
             model: Model = load(place, device, dtype, random_weights, **chosen)
             _check_streams(model, str(place))
-            with suppress(CheckpointError):  # of a file that is missing; reading it again says so
+            with suppress(Exception):  # a file that is missing is named when it is needed
                 model.read_late_files()
         # Options that the adapter does not record itself are part of the identity too.
         said = {name: str(value) for name, value in chosen.items() if name != "weights_seed"}

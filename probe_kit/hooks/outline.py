@@ -62,10 +62,14 @@ def outline_of(
     folder = _folder(place)
     if place is None or folder is None:
         return None
-    key = (name, place, dtype, repr(sorted(options.items())), _state(folder))
-    if key not in _OUTLINES:
-        _OUTLINES[key] = _built(load, place, dtype, options, is_complete(place))
-    return _OUTLINES[key]
+    complete = is_complete(place)
+    key = (name, place, dtype, repr(sorted(options.items())), complete, _state(folder))
+    if key in _OUTLINES:
+        return _OUTLINES[key]
+    outline = _built(load, place, dtype, options, complete)
+    if outline.model is not None:  # what another repository lacks may arrive
+        _OUTLINES[key] = outline
+    return outline
 
 
 def _built(load: Any, place: str, dtype: str | None, options: Mapping[str, Any], complete: bool) -> Outline:

@@ -178,6 +178,31 @@ def test_a_configuration_whose_backbone_is_not_in_the_cache_is_planned_with_the_
 
 
 @pytest.mark.usefixtures("nowhere")
+def test_an_adapter_in_the_cache_is_planned_with_the_sizes_of_its_base(
+    tmp_path: Path, small_suite: Suite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As long as the weights of either are not there, they are to be downloaded."""
+    base = write_pi05(tmp_path / "base")
+    streams = sizes(load_model("pi05", str(base)).streams.values())
+    (tmp_path / "alone").mkdir()
+    settings = {"peft_type": "LORA", "r": 2, "lora_alpha": 2, "base_model_name_or_path": "lab/base"}
+    (tmp_path / "alone" / "adapter_config.json").write_text(json.dumps(settings), encoding="utf-8")
+    tuned = cached(monkeypatch, tmp_path / "cache", "lab/tuned", tmp_path / "alone")
+    wanted = settings_of("pi05", small_suite, checkpoint=tuned, capture_only=True)
+    planned = prepare(wanted, fetch=False)
+    assert planned.declared.startswith("of the released size, because")
+    assert "'lab/base'" in planned.declared
+    cached(monkeypatch, tmp_path / "cache", "lab/base", base)
+    assert sizes(prepare(wanted, fetch=False).plan.streams) == streams
+    assert "download about" in weights_needed("pi05", tuned, {}, None)
+    folder = tmp_path / "cache" / "models--lab--base" / "snapshots" / ("c" * 40)
+    shutil.copy(base / "model.safetensors", folder)
+    assert "download about" in weights_needed("pi05", tuned, {}, None)
+    (folder.parents[2] / "models--lab--tuned" / "snapshots" / ("c" * 40) / "adapter_model.safetensors").touch()
+    assert weights_needed("pi05", tuned, {}, None).endswith("nothing to download")
+
+
+@pytest.mark.usefixtures("nowhere")
 def test_a_download_is_counted_from_the_index_of_the_weights_in_the_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
