@@ -11,7 +11,6 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     ADAPTER_FILE,
     CONFIG_FILE,
     PATTERNS,
-    NotCachedError,
     missing_weights,
     plain_folder,
 )
@@ -81,8 +80,7 @@ def base_folder_of(folder: Path, settings: Mapping[str, Any], patterns: Sequence
     try:
         place = beside.resolve() if beside.is_dir() else plain_folder(base, patterns)
     except CheckpointError as error:
-        kind = NotCachedError if isinstance(error, NotCachedError) else CheckpointError
-        raise kind(
+        raise CheckpointError(
             f"the LoRA adapter in {folder} was trained on {base!r}: {error}. "
             f"Correct base_model_name_or_path in its {ADAPTER_FILE}"
         ) from error

@@ -30,8 +30,8 @@ RUN_WEIGHTS = "checkpoints/latest-checkpoint.pt"
 """Where a folder of a training run of Prismatic keeps its weights."""
 
 
-class NotCachedError(CheckpointError):
-    """A repository of the hub is not in the cache, and the hub cannot be asked."""
+class NotCachedError(LookupError):
+    """The cause of a CheckpointError about a repository that the cache lacks where the hub cannot be asked."""
 
 
 class HubName(NamedTuple):
@@ -134,7 +134,9 @@ def _fetched(checkpoint: str, patterns: Sequence[str]) -> Path:
     if why := unreachable():
         commit = _cached_commit(named)
         if commit is None or not (snapshots / commit).is_dir():
-            raise NotCachedError(_not_fetched(checkpoint, f"{why}; the cache has no copy", OFFLINE_WAY_OUT))
+            raise CheckpointError(
+                _not_fetched(checkpoint, f"{why}; the cache has no copy", OFFLINE_WAY_OUT)
+            ) from NotCachedError(named.repository)
         place = snapshots / commit
     else:
         place = _downloaded(checkpoint, named, patterns)
