@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.check_adapter.outcome import folder_size
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.conformance.check import SkipTest
 from probe_kit.hooks.conformance.examples import examples_for
 from probe_kit.hooks.conformance.subject import ContractSettings

@@ -125,15 +125,15 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     growth = growth_at(location, plan.to_json()["episodes"])
     needed = in_units(sum(space_needed(extraction.further_plan(location), extraction.settings).values()))
     weights = "not read" if extraction.declared else (identity["weights_sha256"] or "scripted")[:12]
-    declared = " (of the released size; the weights were not read)" if extraction.declared and plan.streams else ""
+    source = f" ({extraction.declared}; the weights were not read)" if extraction.declared and plan.streams else ""
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
-        **_weights_row(extraction.settings),
+        **_weights_row(extraction),
         **_units_row(extraction.settings),
         **_protocol_row(identity),
         **_rows_of_plan(extraction),
         **({"grows": growth.words} if growth and growth.words else {}),
-        "streams": ("; ".join(_describe(s) for s in plan.streams) or "none") + declared,
+        "streams": ("; ".join(_describe(s) for s in plan.streams) or "none") + source,
         **_acts_row(identity),
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
         "disk": f"up to {needed} with columns, probes and report; "
@@ -149,11 +149,14 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     err.print(table)
 
 
-def _weights_row(settings: "RunSettings") -> dict[str, str]:
-    """Memory and download of a model whose released size is declared."""
+def _weights_row(extraction: "Extraction") -> dict[str, str]:
+    """Memory and download of a model whose size is known."""
     from probe_kit.extract.needs import weights_needed
 
-    words = weights_needed(settings.model, settings.checkpoint, settings.options, settings.dtype)
+    settings, controller = extraction.settings, extraction.controller
+    model: Any = getattr(controller, "policy", None) or getattr(controller, "model", None)
+    loaded = None if model is None else model.card.parameters
+    words = weights_needed(settings.model, settings.checkpoint, settings.options, settings.dtype, loaded)
     return {"weights": words} if words else {}
 
 

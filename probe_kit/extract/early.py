@@ -45,7 +45,7 @@ def check_model(settings: RunSettings, scripted: tuple[str, ...], fetch: bool = 
     if not asked and not family.acts:
         raise UsageError(f"{settings.model} answers and does not act; use `probe-kit ask`, or a model that acts")
     if isinstance(settings, ExtractSettings) and settings.source is None and not settings.capture_only:
-        family.check_acting(settings.checkpoint)
+        family.check_acting(settings.checkpoint, settings.options)
     # Elsewhere there may be other devices than here.
     device = "cpu" if settings.workers or settings.ray else settings.device
     family.check(

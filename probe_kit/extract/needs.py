@@ -1,13 +1,21 @@
 """Estimated disk space of a run before compression, including probes, figures and report."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import RowPlan
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import RunSettings
 from probe_kit.hooks.contract.views import view_names
 from probe_kit.hooks.family import DTYPES
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Family, Model
+    from probe_kit.hooks.outline import Outline
 
 EPISODE = 40_000
 """Bytes of an episode's commit, trajectory and files of the file system (measured: 12 to 30 kB)."""
@@ -19,6 +27,8 @@ FILM = 1_500_000
 """Bytes of a film of sixty actions."""
 DECISION = 16
 """Bytes that probes keep per site and episode: decisions, labels and directions, by category and pooled."""
+_PICTURE, _INSTRUCTION = (480, 640), "put the red block on the green plate to the left"
+"""An observation of usual size, of which tokens are counted where nothing else is asked."""
 REPORT = 5_000_000
 """Bytes of a report with its figures."""
 
@@ -43,10 +53,96 @@ def space_of(streams: Sequence[StoredStream], episodes: int, settings: RunSettin
     }
 
 
-def weights_needed(model: str, checkpoint: str | None, options: Mapping[str, Any], dtype: str | None) -> str:
+@dataclass(frozen=True)
+class PlannedSizes:
+    """The sizes of a model that was not loaded. streams: as a run stores them. source: whose sizes these are.
+
+    outline: the model without numbers, where its configuration is here.
+    """
+
+    streams: tuple[StoredStream, ...]
+    source: str
+    outline: "Outline | None" = None
+
+    @property
+    def execute(self) -> int:
+        """Actions of an inference that are executed; 1 where that is not known, as a model may execute more."""
+        model = None if self.outline is None else self.outline.model
+        return 1 if model is None else max(1, model.card.execute)
+
+
+def planned_sizes(settings: RunSettings, instructions: Sequence[str] = ()) -> PlannedSizes | None:
+    """The streams of a model by its configuration, where that is here, else as its family declares them.
+
+    instructions: texts that it will read, for the number of tokens; else one of about ten words.
+    Returns None for a model that declares none. Reads no weights and asks no network. Raises what loading raises
+    for a checkpoint in a folder.
+    """
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(settings.model)
+    declared = None if family is None else family.declared_streams(settings.options)
+    if family is None or declared is None:
+        return None
+    outline = family.outline(settings.checkpoint, settings.options, settings.dtype)
+    if outline is None or outline.model is None:
+        streams = [StoredStream.of(one.stream, one.tokens, view_names(one.roles)) for one in declared]
+        why = "" if outline is None else f", because its own configuration cannot be read here: {outline.reason}"
+        source = f"of the released size{why}"
+    else:
+        tokens = _tokens(outline.model, instructions or (_INSTRUCTION,))
+        average = {one.stream.name: one.tokens for one in declared}
+        names = outline.model.role_names
+        streams = [
+            StoredStream.of(stream, tokens.get(name, average.get(name, 1)), view_names(names[name]))
+            for name, stream in outline.model.streams.items()
+        ]
+        counted = (
+            "" if tokens else "; its tokenizer is not here, so that numbers of tokens are of the released size"
+        )
+        source = f"of the checkpoint's configuration{counted}"
+    return PlannedSizes(tuple(streams) if settings.tokens != "none" else (), source, outline)
+
+
+def _tokens(model: "Model", instructions: Sequence[str]) -> dict[str, int]:
+    """The longest sequence of every stream; empty where its tokenizer or processor is not here."""
+    from probe_kit.hooks.checkpoints.hub import without_network
+    from probe_kit.hooks.contract.observation import Observation
+
+    picture, state = np.zeros((*_PICTURE, 3), np.uint8), np.zeros(8, np.float32)
+    example = Observation(picture, state, max(instructions, key=len), np.eye(3, dtype=np.float32))
+    try:
+        with without_network():
+            roles = model.roles([example])
+    except Exception:  # noqa: BLE001 - whatever is missing, the number of the released size stands for it
+        return {}
+    return {name: max(len(row) for row in rows) for name, rows in roles.items()}
+
+
+def _parameters(
+    family: "Family", checkpoint: str | None, options: Mapping[str, Any], dtype: str | None
+) -> int | None:
+    """Parameters of a network of the configuration that is here; None where it is not, or cannot be built."""
+    try:
+        outline = family.outline(checkpoint, options, dtype)
+    except ProbeKitError:  # a plan or a run of this checkpoint says what is wrong with it
+        return None
+    return None if outline is None or outline.model is None else outline.model.card.parameters
+
+
+def weights_needed(
+    model: str,
+    checkpoint: str | None,
+    options: Mapping[str, Any],
+    dtype: str | None,
+    parameters: int | None = None,
+) -> str:
     """Memory for the weights and the size of a download, in words; empty for a model that declares no size.
 
-    Of the released size. dtype: None for both. No network is asked, so the stored precision is not known.
+    Of the checkpoint's configuration where it is here, else of the released size. dtype: None for both.
+    parameters: of a model that is loaded; None for one that is not. No network
+    is asked: a download is counted from the index of the weights in the cache, else estimated from the number of
+    parameters, whose stored precision is not known.
     """
     from probe_kit.extract.store.locations.disk import in_units
     from probe_kit.hooks.registry import get_family
@@ -54,26 +150,22 @@ def weights_needed(model: str, checkpoint: str | None, options: Mapping[str, Any
     family = get_family(model)
     if family is None or family.weights_bytes(options) is None:
         return ""
-    sizes = {name: in_units(family.weights_bytes(options, name) or 0) for name in DTYPES}
-    held = {name: in_units(family.memory_bytes(options, name) or 0) for name in DTYPES}
+    count = _parameters(family, checkpoint, options, dtype) if parameters is None else parameters
+    sizes = {name: in_units(family.weights_bytes(options, name, count) or 0) for name in DTYPES}
+    held = {name: in_units(family.memory_bytes(options, name, count) or 0) for name in DTYPES}
     every = (
         held["float32"] if family.always_float32 else " or ".join(f"{own} in {name}" for name, own in held.items())
     )
     memory = next((own for name, own in held.items() if name == dtype), every)
     download = "nothing to download"
     if not family.is_here(checkpoint, options):
-        download = f"download {sizes['bfloat16']} or {sizes['float32']}, as stored"
+        counted = family.bytes_to_fetch(checkpoint, options)
+        download = (
+            f"download {in_units(counted)}"
+            if counted
+            else (
+                f"download about {sizes['bfloat16']} or {sizes['float32']}, as stored, estimated from the "
+                "parameters"
+            )
+        )
     return f"memory {memory} for weights, more for activations; {download}"
-
-
-def declared_streams(settings: RunSettings) -> list[StoredStream] | None:
-    """What a run stores of the streams that its family declares; None for one that declares none."""
-    from probe_kit.hooks.registry import get_family
-
-    family = get_family(settings.model)
-    declared = None if family is None else family.declared_streams(settings.options)
-    if declared is None:
-        return None
-    if settings.tokens == "none":
-        return []
-    return [StoredStream.of(one.stream, one.tokens, view_names(one.roles)) for one in declared]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from probe_kit.errors import UsageError
 from probe_kit.extract.calibration import Calibration, calibrated
 from probe_kit.extract.early import asked_objects, check_model, check_place, check_words, check_writable
-from probe_kit.extract.needs import declared_streams
+from probe_kit.extract.needs import PlannedSizes, planned_sizes
 from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.plan import (
     Plan,
@@ -41,8 +41,13 @@ from probe_kit.extract.rollout.preflight import (
 )
 from probe_kit.extract.rollout.recorded.recorded_controller import check_recorded_units, fit, recorded_controller
 from probe_kit.extract.rollout.recorded.recorded_stage import example_of
-from probe_kit.extract.rollout.settings_checks import check_embodiment, check_meaningless, check_unreachable
-from probe_kit.extract.run_layout import StoredStream
+from probe_kit.extract.rollout.settings_checks import (
+    check_embodiment,
+    check_meaningless,
+    check_misfit,
+    check_unreachable,
+)
+from probe_kit.extract.run_layout import RUN_FILE, StoredStream
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.provenance import provenance_here
@@ -50,6 +55,8 @@ from probe_kit.extract.store.writer import RunWriter
 from probe_kit.extract.vqa.phrases import phrases
 from probe_kit.hashing import sha256_json
 from probe_kit.suite import Suite, default_suite, load_suite
+from probe_kit.suite.build import ITEMS, default_folder
+from probe_kit.suite.validation.sufficiency import Smallest
 
 if TYPE_CHECKING:
     from probe_kit.hooks import AnswerModel, Policy
@@ -60,8 +67,8 @@ class Prepared:
     """What an extraction starts from: the model was loaded and the plan is made.
 
     controller: None if the model is loaded again by workers elsewhere. calibration: what chose the batch, None if
-    it was not requested or is left to workers. declared: no model was loaded; the streams are those that its
-    family declares, and the run has no name yet.
+    it was not requested or is left to workers. declared: whose sizes the streams have where no model
+    was loaded and the run has no name yet; empty where one was.
     """
 
     settings: RunSettings
@@ -69,7 +76,7 @@ class Prepared:
     card: dict[str, Any]
     controller: ActingController | AnswerController | None
     calibration: Calibration | None = None
-    declared: bool = False
+    declared: str = ""
 
     def identity(self) -> dict[str, Any]:
         """Everything that decides the numbers of an episode: neither which are selected, nor the label.
@@ -140,11 +147,10 @@ def load(
         skipped_items(suite, asked, wordings)
     if policy is None:
         _check_instructions(settings, instructions_of(asked), fetch)
-    if not fetch and (streams := declared_streams(settings)) is not None:
-        if isinstance(settings, ExtractSettings):
-            settings = settings.with_every_call(settings.execute or 1)  # a model may execute more
-        plan = _plan(suite, streams, settings, objects)
-        return Prepared(settings, plan, _declared_card(settings), None, declared=True)
+    if not fetch and (sizes := planned_sizes(settings, instructions_of(asked))) is not None:
+        settings = _planned_settings(settings, sizes)
+        plan = _plan(suite, list(sizes.streams), settings, objects)
+        return Prepared(settings, plan, _declared_card(settings), None, declared=sizes.source)
     if isinstance(settings, AskSettings):
         controller: ActingController | AnswerController = _asking(settings, suite, answer_model)
     else:
@@ -205,13 +211,15 @@ def _load_source(
     opened = OpenedEnvironment.of(source) if isinstance(source, EnvSource) else open_recording(source)
     if loaded is None:
         raise_together(_before_loading(settings, opened, fetch))
-    if not fetch and (streams := declared_streams(settings)) is not None:
+    if not fetch and (sizes := planned_sizes(settings, opened.instructions)) is not None:
+        streams = list(sizes.streams)
         if isinstance(opened, OpenedEnvironment):
-            settings = settings.with_every_call(settings.execute or 1)
-            planned: RowPlan = environment_plan(opened, None, streams, settings, settings.execute or 1)
+            execute = settings.execute or sizes.execute
+            settings = settings.with_every_call(execute)
+            planned: RowPlan = environment_plan(opened, None, streams, settings, execute)
         else:
             planned = recorded_plan(opened, streams, settings, (0, 0))
-        return Prepared(settings, planned, _declared_card(settings), None, declared=True)
+        return Prepared(settings, planned, _declared_card(settings), None, declared=sizes.source)
     if loaded is not None:
         _check_loaded(settings, loaded)
     policy = load_acting_policy(settings) if loaded is None else loaded
@@ -308,7 +316,7 @@ def check_run(
     if not loaded:
         check_model(settings, tuple(SCRIPTED), fetch)
     check_meaningless(settings)
-    suite = _suite(settings)
+    suite = _suite(settings, not fetch and _is_only_planned(settings, location))
     texts = _texts(settings, suite)
     if not loaded:
         check_words(settings, texts, tuple(SCRIPTED))
@@ -330,6 +338,15 @@ def _check_instructions(settings: RunSettings, instructions: Sequence[str], fetc
         family.check_instructions(settings.checkpoint, instructions, settings.options, fetch)
 
 
+def _planned_settings(settings: RunSettings, sizes: PlannedSizes) -> RunSettings:
+    """The settings with the inferences of an episode counted. Raises CheckpointError for who cannot act."""
+    if not isinstance(settings, ExtractSettings):
+        return settings
+    if settings.source is None and sizes.outline is not None:
+        check_misfit(settings, sizes.outline.misfit(), sizes.outline.checkpoint)
+    return settings.with_every_call(settings.execute or sizes.execute)
+
+
 def _declared_card(settings: RunSettings) -> dict[str, Any]:
     """What is known of a model that was not loaded."""
     given = {"dtype": settings.dtype, "execute": getattr(settings, "execute", None)}
@@ -337,11 +354,41 @@ def _declared_card(settings: RunSettings) -> dict[str, Any]:
     return {"model": settings.model, "random_weights": settings.random_weights, "weights_sha256": None, **known}
 
 
-def _suite(settings: RunSettings) -> Suite:
+def _is_only_planned(settings: RunSettings, location: Location | None) -> bool:
+    """Whether nothing but the items themselves is asked of the suite.
+
+    Names of runs that are known before they are played hold the hash of the whole suite, and so does a run that is
+    there; questions name objects of all its items.
+    """
+    if not isinstance(settings, ExtractSettings):
+        return False
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(settings.model)
+    if location is None:
+        return family is not None and bool(family.declared)
+    with location.in_words():
+        return not location.exists(RUN_FILE)
+
+
+def _suite(settings: RunSettings, planned: bool = False) -> Suite:
+    """The suite of these settings. planned: its first items alone are needed."""
     if settings.suite is None:
-        # Of a category drawn alone every item is the same: drawing all eleven takes half a minute.
+        # Of a category drawn alone every item is the same: drawing all eleven takes minutes.
+        if planned and settings.items is not None and not default_folder(settings.categories).is_dir():
+            return _first_items(settings.categories, settings.items)
         return default_suite(settings.categories).select(None, settings.items)
     return load_suite(settings.suite).select(settings.categories, settings.items)
+
+
+def _first_items(categories: Sequence[str] | None, count: int) -> Suite:
+    """The first items of the embedded suite, drawn alone: fewer items are the beginning of more.
+
+    It is said to be selected from the category that a plan looks at for further items, which is drawn in full.
+    """
+    drawn = min(max(2, count + count % 2), ITEMS)
+    suite = default_suite(categories, drawn).select(None, count)
+    return replace(suite, selected_from=default_suite((Smallest.of(suite).category,)))
 
 
 def _texts(settings: RunSettings, suite: Suite) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -19,18 +20,19 @@ from probe_kit.errors import (
     UnsupportedInterventionError,
     UsageError,
 )
+from probe_kit.hooks.checkpoints.adapter_files import with_adapters_named
 from probe_kit.hooks.checkpoints.checkpoint import (
     CONFIG_FILE,
     PATTERNS,
-    cached_folder,
-    checkpoint_folder,
     hub_name,
     is_on_hub,
     missing_weights,
     pinned,
     without_revision,
 )
+from probe_kit.hooks.checkpoints.commits import recorded_commits
 from probe_kit.hooks.checkpoints.file_checks import check_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
 from probe_kit.hooks.contract.card import ModelCard, SourceWeights
 from probe_kit.hooks.contract.declared import DeclaredStream
@@ -38,6 +40,7 @@ from probe_kit.hooks.contract.default_scene import RELEASED, DefaultScene
 from probe_kit.hooks.contract.interventions import ALL_EDITS, InterventionKind, Interventions
 from probe_kit.hooks.contract.options import Option, check_options
 from probe_kit.hooks.contract.protocol import ProtocolRow
+from probe_kit.hooks.outline import Outline, bytes_to_fetch, is_complete, is_configured, outline_of
 from probe_kit.models.bounds import MOST_STEPS
 
 if TYPE_CHECKING:
@@ -77,10 +80,10 @@ class Family:
     units: `module:function(checkpoint, **options)` that says whose units the actions get, and where they stand,
     from the small files; it raises UsageError where that has to be chosen. of_default: options that belong to the
     default checkpoint, and to no other; they count where they are not given.
-    files: patterns of the files of a hub repository that are needed. bare_adapters: whether a LoRA adapter needs
-    no config.json of its own, as the family reads its base's. parameters: count of the released sizes, by name.
+    files: patterns of the files of a hub repository that are needed. parameters: count of the released sizes, by
+    name.
     always_float32: whether weights stay in float32 whatever dtype is chosen.
-    not_acting: released checkpoints whose actions no arm here can execute.
+    not_acting: released checkpoints whose actions no arm here can execute, for plans without their configuration.
     home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
     `words_in`, of a family whose default checkpoint knows few words; empty for one that reads any text.
     Raises UsageError if an option is not declared as an `Option`.
@@ -115,7 +118,6 @@ class Family:
     units: str | None = None
     of_default: Mapping[str, Any] = MappingProxyType({})
     files: tuple[str, ...] = PATTERNS
-    bare_adapters: bool = False
     parameters: Mapping[str, int] = MappingProxyType({})
     always_float32: bool = False
     not_acting: tuple[str, ...] = ()
@@ -183,9 +185,11 @@ class Family:
             if "weights_seed" not in inspect.signature(load).parameters:
                 raise UsageError(f"{self.name} has one untrained network only: its loader takes no weights_seed")
             chosen["weights_seed"] = weights_seed
-        with while_loading(self.name, str(place or "what it brings")):
+        with while_loading(self.name, str(place or "what it brings")), recorded_commits() as commits:
             model: Model = load(place, device, dtype, random_weights, **chosen)
             _check_streams(model, str(place))
+            with suppress(Exception):  # a file that is missing is named when it is needed
+                model.read_late_files()
         # Options that the adapter does not record itself are part of the identity too.
         said = {name: str(value) for name, value in chosen.items() if name != "weights_seed"}
         merged = model.card.audit.get("adapter")
@@ -193,7 +197,8 @@ class Family:
             model.card,
             checkpoint=pinned(model.card.checkpoint),
             settings={**said, **model.card.settings},
-            notes=tuple(dict.fromkeys((*model.card.notes, *([merged] if merged else [])))),
+            notes=_notes((*model.card.notes, *([merged] if merged else []), *_unguarded(model))),
+            repositories=_others(commits, place),
             **self._source_of(model.card, place),
         )
         return model
@@ -249,7 +254,6 @@ class Family:
                     self.config_types,
                     weights,
                     self.instead,
-                    self.bare_adapters,
                 )
         return self._with_own(chosen, place)
 
@@ -263,31 +267,63 @@ class Family:
         size = check_options(self.name, self.options, options).get(SIZE)
         return self.declared.get(size or next(iter(self.declared), ""))
 
-    def weights_bytes(self, options: Mapping[str, Any], dtype: Dtype = "float32") -> int | None:
-        """Bytes of the weights of the released size that `options` choose; None where it is not declared."""
+    def weights_bytes(
+        self, options: Mapping[str, Any], dtype: Dtype = "float32", parameters: int | None = None
+    ) -> int | None:
+        """Bytes of so many parameters; by default of the released size that `options` choose.
+
+        Returns None where that is not declared.
+        """
         size = check_options(self.name, self.options, options).get(SIZE)
-        count = self.parameters.get(size or next(iter(self.parameters), ""))
+        count = parameters or self.parameters.get(size or next(iter(self.parameters), ""))
         return None if count is None else count * {"float32": 4, "bfloat16": 2}[dtype]
 
-    def memory_bytes(self, options: Mapping[str, Any], dtype: Dtype) -> int | None:
+    def memory_bytes(self, options: Mapping[str, Any], dtype: Dtype, parameters: int | None = None) -> int | None:
         """Bytes of these weights in memory when `dtype` is chosen."""
-        return self.weights_bytes(options, "float32" if self.always_float32 else dtype)
+        return self.weights_bytes(options, "float32" if self.always_float32 else dtype, parameters)
+
+    def outline(
+        self, checkpoint: str | None, options: Mapping[str, Any] = MappingProxyType({}), dtype: str | None = None
+    ) -> Outline | None:
+        """The model without numbers, of the configuration in a folder or in the hub's cache; None where none is.
+
+        None also for a family that declares no streams, whose models are loaded. Asks no network. Raises what
+        loading raises for a checkpoint in a folder.
+        """
+        if not self.declared:
+            return None
+        chosen = check_options(self.name, self.options, options)
+        place = self.place(checkpoint, chosen.pop(SIZE, None))
+        with while_loading(self.name, self.loader):
+            load = imported(self.loader)
+        with naming_checkpoint(self.name, str(place)):
+            return outline_of(self.name, load, place, dtype, self._with_own(chosen, place))
 
     def is_here(self, checkpoint: str | None, options: Mapping[str, Any]) -> bool:
         """Whether a checkpoint with its weights is in a folder or in the hub's cache. Asks no network."""
         place = self.place(checkpoint, options.get(SIZE))
-        if place is None or not is_on_hub(place):
-            return True
-        folder = cached_folder(place)
-        return folder is not None and not missing_weights(folder)
+        return place is None or is_complete(place)
 
-    def check_acting(self, checkpoint: str | None) -> None:
-        """Raise UsageError for a released checkpoint whose actions no arm here can execute."""
-        if (place := without_revision(self.place(checkpoint))) in self.not_acting:
-            raise UsageError(
-                f"{place} puts out numbers that no arm here can execute. Plan and capture it with --no-act, or "
-                "pass a fine-tune as --checkpoint"
-            )
+    def bytes_to_fetch(self, checkpoint: str | None, options: Mapping[str, Any]) -> int | None:
+        """Bytes of the weights that have to be downloaded, as an index in the cache has them; None without one."""
+        place = self.place(checkpoint, options.get(SIZE))
+        return None if place is None else bytes_to_fetch(place)
+
+    def check_acting(self, checkpoint: str | None, options: Mapping[str, Any] = MappingProxyType({})) -> None:
+        """Raise UsageError for a checkpoint of the hub whose actions no arm here can execute, before a download.
+
+        Its own configuration decides where it is here, else the family's list of released checkpoints. One whose
+        weights are here is left to its loading.
+        """
+        place = self.place(checkpoint, options.get(SIZE))
+        if place is None or is_complete(place):
+            return
+        outline = self.outline(checkpoint, options) if is_configured(place) else None
+        reason = None if outline is None else outline.misfit()
+        if (outline is None or outline.model is None) and (bare := without_revision(place)) in self.not_acting:
+            reason = f"{bare} puts out numbers that no arm here can execute"
+        if reason is not None:
+            raise UsageError(f"{reason}. Plan and capture it with --no-act, or pass a fine-tune as --checkpoint")
 
     def check_instructions(
         self, checkpoint: str | None, instructions: Sequence[str], options: Mapping[str, Any], fetch: bool = True
@@ -320,7 +356,7 @@ class Family:
         with while_loading(self.name, self.units):
             told = imported(self.units)
         with naming_checkpoint(self.name, place):
-            return str(told(place, **self._with_own(chosen, place)))
+            return with_adapters_named(str(told(place, **self._with_own(chosen, place))))
 
     def check_intervention(self, kind: InterventionKind) -> None:
         """Raises UnsupportedInterventionError, before anything is loaded, for what the family does not support."""
@@ -396,6 +432,26 @@ class Family:
 
     def _missing_packages(self) -> list[tuple[str, str]]:
         return [(module, extra) for module, extra in self.packages if find_spec(module) is None]
+
+
+def _unguarded(model: "Model") -> tuple[str, ...]:
+    """A note on states that are read and compared with no statistics."""
+    from probe_kit.hooks.contract.model import Policy
+
+    if not isinstance(model, Policy) or model.state_numbers is None or (why := model.unguarded_state) is None:
+        return ()
+    return (f"units of states are not compared with statistics: {why}",)
+
+
+def _notes(notes: Iterable[str]) -> tuple[str, ...]:
+    """Every note once, with the names that adapters' folders have."""
+    return tuple(dict.fromkeys(map(with_adapters_named, notes)))
+
+
+def _others(commits: Mapping[str, str], place: str | None) -> dict[str, str]:
+    """The commits of repositories besides that of the checkpoint `place`, which names its own."""
+    named = None if place is None else hub_name(place)
+    return {name: commit for name, commit in sorted(commits.items()) if named is None or name != named.repository}
 
 
 def _check_streams(model: "Model", place: str) -> None:

@@ -4,6 +4,8 @@ import numpy as np
 import torch
 from torch import nn
 
+from probe_kit.models.sizes_only import builds_sizes_only
+
 
 @torch.no_grad()
 def initialise(network: nn.Module, seed: int) -> None:
@@ -13,6 +15,8 @@ def initialise(network: nn.Module, seed: int) -> None:
     0.5, biases zero, norms untouched. Drawn by numpy in name order, so that a seed means the same bits
     on every machine.
     """
+    if builds_sizes_only():
+        return
     rng = np.random.Generator(np.random.PCG64(seed))
     residual_outputs = ("o_proj.weight", "out_proj.weight", "down_proj.weight", "fc2.weight")
     for name, parameter in sorted(network.named_parameters()):

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe_kit._system.bounded_json import parse_json
-from probe_kit._terminal.console import counter, err, out, print_json, progress
+from probe_kit._system.bounded_json import load_json, parse_json
+from probe_kit._terminal.console import counter, err, marked, out, print_json, progress
 from probe_kit._terminal.options import AsJson, Categories, Seed, choices, one_of
 from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
@@ -231,6 +231,9 @@ def convert(
         )
     counts = ", ".join(f"{c} {sum(i.category == c for i in suite.items)}" for c in suite.categories)
     out.print(f"{suite.identity}: {counts} items in {out_folder}", soft_wrap=True)
+    if reasons := load_json(out_folder / "stats.json").get("reasons"):
+        left_out = "; ".join(f"{reason} {count}×" for reason, count in reasons.items())
+        err.print(marked("records left out: {}", left_out), soft_wrap=True)
 
 
 def _options(pairs: list[str]) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """`--dry-run` plans with declared sizes: no weights, no network, no GPU; words are refused before the network."""
 
 import json
+import shutil
 import socket
 from dataclasses import replace
 from pathlib import Path
@@ -13,12 +14,17 @@ from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, prepare
 from probe_kit.extract.extraction import prepare_asks
 from probe_kit.extract.needs import weights_needed
+from probe_kit.extract.plan import Plan
+from probe_kit.extract.store.locations.disk import in_units
 from probe_kit.hooks import load_model
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.registry import own_families
-from probe_kit.suite import Suite, build_suite
+from probe_kit.suite import Suite, build_suite, default_suite, load_suite
+from probe_kit.suite.validation.sufficiency import sufficiencies
 from tests.support.every_checkpoint import WRITERS
 from tests.support.pi0_checkpoints import write_intact
+from tests.support.pi05_checkpoints import write_pi05
+from tests.support.smolvla_checkpoints import write_smolvla
 
 DECLARING = [name for name, family in own_families().items() if family.declared]
 RELEASED = [(name, size) for name in DECLARING for size in own_families()[name].declared]
@@ -39,7 +45,10 @@ def nowhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def settings_of(name: str, suite: Suite, **given: Any) -> ExtractSettings | AskSettings:
-    kind = ExtractSettings if own_families()[name].acts else AskSettings
+    family = own_families()[name]
+    kind = ExtractSettings if family.acts else AskSettings
+    if family.acts and "checkpoint" not in given and family.default_checkpoint in family.not_acting:
+        given["capture_only"] = True
     return kind(name, suite=suite.folder, categories=("color",), items=2, tokens="pooled", device="cuda", **given)
 
 
@@ -65,7 +74,7 @@ def test_memory_and_download_of_every_released_size_are_named(name: str, size: s
     count = family.parameters[size]
     words = weights_needed(name, None, options, "bfloat16")
     assert f"memory {(4 if family.always_float32 else 2) * count / 1e9:,.1f} GB" in words
-    assert f"or {4 * count / 1e9:,.1f} GB" in words or "nothing to download" in words
+    assert f"or {4 * count / 1e9:,.1f} GB, as stored, estimated" in words or "nothing to download" in words
     assert weights_needed("pi0-tiny", None, {}, None) == ""
 
 
@@ -74,12 +83,143 @@ def test_a_checkpoint_in_a_folder_is_nothing_to_download(tmp_path: Path) -> None
     assert words.endswith("nothing to download")
 
 
+NOT_ACTING = [(name, own) for name, family in own_families().items() for own in family.not_acting]
+
+
 @pytest.mark.usefixtures("nowhere")
-def test_a_checkpoint_that_cannot_act_here_is_planned_with_no_act_alone(small_suite: Suite) -> None:
-    base = {"checkpoint": "lerobot/pi0_base"}
+@pytest.mark.parametrize(("name", "checkpoint"), NOT_ACTING)
+def test_a_checkpoint_that_cannot_act_here_is_planned_with_no_act_alone(
+    name: str, checkpoint: str, small_suite: Suite
+) -> None:
     with pytest.raises(UsageError, match="Plan and capture it with --no-act"):
-        prepare(settings_of("pi0", small_suite, **base), fetch=False)
-    assert prepare(settings_of("pi0", small_suite, capture_only=True, **base), fetch=False).plan.bytes > 0
+        prepare(settings_of(name, small_suite, checkpoint=checkpoint), fetch=False)
+    planned = prepare(settings_of(name, small_suite, checkpoint=checkpoint, capture_only=True), fetch=False)
+    assert planned.plan.bytes > 0
+
+
+def cached(monkeypatch: pytest.MonkeyPatch, place: Path, repo: str, files: Path, weights: bool = False) -> str:
+    """A cache of the hub that holds the files of a folder, but for weights, as one commit of `repo`."""
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(place))
+    own = place / f"models--{repo.replace('/', '--')}"
+    (own / "refs").mkdir(parents=True)
+    (own / "refs" / "main").write_text("c" * 40, encoding="utf-8")
+    without = shutil.ignore_patterns(*(() if weights else ("model*.safetensors*", "*.pt")))
+    shutil.copytree(files, own / "snapshots" / ("c" * 40), ignore=without)
+    return repo
+
+
+def sizes(streams: Any) -> dict[str, tuple[Any, ...]]:
+    return {own.name: (own.layers, own.width, own.iterations, own.quantities, own.part) for own in streams}
+
+
+@pytest.mark.usefixtures("nowhere")
+@pytest.mark.parametrize("name", DECLARING)
+def test_a_checkpoint_whose_configuration_is_in_the_cache_is_planned_with_its_own_sizes(
+    name: str, tmp_path: Path, small_suite: Suite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Streams, memory and actions per inference; no weights are there, and no network is asked."""
+    write, options = WRITERS[name]
+    folder = write(tmp_path / "model")
+    model = load_model(name, str(folder), **options)
+    repo = cached(monkeypatch, tmp_path / "cache", "lab/tiny", folder)
+    given: dict[str, Any] = {"capture_only": True} if own_families()[name].acts else {}
+    settings = settings_of(name, small_suite, checkpoint=repo, options=options, **given)
+    planned = prepare(settings, fetch=False)
+    assert sizes(planned.plan.streams) == sizes(model.streams.values())
+    assert planned.declared.startswith("of the checkpoint's configuration")
+    network: Any = model
+    held = sum(own.numel() for own in network.network.parameters()) * 4
+    words = weights_needed(name, repo, options, "float32")
+    assert words.startswith(f"memory {in_units(held)} for weights")
+    assert "estimated from the parameters" in words
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_folder_is_planned_with_its_own_sizes(tmp_path: Path, small_suite: Suite) -> None:
+    folder = write_pi05(tmp_path / "model")
+    planned = prepare(settings_of("pi05", small_suite, checkpoint=str(folder)), fetch=False)
+    assert sizes(planned.plan.streams) == sizes(load_model("pi05", str(folder)).streams.values())
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_its_own_configuration_says_whether_a_checkpoint_acts_here(
+    tmp_path: Path, small_suite: Suite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A base model under any name is refused without --no-act; one whose file has a fine-tune's actions is not."""
+    folder = write_pi05(tmp_path / "model")
+    acting = cached(monkeypatch, tmp_path / "cache", "lerobot/pi05_base", folder)
+    assert prepare(settings_of("pi05", small_suite, checkpoint=acting), fetch=False).plan.bytes > 0
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    config["output_features"]["action"]["shape"] = [32]
+    (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
+    base = cached(monkeypatch, tmp_path / "cache", "lab/base", folder)
+    with pytest.raises(UsageError, match=r"acts in 32 dimensions.*--no-act"):
+        prepare(settings_of("pi05", small_suite, checkpoint=base), fetch=False)
+    assert (
+        prepare(settings_of("pi05", small_suite, checkpoint=base, capture_only=True), fetch=False).plan.bytes > 0
+    )
+    with pytest.raises(CheckpointError, match=r"acts in 32 dimensions.*--no-act"):
+        prepare(settings_of("pi05", small_suite, checkpoint=str(folder)), fetch=False)
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_configuration_whose_backbone_is_not_in_the_cache_is_planned_with_the_released_size_and_why(
+    tmp_path: Path, small_suite: Suite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_smolvla(tmp_path / "model")
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    config["vlm_model_name"] = "lab/absent"
+    (folder / "config.json").write_text(json.dumps(config), encoding="utf-8")
+    repo = cached(monkeypatch, tmp_path / "cache", "lab/tiny", folder)
+    planned = prepare(settings_of("smolvla", small_suite, checkpoint=repo, capture_only=True), fetch=False)
+    assert planned.declared.startswith("of the released size, because its own configuration cannot be read here: ")
+    assert "lab/absent" in planned.declared
+    assert [own.layers for own in planned.plan.streams] == [17, 17]
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_an_adapter_in_the_cache_is_planned_with_the_sizes_of_its_base(
+    tmp_path: Path, small_suite: Suite, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As long as the weights of either are not there, they are to be downloaded."""
+    base = write_pi05(tmp_path / "base")
+    streams = sizes(load_model("pi05", str(base)).streams.values())
+    (tmp_path / "alone").mkdir()
+    settings = {"peft_type": "LORA", "r": 2, "lora_alpha": 2, "base_model_name_or_path": "lab/base"}
+    (tmp_path / "alone" / "adapter_config.json").write_text(json.dumps(settings), encoding="utf-8")
+    tuned = cached(monkeypatch, tmp_path / "cache", "lab/tuned", tmp_path / "alone")
+    wanted = settings_of("pi05", small_suite, checkpoint=tuned, capture_only=True)
+    planned = prepare(wanted, fetch=False)
+    assert planned.declared.startswith("of the released size, because")
+    assert "'lab/base'" in planned.declared
+    cached(monkeypatch, tmp_path / "cache", "lab/base", base)
+    assert sizes(prepare(wanted, fetch=False).plan.streams) == streams
+    assert "download about" in weights_needed("pi05", tuned, {}, None)
+    folder = tmp_path / "cache" / "models--lab--base" / "snapshots" / ("c" * 40)
+    shutil.copy(base / "model.safetensors", folder)
+    assert "download about" in weights_needed("pi05", tuned, {}, None)
+    (folder.parents[2] / "models--lab--tuned" / "snapshots" / ("c" * 40) / "adapter_model.safetensors").touch()
+    assert weights_needed("pi05", tuned, {}, None).endswith("nothing to download")
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_download_is_counted_from_the_index_of_the_weights_in_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_pi05(tmp_path / "model")
+    content = (folder / "model.safetensors").read_bytes()
+    (folder / "model.safetensors").unlink()
+    for number, part in enumerate((content[:5_000], content[5_000:7_000]), 1):
+        (folder / f"model-0000{number}-of-00002.safetensors").write_bytes(part)
+    index = {
+        "metadata": {"total_size": 1_234_567},
+        "weight_map": {"a": "model-00001-of-00002.safetensors", "b": "model-00002-of-00002.safetensors"},
+    }
+    (folder / "model.safetensors.index.json").write_text(json.dumps(index), encoding="utf-8")
+    repo = cached(monkeypatch, tmp_path / "cache", "lab/tiny", folder, weights=True)
+    assert weights_needed("pi05", repo, {}, None).endswith("nothing to download")
+    (tmp_path / "cache" / "models--lab--tiny" / "snapshots" / ("c" * 40) / index["weight_map"]["b"]).unlink()
+    assert weights_needed("pi05", repo, {}, None).endswith(f"download {in_units(1_234_567 - 5_000)}")
 
 
 def test_every_family_of_the_hub_declares_its_sizes() -> None:
@@ -139,7 +279,7 @@ def test_declared_streams_have_the_names_and_roles_of_the_loaded_model(name: str
 @pytest.mark.usefixtures("nowhere")
 def test_questions_are_planned_without_their_model(small_suite: Suite) -> None:
     asks = [settings_of("qwen3-vl", small_suite)] * 2
-    assert [one.declared for one in prepare_asks(asks, [None, None], fetch=False)] == [True, True]  # type: ignore[arg-type]
+    assert [one.declared for one in prepare_asks(asks, [None, None], fetch=False)] == ["of the released size"] * 2  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("nowhere")
@@ -148,6 +288,27 @@ def test_a_folder_that_is_not_there_is_refused_without_the_network(name: str, sm
     """Also of families whose checkpoints only their loader knows."""
     with pytest.raises(CheckpointError, match="does not exist"):
         prepare(settings_of(name, small_suite, checkpoint="./nowhere"), fetch=False)
+
+
+@pytest.mark.usefixtures("nowhere")
+def test_a_plan_of_a_few_items_draws_these_and_one_category(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The items, their hash and what they are enough for are those of the whole suite."""
+    monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path / "cache"))
+    settings = ExtractSettings("pi05", categories=("color", "shape"), items=4, device="cuda", capture_only=True)
+    first = prepare(settings, fetch=False)
+    assert isinstance(first.plan, Plan)
+    drawn = [len(load_suite(place).items) for place in (tmp_path / "cache" / "suites").iterdir()]
+    assert sorted(drawn) == [8, 150]
+    whole = default_suite(("color", "shape"))
+    again = prepare(settings, fetch=False)
+    assert isinstance(again.plan, Plan)
+    assert again.plan.suite.whole.content_sha256 == whole.content_sha256
+    assert first.plan.suite.items == again.plan.suite.items
+    assert first.plan.suite.identity == again.plan.suite.identity
+    enough = [list(sufficiencies(own.plan.suite, True, True)) for own in (first, again)]
+    assert enough[0] == enough[1]
 
 
 @pytest.mark.slow

@@ -91,6 +91,15 @@ def test_the_options_of_a_row_are_the_familys_own(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", RELEASED)
+def test_a_row_and_its_options_are_those_of_the_checkpoint_at_any_revision(name: str) -> None:
+    for row in (row for first in own_families()[name].protocols.values() for row in first.rows):
+        at_commit = f"{row.checkpoint}@{'a' * 40}"
+        settings = ExtractSettings(name, row.checkpoint, protocol="act2answer").followed()
+        pinned = ExtractSettings(name, at_commit, protocol="act2answer").followed()
+        assert pinned == replace(settings, checkpoint=at_commit)
+
+
+@pytest.mark.parametrize("name", RELEASED)
 def test_what_is_not_given_is_as_released(name: str) -> None:
     settings = ExtractSettings(name, protocol="act2answer").followed()
     assert settings.scene == SceneSpec.preset("act2answer")

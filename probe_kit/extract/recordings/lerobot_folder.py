@@ -16,7 +16,7 @@ from probe_kit.errors import RecordingError, UsageError
 from probe_kit.extract.recordings.hashed_files import HashedFiles
 from probe_kit.extract.recordings.lerobot_meta import IMAGE, KEYS, NUMERIC, EpisodeMeta, LeRobotMeta
 from probe_kit.extract.recordings.lerobot_source import LeRobotSource
-from probe_kit.hooks.checkpoints.hub import hub_reason, unreachable, way_out
+from probe_kit.hooks.checkpoints.hub import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
 
 MOST_FRAMES = 64
 """Chosen frames that one row holds."""
@@ -222,6 +222,6 @@ def _download(repo: str, commit: str, patterns: list[str]) -> Path:
         )
     except (HfHubHTTPError, LocalEntryNotFoundError, OSError) as error:
         raise UsageError(
-            f"{repo}@{commit} cannot be fetched ({hub_reason(error)}). {way_out(error, offline)}; or give a "
-            "folder that exists"
+            f"{repo}@{commit} cannot be fetched ({hub_reason(error)}). "
+            f"{OFFLINE_WAY_OUT if offline else way_out(error)}; or give a folder that exists"
         ) from error

@@ -93,8 +93,14 @@ def _check_acting(settings: ExtractSettings) -> None:
 
 def check_embodiment(settings: ExtractSettings, policy: "Policy") -> None:
     """Raise CheckpointError for a policy whose actions cannot move this arm, unless it is only captured."""
-    if not settings.capture_only and (reason := policy.embodiment_mismatch()) is not None:
-        problem = with_origin(reason, settings.model, policy.card.checkpoint)
+    if not settings.capture_only:
+        check_misfit(settings, policy.embodiment_mismatch(), policy.card.checkpoint)
+
+
+def check_misfit(settings: ExtractSettings, reason: str | None, checkpoint: str) -> None:
+    """Raise CheckpointError for a reason why actions cannot move this arm, unless nothing acts."""
+    if not settings.capture_only and reason is not None:
+        problem = with_origin(reason, settings.model, checkpoint)
         raise CheckpointError(
             f"{problem}. To capture activations without acting, add --no-act. Probing works as usual; there is no "
             "success rate"

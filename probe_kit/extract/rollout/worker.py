@@ -136,8 +136,9 @@ class Worker:
     def _certificate(self) -> dict[str, Any]:
         """The controller's, and the sources of this process."""
         certificate = self._controller.certificate()
-        checkpoint = str(certificate["policy"].get("checkpoint") or "")
-        return {**certificate, SOURCES: RunSources.of(self._settings, checkpoint).to_json()}
+        card = certificate["policy"]
+        checkpoint, repositories = str(card.get("checkpoint") or ""), card.get("repositories", {})
+        return {**certificate, SOURCES: RunSources.of(self._settings, checkpoint, repositories).to_json()}
 
     def _pictures(self, rollout: Rollout) -> dict[str, bytes]:
         """Content by key of what is kept for people."""

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Protocol, Self
 
 from probe_kit.env import SceneSpec
@@ -43,7 +44,8 @@ class RunSources:
     suite: absolute folder; None for the embedded suite and for runs without one. checkpoint: absolute folder, hub
     id, or a word of the family; empty if unknown. scene_files: absolute, by field of the scene. options: of the
     family, as they were passed. random_weights: whether random weights were requested, which a file that calls its
-    weights random is not. weights_seed: of requested random weights.
+    weights random is not. weights_seed: of requested random weights. repositories: commits of further repositories
+    of the hub, by name, which a repetition reads again.
     """
 
     suite: str | None = None
@@ -52,10 +54,13 @@ class RunSources:
     options: Mapping[str, Any] = field(default_factory=dict)
     random_weights: bool = False
     weights_seed: int = 0
+    repositories: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, settings: SettingsWithSources, checkpoint: str) -> Self:
-        """Sources of a process with these settings. checkpoint: as the loaded model's card has it."""
+    def of(
+        cls, settings: SettingsWithSources, checkpoint: str, repositories: Mapping[str, str] = MappingProxyType({})
+    ) -> Self:
+        """Sources of a process with these settings. checkpoint, repositories: of the loaded model's card."""
         files = {name: getattr(settings.scene, name) for name in ("arm_urdf", "background")}
         return cls(
             suite=None if settings.suite is None else _absolute(settings.suite),
@@ -64,6 +69,7 @@ class RunSources:
             options=dict(settings.options),
             random_weights=settings.random_weights,
             weights_seed=settings.weights_seed,
+            repositories=dict(repositories),
         )
 
     @classmethod

@@ -1,6 +1,6 @@
 """The files of a LoRA adapter: what of them can be merged, and on which base. Imports no torch."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,8 +10,9 @@ from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import (
     ADAPTER_FILE,
     CONFIG_FILE,
-    checkpoint_folder,
+    PATTERNS,
     missing_weights,
+    plain_folder,
 )
 
 ADAPTER_WEIGHTS = ("adapter_model.safetensors", "adapter_model.bin")
@@ -47,27 +48,57 @@ class AdapterFiles:
         """Folder or hub id of the checkpoint that it was trained on, as the file names it."""
         return str(self.settings["base_model_name_or_path"])
 
-    def base_folder(self) -> Path:
+    def base_folder(self, patterns: Sequence[str] = PATTERNS) -> Path:
         """The folder of the base's checkpoint; a relative path may start at the adapter.
 
-        Raises CheckpointError if it is not there, or is an adapter itself.
+        patterns: the files that are needed of a base on the hub. Raises CheckpointError if it is not there, or is
+        an adapter itself.
         """
-        beside = self.folder / self.base
-        try:
-            place = beside.resolve() if beside.is_dir() else checkpoint_folder(self.base)
-        except CheckpointError as error:
-            raise CheckpointError(
-                f"the LoRA adapter in {self.folder} was trained on {self.base!r}: {error}. "
-                f"Correct base_model_name_or_path in its {ADAPTER_FILE}"
-            ) from error
-        if place.resolve() == self.folder.resolve():
-            return self.folder
-        if (place / ADAPTER_FILE).is_file():
-            raise CheckpointError(
-                f"the base {place} of the LoRA adapter in {self.folder} is an adapter itself. Merge the base with "
-                "peft first, and name the merged folder as base_model_name_or_path"
-            )
-        return place
+        return base_folder_of(self.folder, self.settings, patterns)
+
+
+_JOINED: dict[str, Path] = {}
+"""Folders in which the files of an adapter and its base are joined, with the adapter's own."""
+
+
+def remember_joined(joined: Path, folder: Path) -> None:
+    """Note that a folder holds links to the files of the adapter in `folder`, and of its base."""
+    _JOINED[str(joined)] = folder
+
+
+def with_adapters_named(text: str) -> str:
+    """Return a text in which every joined folder has the name of its adapter's own."""
+    for joined, folder in _JOINED.items():
+        text = text.replace(joined, str(folder))
+    return text
+
+
+def base_folder_of(folder: Path, settings: Mapping[str, Any], patterns: Sequence[str] = PATTERNS) -> Path:
+    """The folder of the base of the adapter in `folder`, with these settings; see `AdapterFiles.base_folder`."""
+    base = str(settings["base_model_name_or_path"])
+    beside = folder / base
+    try:
+        place = beside.resolve() if beside.is_dir() else plain_folder(base, patterns)
+    except CheckpointError as error:
+        raise CheckpointError(
+            f"the LoRA adapter in {folder} was trained on {base!r}: {error}. "
+            f"Correct base_model_name_or_path in its {ADAPTER_FILE}"
+        ) from error
+    if place.resolve() == folder.resolve():
+        return folder
+    if (place / ADAPTER_FILE).is_file():
+        raise CheckpointError(
+            f"the base {place} of the LoRA adapter in {folder} is an adapter itself. Merge the base with "
+            "peft first, and name the merged folder as base_model_name_or_path"
+        )
+    return place
+
+
+def adapter_settings(file: Path) -> dict[str, Any]:
+    """The content of an `adapter_config.json` of an adapter that can be merged. Raises CheckpointError."""
+    settings = dict(read_json_object(file, CheckpointError, "Download the adapter again"))
+    _check_settings(file, settings)
+    return settings
 
 
 def adapter_in(folder: Path) -> AdapterFiles | None:
@@ -76,13 +107,13 @@ def adapter_in(folder: Path) -> AdapterFiles | None:
     Raises CheckpointError for an adapter that cannot be merged exactly, for one of which a file is missing, and
     for weights beside it of which no file says whether they are the base's or merged.
     """
+    folder = _JOINED.get(str(folder), folder)
     file = folder / ADAPTER_FILE
     found = next((folder / name for name in ADAPTER_WEIGHTS if (folder / name).is_file()), None)
     if not file.is_file():
         _check_no_traces(folder, found)
         return None
-    settings = read_json_object(file, CheckpointError, "Download the adapter again")
-    _check_settings(file, settings)
+    settings = adapter_settings(file)
     if found is None:
         raise CheckpointError(
             f"{folder} has {ADAPTER_FILE}, but neither {' nor '.join(ADAPTER_WEIGHTS)}. Download the adapter again"

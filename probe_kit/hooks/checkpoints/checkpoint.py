@@ -9,7 +9,8 @@ from probe_kit._system.bounded_files import MOST_BYTES, check_regular, read_regu
 from probe_kit._system.bounded_json import load_json
 from probe_kit._system.bounded_yaml import load_yaml
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
-from probe_kit.hooks.checkpoints.hub import hub_reason, unreachable, way_out
+from probe_kit.hooks.checkpoints.commits import pinned_commit, record_commit
+from probe_kit.hooks.checkpoints.hub import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
 from probe_kit.models.bounds import check_sizes
 
 CONFIG_FILE, ADAPTER_FILE = "config.json", "adapter_config.json"
@@ -27,6 +28,10 @@ COMMIT_DIGITS = 40
 """Of a commit's full name."""
 RUN_WEIGHTS = "checkpoints/latest-checkpoint.pt"
 """Where a folder of a training run of Prismatic keeps its weights."""
+
+
+class NotCachedError(LookupError):
+    """The cause of a CheckpointError about a repository that the cache lacks where the hub cannot be asked."""
 
 
 class HubName(NamedTuple):
@@ -70,7 +75,13 @@ def pinned(checkpoint: str) -> str:
 def cached_folder(checkpoint: str) -> Path | None:
     """Where the cache of the hub has a hub id; None where it has nothing of it. Asks no network."""
     named = hub_name(checkpoint) if is_on_hub(checkpoint) else None
-    if named is None or (commit := _cached_commit(named)) is None:
+    return None if named is None else _cached(named)
+
+
+def _cached(named: HubName) -> Path | None:
+    """The folder of a revision in the cache, or None."""
+    commit = _cached_commit(named)
+    if commit is None:
         return None
     folder = _cache_of(named.repository) / "snapshots" / commit / named.folder
     return folder if folder.is_dir() else None
@@ -87,9 +98,9 @@ def _cached_commit(named: HubName) -> str | None:
 
 def _cache_of(repository: str) -> Path:
     from huggingface_hub import constants
-    from huggingface_hub.file_download import repo_folder_name
 
-    return Path(constants.HF_HUB_CACHE) / repo_folder_name(repo_id=repository, repo_type="model")
+    # Not the hub's own function: it refuses names that no repository can have, and nothing is looked up here.
+    return Path(constants.HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}"
 
 
 def is_on_hub(checkpoint: str) -> bool:
@@ -97,7 +108,7 @@ def is_on_hub(checkpoint: str) -> bool:
     return hub_name(checkpoint) is not None and not Path(checkpoint).expanduser().exists()
 
 
-def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
+def plain_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
     """The local folder of a folder path or hub id such as `lerobot/pi0_base`, or `owner/repo/folder` for one model
     of a repository that holds several; `@revision` behind it names a branch, a tag or a commit.
 
@@ -108,32 +119,59 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
         folder = Path(checkpoint).expanduser()
     except RuntimeError as error:  # ~name of an unknown user
         raise CheckpointError(f"checkpoint folder {checkpoint!r} does not exist ({error})") from None
-    if folder.is_dir():
-        return _possible(folder)
+    if not folder.is_dir():
+        folder = _fetched(checkpoint, patterns)
+    return _possible(folder)
+
+
+def _fetched(checkpoint: str, patterns: Sequence[str]) -> Path:
+    """The folder of a hub id, of which the cache has a copy then. Raises CheckpointError."""
     named = hub_name(checkpoint)
     if named is None:
         raise CheckpointError(_not_here(checkpoint))
+    named = _with_pin(named)
+    snapshots = _cache_of(named.repository) / "snapshots"
+    if why := unreachable():
+        commit = _cached_commit(named)
+        if commit is None or not (snapshots / commit).is_dir():
+            raise CheckpointError(
+                _not_fetched(checkpoint, f"{why}; the cache has no copy", OFFLINE_WAY_OUT)
+            ) from NotCachedError(named.repository)
+        place = snapshots / commit
+    else:
+        place = _downloaded(checkpoint, named, patterns)
+    record_commit(named.repository, place.name)
+    folder = place / named.folder
+    if not folder.is_dir():
+        raise CheckpointError(
+            f"the repository {named.repository} has no folder {named.folder!r}; look its folders up on its page"
+        )
+    return folder
+
+
+def _with_pin(named: HubName) -> HubName:
+    """A name at the commit that a repetition reads, unless it has a revision."""
+    return named if named.revision else named._replace(revision=pinned_commit(named.repository))
+
+
+def _downloaded(checkpoint: str, named: HubName, patterns: Sequence[str]) -> Path:
+    """The folder of a commit, with the files of these patterns. Raises CheckpointError."""
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 
-    why, (repository, inside, revision) = unreachable(), named
-    wanted = [f"{inside}/{pattern}" if inside else pattern for pattern in patterns]
+    wanted = [f"{named.folder}/{pattern}" if named.folder else pattern for pattern in patterns]
     try:
-        place = snapshot_download(
-            repository, revision=revision or None, allow_patterns=wanted, local_files_only=bool(why)
-        )
+        return Path(snapshot_download(named.repository, revision=named.revision or None, allow_patterns=wanted))
     except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError, ValueError) as error:
-        reason = f"{why}; the cache has no copy" if why else hub_reason(error)
-        raise CheckpointError(
-            f"{_not_here(checkpoint)}, and as a hub id it cannot be fetched ({reason}). "
-            f"{way_out(error, bool(why))}; or pass a local folder as --checkpoint"
-        ) from error
-    folder = Path(place) / inside
-    if not folder.is_dir():
-        raise CheckpointError(
-            f"the repository {repository} has no folder {inside!r}; look its folders up on its page"
-        )
-    return _possible(folder)
+        raise CheckpointError(_not_fetched(checkpoint, hub_reason(error), way_out(error))) from error
+
+
+def _not_fetched(checkpoint: str, reason: str, advice: str) -> str:
+    """The message about a hub id of which nothing arrives."""
+    return (
+        f"{_not_here(checkpoint)}, and as a hub id it cannot be fetched ({reason}). {advice}; or pass a local "
+        "folder as --checkpoint"
+    )
 
 
 def _not_here(checkpoint: str) -> str:
@@ -151,10 +189,10 @@ def hub_files(checkpoint: str) -> list[str]:
     named = hub_name(checkpoint)
     if named is None:
         raise CheckpointError(f"{checkpoint!r} is no hub id; expected owner/repo or owner/repo/folder")
-    repository, inside, revision = named
+    repository, inside, revision = _with_pin(named)
     begin = f"{inside}/" if inside else ""
     if unreachable():
-        folder = checkpoint_folder(checkpoint, ())
+        folder = plain_folder(checkpoint, ())
         found = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
         return sorted(found)
     from huggingface_hub import HfApi
@@ -229,6 +267,11 @@ def side_files(folder: Path, prefix: str = "") -> dict[str, Path]:
     }
 
 
+def is_weights(path: Path) -> bool:
+    """Whether a file holds weights of a network, or lists the files that do."""
+    return path.name.startswith(_WEIGHTS) or path.suffix in (".pt", ".pth", ".bin")
+
+
 def content_hashes(files: Mapping[str, Path]) -> dict[str, str]:
     """`file <name>` → sha256 of its bytes, for `Card.settings`: where a checkpoint lies does not matter."""
     return {f"file {name}": hashlib.sha256(read_regular(path)).hexdigest() for name, path in files.items()}
@@ -269,6 +312,22 @@ def check_unambiguous(folder: Path) -> None:
             f"{folder} holds two sets of weights: {WEIGHTS_FILE}, and {INDEX_FILE} with {others[0]}{more}. "
             "Nothing says which one is meant: remove the other one"
         )
+
+
+def weights_sizes(folder: Path) -> int | None:
+    """Bytes of the weights that an index of shards lists and the folder lacks; None where no index says it.
+
+    An index has the size of all tensors, `total_size`.
+    """
+    try:
+        index = load_json(folder / INDEX_FILE)
+        total = index["metadata"]["total_size"]
+        shards = listed_shards(folder / INDEX_FILE)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    if type(total) is not int or total < 1:
+        return None
+    return max(0, total - sum((folder / name).stat().st_size for name in shards if (folder / name).is_file()))
 
 
 def missing_weights(folder: Path) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from probe_kit._system.bounded_json import read_json, read_json_object
+from probe_kit._system.bounded_json import read_json
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks.checkpoints.adapter_files import adapter_in
 from probe_kit.hooks.checkpoints.checkpoint import (
@@ -20,21 +20,16 @@ def check_files(
     types: Sequence[str],
     weights: bool = True,
     instead: Sequence[tuple[str, str]] = (),
-    bare: bool = False,
 ) -> None:
     """Look at what can be wrong with a checkpoint before anything heavy is imported.
 
     types: what `type` or `model_type` of its config may be. weights: whether its weights will be read. instead:
-    for other types that people may take for one of them, what to do. bare: whether the family reads the
-    configuration of an adapter's base where the adapter has none.
+    for other types that people may take for one of them, what to do.
     Raises CheckpointError for a missing or unreadable config or one of another model, and for a LoRA adapter that
     cannot be merged; WeightsError for missing weights, and for two sets of them.
     """
     file = folder / CONFIG_FILE
-    check_own_config(folder, bare)
     adapter = adapter_in(folder) if weights else None
-    if adapter is not None and not file.is_file():
-        return  # the loader reads the base's
     if not file.is_file():
         raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}")
     config = read_json(file, CheckpointError, "Download the checkpoint again")
@@ -48,21 +43,6 @@ def check_files(
     check_unambiguous(place)
     if lacking := missing_weights(place):
         raise WeightsError(f"no weights in {place}: {lacking}. {_way_to_weights(place)}")
-
-
-def check_own_config(folder: Path, bare: bool = False) -> None:
-    """Raise CheckpointError for a LoRA adapter without the configuration that its family reads beside it.
-
-    bare: whether the family reads that of the base.
-    """
-    if bare or (folder / CONFIG_FILE).is_file() or not (folder / ADAPTER_FILE).is_file():
-        return
-    settings = read_json_object(folder / ADAPTER_FILE, CheckpointError, "Download the adapter again")
-    base = settings.get("base_model_name_or_path") or "an unnamed base"
-    raise CheckpointError(
-        f"{folder} is a LoRA adapter of {base} without {CONFIG_FILE}, which this family reads beside the adapter. "
-        f"Copy {CONFIG_FILE} and the processor and tokenizer files of {base} there"
-    )
 
 
 def _type_of(config: Any) -> Any:

@@ -1,11 +1,27 @@
 """Whether the hub can be reached, because its client retries for minutes, and why it refuses. Imports no torch."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from threading import Thread
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 PATIENCE = 5.0
 """Seconds without a reply after which the hub counts as unreachable."""
+OFFLINE_WAY_OUT = "Connect to the network once, or fill the cache with `hf download`"
+"""What to do where the hub cannot be asked."""
+_WITHOUT_NETWORK = ContextVar("without_network", default=False)
+
+
+@contextmanager
+def without_network() -> Iterator[None]:
+    """A context in which only the cache of the hub is read, as for a plan."""
+    token = _WITHOUT_NETWORK.set(True)
+    try:
+        yield
+    finally:
+        _WITHOUT_NETWORK.reset(token)
 
 
 def unreachable() -> str:
@@ -13,6 +29,8 @@ def unreachable() -> str:
 
     A proxy that the environment names is used. Nothing is sent when the hub's own offline mode is on.
     """
+    if _WITHOUT_NETWORK.get():
+        return "a plan asks no network"
     from huggingface_hub import constants
 
     if constants.HF_HUB_OFFLINE:
@@ -63,13 +81,11 @@ def hub_reason(error: Exception) -> str:
     return f"the hub answers {status}: {first}" if status else first
 
 
-def way_out(error: Exception, offline: bool = False) -> str:
+def way_out(error: Exception) -> str:
     """What to do about a refusal of the hub."""
     from huggingface_hub import errors, get_token
 
     cause = _cause(error)
-    if offline:
-        return "Connect to the network once, or fill the cache with `hf download`"
     if isinstance(cause, errors.GatedRepoError):
         asked = "ask for access on the model's page" if get_token() else "run `hf auth login`"
         return f"{asked[0].upper()}{asked[1:]}"

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from probe_kit.errors import CheckpointError, InstructionError, PolicyFailedError, ProbeKitError, WeightsError
+from probe_kit.hooks.checkpoints.adapter_files import with_adapters_named
 from probe_kit.hooks.checkpoints.containment import contained
 
 _LONGEST = 300
@@ -30,6 +31,7 @@ def naming_checkpoint(model: str, place: str) -> Iterator[None]:
 
 def with_origin(reason: str, model: str, place: str) -> str:
     """A reason why a checkpoint cannot be used, with the names of its model and place unless it holds them."""
+    reason = with_adapters_named(reason)
     places = {place, str(Path(place))}
     rest = reason
     for one in places:

@@ -18,6 +18,7 @@ from probe_kit.errors import WeightsError
 from probe_kit.hooks.checkpoints.adapter_files import AdapterFiles, adapter_in
 from probe_kit.hooks.checkpoints.checkpoint import check_unambiguous, shard_name
 from probe_kit.hooks.checkpoints.lora import Adapter
+from probe_kit.models.sizes_only import builds_sizes_only
 
 SINGLE_FILE = "model.safetensors"
 INDEX_FILE = "model.safetensors.index.json"
@@ -207,6 +208,8 @@ def load_weights(
     named: the module's name of a tensor in a file, for the adapter that is merged.
     Raises WeightsError naming missing, extra, mis-shaped and non-finite tensors; the module is then not used.
     """
+    if builds_sizes_only():
+        return WeightsAudit("", True, 0, sum(own.numel() for own in module.parameters()), ())
     state = module.state_dict()
     _refuse_wrapped(weights, tensors, state)
     allowed = set(allowed_missing) & (set(state) - set(tensors))

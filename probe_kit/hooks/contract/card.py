@@ -34,6 +34,8 @@ class ModelCard:
     newest with the largest weight; None executes the head of the newest chunk.
     source: the family of the VLM whose network this policy grew from, if it is one of ours. source_weights: of
     that family, the weights; None where they are unknown, as for a checkpoint that is not the family's own.
+    repositories: commits of further repositories of the hub that were read, by name: of the base of an adapter, a
+    vision-language model or a tokenizer.
     exact: False if the weights that ran are only near those of the file, as after quantisation.
     """
 
@@ -58,6 +60,7 @@ class ModelCard:
     ensemble: float | None = None
     source: str | None = None
     source_weights: SourceWeights | None = None
+    repositories: Mapping[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """As stored in a run's certificate: plain values only."""
@@ -68,6 +71,7 @@ class ModelCard:
             "notes": list(self.notes),
             "audit": dict(self.audit),
             "settings": dict(self.settings),
+            "repositories": dict(self.repositories),
             "needs": sorted(self.needs),
             "source_weights": None if self.source_weights is None else asdict(self.source_weights),
         }

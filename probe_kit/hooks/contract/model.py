@@ -143,6 +143,13 @@ class Model(ABC):
         del instructions
         return None
 
+    def read_late_files(self) -> None:
+        """Read what is otherwise read at the first inference, such as a tokenizer of another repository.
+
+        Its commit then stands in the card. Raises CheckpointError for what is not here.
+        """
+        return
+
     def sites(self, quantity: str = "residual") -> list[Site]:
         """All sites of one quantity in the stored streams that have it, stream by stream."""
         having = [stream for stream in self.streams.values() if quantity in stream.captured]
@@ -232,6 +239,10 @@ class Policy(Model):
         """Why its actions cannot move this arm; None if they can. Its activations can be captured nevertheless."""
         return None
 
+    def configured_mismatch(self) -> str | None:
+        """As `embodiment_mismatch`, from the configuration alone: its statistics may not be here yet."""
+        return None
+
     def zero_filled_inputs(self) -> tuple[str, ...]:
         """Inputs that `infer_without_acting` replaces by zeros, because the checkpoint expects others there."""
         return ()
@@ -299,6 +310,17 @@ class Policy(Model):
         Raises CheckpointError for a checkpoint without statistics.
         """
         return np.zeros(states.shape, bool)
+
+    @property
+    def unguarded_state(self) -> str | None:
+        """Why the states of a source are compared with no statistics; None where `unusual_states` compares them.
+
+        A family that reads a state has statistics of it, or says here why not; the card's notes repeat it.
+        """
+        if self.state_numbers is None:
+            return "no state is read"
+        compares = type(self).unusual_states is not Policy.unusual_states
+        return None if compares else "the family has no statistics of states"
 
     def unusual_actions(self, actions: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(n, D) which numbers of recorded actions (n, D) lie far outside the checkpoint's own statistics."""

@@ -38,12 +38,15 @@ class ProtocolRow:
         return (self, *self.further)
 
     def of(self, checkpoint: str | None) -> "ProtocolRow":
-        """The row of `checkpoint`; this one for None, and for a checkpoint that the protocol does not use."""
-        return next((row for row in self.rows if row.checkpoint == checkpoint), self)
+        """The row of `checkpoint`, at any revision.
+
+        This one for None, and for a checkpoint that the protocol does not use.
+        """
+        return next((row for row in self.rows if row.checkpoint == _bare(checkpoint)), self)
 
     def options_for(self, checkpoint: str | None) -> dict[str, Any]:
         """The options with `checkpoint`, None for the protocol's own."""
-        own = self.of_checkpoint if checkpoint in (None, self.checkpoint) else {}
+        own = self.of_checkpoint if _bare(checkpoint) in (None, self.checkpoint) else {}
         return {**own, **self.options}
 
     def settings(self) -> dict[str, str]:
@@ -55,6 +58,11 @@ class ProtocolRow:
             "dtype": self.dtype,
             **{f"-M {name}": as_text(value) for name, value in self.options_for(None).items()},
         }
+
+
+def _bare(checkpoint: str | None) -> str | None:
+    """A hub id without the revision at which it is read."""
+    return None if checkpoint is None else checkpoint.partition("@")[0]
 
 
 def as_text(value: Any) -> str:

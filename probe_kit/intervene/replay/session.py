@@ -25,6 +25,7 @@ from probe_kit.extract.store.run import Run
 from probe_kit.extract.store.sources import RunSources
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.checkpoint import cached_folder
+from probe_kit.hooks.checkpoints.commits import pinned_commits
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.card import EMBEDDED
@@ -240,15 +241,17 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
 
     made = _sources_of(run)
     checkpoint = source.checkpoint or _folder_of(run)
-    return load_policy(
-        run.model,
-        checkpoint,
-        source.device,
-        run.settings["dtype"],
-        made.random_weights,
-        made.weights_seed if source.weights_seed is None else source.weights_seed,
-        **{**_options_of(made, checkpoint), **source.options},
-    )
+    # Branches of its vision-language model or tokenizer may have gone on since the run was made.
+    with pinned_commits(made.repositories):
+        return load_policy(
+            run.model,
+            checkpoint,
+            source.device,
+            run.settings["dtype"],
+            made.random_weights,
+            made.weights_seed if source.weights_seed is None else source.weights_seed,
+            **{**_options_of(made, checkpoint), **source.options},
+        )
 
 
 def _sources_of(run: Run) -> RunSources:

@@ -95,7 +95,10 @@ def check_run_fits(run: Run) -> None:
     elif run.weights_sha256 is None or not run.streams:
         why = f"{run.model} is scripted: it has no network in which anything could be changed"
     elif run.capture_only:
-        why = f"{run.model} only captured activations, because its actions cannot move this arm"
+        why = (
+            f"{run.model} only captured activations (--no-act): no action was stored with which the effect of a "
+            "change could be compared. Extract a run without --no-act, of a checkpoint whose actions move this arm"
+        )
     elif settings.get("edits"):
         why = "its streams were edited already, and the stored run does not hold the vectors"
     if why is not None:

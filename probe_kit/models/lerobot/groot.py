@@ -23,6 +23,7 @@ from transformers import BatchFeature
 
 from probe_kit.errors import CheckpointError
 from probe_kit.models.building import build_empty, replaced
+from probe_kit.models.sizes_only import building_device
 
 VLM = GROOT_N1_7_BACKBONE_MODEL
 """Whose configuration lerobot holds itself; any other is read from its folder."""
@@ -47,6 +48,7 @@ def network_config(values: Mapping[str, Any], config: GrootConfig, vlm: str) -> 
 
 def build_groot(config: GrootConfig, network: GR00TN17Config, device: str = "cpu") -> GrootPolicy:
     """A `GrootPolicy` in eval mode with uninitialised weights; parameters in float32 where `config` says so."""
+    device = building_device(device)
     config.device = device
     dtype = torch.float32 if config.model_params_fp32 else torch.bfloat16
 

@@ -28,6 +28,7 @@ from probe_kit.models.building import build_empty, replaced
 from probe_kit.models.lerobot.pi05 import Gate
 from probe_kit.models.pretrained import load_pretrained
 from probe_kit.models.prompt_kv import PromptKV
+from probe_kit.models.sizes_only import building_device
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 RELEASED: dict[str, Any] = {
@@ -91,6 +92,7 @@ def lerobots_policy(
 
     network: the configuration in the VLM's own folder `place`.
     """
+    device = building_device(device)
     config.device, config.checkpoint_path = device, str(place)
     dtype = DTYPES[config.model_dtype]
 

@@ -19,6 +19,7 @@ from lerobot.policies.pi0.modeling_pi0 import PI0Policy
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.models.building import replaced
+from probe_kit.models.sizes_only import building_device
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,7 @@ def build_pi0(config: PI0Config, size: Pi0Size | None = None, device: str = "cpu
     device: `meta` serves to look at names and shapes. A policy that will act is built on the CPU, because the
     embedding scale and the rotary frequencies are buffers no checkpoint holds.
     """
+    device = building_device(device)
     config.device = device
     with resized(modeling_pi0, size), torch.device(device):
         policy = PI0Policy(config)

@@ -15,6 +15,7 @@ from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from torch import Tensor, nn
 
 from probe_kit.models.lerobot.pi0 import Pi0Size, resized
+from probe_kit.models.sizes_only import building_device
 
 
 class Gate(nn.Module):
@@ -27,6 +28,7 @@ class Gate(nn.Module):
 
 def build_pi05(config: PI05Config, size: Pi0Size | None = None, device: str = "cpu") -> PI05Policy:
     """A `PI05Policy` in eval mode with uninitialised weights; see `build_pi0`."""
+    device = building_device(device)
     config.device = device
     with resized(modeling_pi05, size), torch.device(device):
         policy = PI05Policy(config)

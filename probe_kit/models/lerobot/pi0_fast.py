@@ -26,6 +26,7 @@ from probe_kit.errors import CheckpointError
 from probe_kit.models.building import replaced
 from probe_kit.models.lerobot.pi0 import GemmaSize, SiglipSize, sized_paligemma
 from probe_kit.models.prompt_kv import PromptKV
+from probe_kit.models.sizes_only import building_device
 
 _NO_TOKENIZER = SimpleNamespace(from_pretrained=lambda *_, **__: None)
 
@@ -57,6 +58,7 @@ class Pi0FastSize:
 
 def build_pi0_fast(config: PI0FastConfig, size: Pi0FastSize | None = None, device: str = "cpu") -> PI0FastPolicy:
     """A `PI0FastPolicy` in eval mode with uninitialised weights and without tokenizers; see `build_pi0`."""
+    device = building_device(device)
     config.device = device
     no_tokenizers = {"AutoProcessor": _NO_TOKENIZER, "AutoTokenizer": _NO_TOKENIZER}
     with sized(size, config), replaced(modeling_pi0_fast, no_tokenizers), torch.device(device):

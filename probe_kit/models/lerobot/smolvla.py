@@ -19,6 +19,7 @@ from probe_kit.errors import CheckpointError
 from probe_kit.models.building import replaced
 from probe_kit.models.lerobot.pi0_keys import STATISTICS
 from probe_kit.models.pretrained import load_pretrained
+from probe_kit.models.sizes_only import building_device
 
 
 def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> SmolVLAPolicy:
@@ -29,6 +30,7 @@ def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> S
     device: `meta` serves to look at names and shapes.
     Raises CheckpointError if the VLM's configuration cannot be found.
     """
+    device = building_device(device)
     config.device = device
     config.load_vlm_weights = False
     name = config.vlm_model_name

@@ -20,6 +20,7 @@ from lerobot.policies.xvla.modeling_xvla import (
 from torch import Tensor
 
 from probe_kit.models.building import build_empty
+from probe_kit.models.sizes_only import building_device
 
 _LANGUAGE = "model.vlm.language_model."
 _EMBEDDINGS = (f"{_LANGUAGE}shared.weight", f"{_LANGUAGE}encoder.embed_tokens.weight")
@@ -44,6 +45,7 @@ FLORENCE_LARGE: dict[str, Any] = {
 
 def build_xvla(config: XVLAConfig, device: str = "cpu") -> XVLAPolicy:
     """A `XVLAPolicy` in eval mode with uninitialised weights, in the precision that `config` names."""
+    device = building_device(device)
     config.device = device
     dtype = torch.bfloat16 if config.dtype == "bfloat16" else torch.float32
     return cast(XVLAPolicy, build_empty(lambda: XVLAPolicy(config), dtype, device))

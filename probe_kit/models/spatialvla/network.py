@@ -14,6 +14,7 @@ from transformers import DynamicCache, Gemma2ForCausalLM, SiglipVisionModel, Zoe
 from probe_kit.errors import UsageError, WeightsError
 from probe_kit.models.building import build_empty
 from probe_kit.models.prompt_kv import PromptKV
+from probe_kit.models.sizes_only import builds_sizes_only
 from probe_kit.models.spatialvla.config import SpatialVLAConfig
 from probe_kit.models.spatialvla.depth import Depth, estimate_depth, fill_depth_buffers
 from probe_kit.models.spatialvla.space import PositionEmbedding3D, back_project
@@ -203,7 +204,8 @@ def build_spatialvla(config: SpatialVLAConfig, dtype: torch.dtype, device: str =
     the weights. Raises WeightsError if a part of transformers has a constant that would stay without memory.
     """
     network = build_empty(lambda: SpatialVLANetwork(config), dtype, device)
-    _fill_buffers(network)
+    if not builds_sizes_only():
+        _fill_buffers(network)
     return network.eval()
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from probe_kit.extract.needs import declared_streams, space_of
+from probe_kit.extract.needs import PlannedSizes, planned_sizes, space_of
 from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import ExtractSettings, RunSettings
 from probe_kit.hooks.registry import family_names
@@ -114,7 +114,8 @@ def _bytes(one: Work, stored: Sequence[StoredStream] | None, speeds: Mapping[str
     """Of an episode: from stored streams, else as the family declares them, else from a calibration."""
     settings, streams = one.cell.settings, one.streams or stored
     if streams is None:  # a script has no network
-        streams = declared_streams(settings) if settings.model in family_names() else []
+        sizes = planned_sizes(settings) if settings.model in family_names() else PlannedSizes((), "")
+        streams = None if sizes is None else sizes.streams
     if streams is not None:
         return bytes_per_episode(streams, settings)
     found = speeds.get(speed_name(one.cell))

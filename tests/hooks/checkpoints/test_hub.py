@@ -9,7 +9,7 @@ import pytest
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints import hub
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 
 
 @pytest.fixture

@@ -1,26 +1,26 @@
 """A checkpoint of the hub is named with its commit, and a refusal of the hub keeps its reason."""
 
+import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.extract.settings import ExtractSettings, run_label
 from probe_kit.hooks import load_model
-from probe_kit.hooks.checkpoints.checkpoint import (
-    cached_folder,
-    checkpoint_folder,
-    hub_files,
-    pinned,
-    without_revision,
-)
+from probe_kit.hooks.checkpoints.checkpoint import cached_folder, hub_files, pinned, without_revision
+from probe_kit.hooks.checkpoints.commits import pinned_commits
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
+from tests.support.every_checkpoint import WRITERS
 from tests.support.hub_stand_in import Hub, hub
 from tests.support.pi0_checkpoints import write_intact
 
 OLD, NEW = "a" * 40, "b" * 40
-REPO = "lab/tiny"
+REPO, PART = "lab/tiny", "lab/part"
 
 
 @pytest.fixture
@@ -85,6 +85,80 @@ def test_the_card_and_a_repetition_have_the_commit(
     monkeypatch.setattr("probe_kit.hooks.checkpoints.checkpoint.unreachable", lambda: "offline mode")
     again = load_model("pi0", card.checkpoint).card
     assert (again.checkpoint, again.weights_sha256) == (card.checkpoint, card.weights_sha256)
+
+
+def vlm_of(folder: Path, field: str, part: str) -> dict[str, bytes]:
+    """A checkpoint that names a part of its folder as a repository; returns the part's files, which it loses."""
+    config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+    (folder / "config.json").write_text(json.dumps(config | {field: PART}), encoding="utf-8")
+    place = folder / part
+    names = [path for path in place.rglob("*") if path.is_file() and path.suffix != ".safetensors"]
+    files = {path.relative_to(place).as_posix(): path.read_bytes() for path in names}
+    shutil.rmtree(place)
+    return files
+
+
+def tokenizer_of(folder: Path, field: str, _: str) -> dict[str, bytes]:
+    """The same of a tokenizer beside the configuration; no field names PaliGemma's."""
+    if field:
+        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        (folder / "config.json").write_text(json.dumps(config | {field: PART}), encoding="utf-8")
+    files = {path.name: path.read_bytes() for path in folder.glob("tokenizer*")}
+    for name in files:
+        (folder / name).unlink()
+    return files
+
+
+def base_of(folder: Path, *_: str) -> dict[str, bytes]:
+    """The same of an adapter, whose base is a repository; the folder then holds the adapter alone."""
+    files = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    tensors = load_file(folder / "model.safetensors")
+    name = next(own for own, tensor in tensors.items() if own.endswith("q_proj.weight") and tensor.ndim == 2)
+    up, down = torch.zeros(len(tensors[name]), 2), torch.zeros(2, tensors[name].shape[1])
+    module = f"base_model.model.{name.removesuffix('.weight')}"
+    shutil.rmtree(folder)
+    folder.mkdir()
+    factors = {f"{module}.lora_A.weight": down, f"{module}.lora_B.weight": up}
+    save_file(factors, folder / "adapter_model.safetensors")
+    settings = {"peft_type": "LORA", "r": 2, "lora_alpha": 2, "base_model_name_or_path": PART}
+    (folder / "adapter_config.json").write_text(json.dumps(settings), encoding="utf-8")
+    return files
+
+
+PARTS: dict[str, tuple[str, Callable[..., dict[str, bytes]], str, str, str]] = {
+    "vision-language model": ("smolvla", vlm_of, "vlm_model_name", "vlm", "config.json"),
+    "checkpoint of the network": ("molmoact2", vlm_of, "checkpoint_path", "vlm", "config.json"),
+    "base of a policy": ("groot", vlm_of, "base_model_path", "base", "statistics.json"),
+    "action tokenizer": ("pi0-fast", vlm_of, "action_tokenizer_name", "fast", "processor_config.json"),
+    "a step's tokenizer": ("xvla", tokenizer_of, "", "", "tokenizer.json"),
+    "default tokenizer": ("pi0", tokenizer_of, "", "", "tokenizer.json"),
+    "base of an adapter": ("pi05", base_of, "", "", "config.json"),
+}
+
+
+@pytest.mark.parametrize("kind", list(PARTS))
+def test_the_card_has_the_commits_of_the_repositories_that_a_checkpoint_names_and_a_repetition_reads_them(
+    kind: str, server: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    family, taken, field, part, changed = PARTS[kind]
+    write, options = WRITERS[family]
+    folder = write(tmp_path / "model")
+    files = taken(folder, field, part)
+    repo = {"default tokenizer": "google/paligemma-3b-pt-224", "a step's tokenizer": "facebook/bart-large"}.get(
+        kind, PART
+    )
+    server.models[repo] = {OLD: files, NEW: {**files, changed: files[changed] + b"\n"}}
+    server.names[repo] = {"main": OLD}
+    card = load_model(family, str(folder), **options).card
+    assert card.repositories == {repo: OLD}
+    server.names[repo]["main"] = NEW
+    with pinned_commits(card.repositories):
+        again = load_model(family, str(folder), **options).card
+    assert (again.repositories, again.settings) == (card.repositories, card.settings)
+    assert load_model(family, str(folder), **options).card.repositories == {repo: NEW}
+    monkeypatch.setattr("probe_kit.hooks.checkpoints.checkpoint.unreachable", lambda: "offline mode")
+    with pinned_commits(card.repositories):
+        assert load_model(family, str(folder), **options).card.repositories == {repo: OLD}
 
 
 def test_a_local_folder_with_an_at_sign_is_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

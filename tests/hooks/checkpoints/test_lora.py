@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from peft import LoraConfig, get_peft_model
@@ -13,9 +14,10 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from probe_kit.errors import CheckpointError, WeightsError
-from probe_kit.hooks import load_model
+from probe_kit.hooks import Observation, load_model, load_policy
 from probe_kit.hooks.checkpoints.adapter_files import adapter_in
 from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.models.magma import shipped_statistics
 from tests.support.every_checkpoint import WRITERS
 
 RANK, ALPHA = 2, 6
@@ -261,13 +263,133 @@ def test_a_folder_without_an_adapter_has_none(folders: tuple[Path, Path]) -> Non
     assert adapter_in(folders[0]) is None
 
 
-@pytest.mark.parametrize("family", ["pi0", "xvla", "magma", "spatialvla"])
-@pytest.mark.parametrize("untrained", [False, True])
-def test_an_adapter_without_a_configuration_is_named_with_what_to_copy(
-    family: str, untrained: bool, tmp_path: Path
+@pytest.mark.parametrize("family", list(WRITERS))
+def test_an_adapter_alone_is_its_base_plus_what_it_learned_in_every_family(family: str, tmp_path: Path) -> None:
+    """As with the base's small files beside it: the same weights, streams and settings."""
+    write, options = WRITERS[family]
+    base = write(tmp_path / "base")
+    plain = load_model(family, str(base), **options)
+    module = last_linear(network_of(plain))
+    own = factors(module, network_of(plain).state_dict()[f"{module}.weight"])
+    beside = write_adapter(without_weights(base, tmp_path / "beside"), own, str(base))
+    (tmp_path / "alone").mkdir()
+    alone = write_adapter(tmp_path / "alone", own, str(base))
+
+    card = load_model(family, str(alone), **options).card
+
+    expected = load_model(family, str(beside), **options).card
+    assert card.weights_sha256 == expected.weights_sha256 != plain.card.weights_sha256
+    assert card.settings == expected.settings
+    assert card.checkpoint == str(alone)
+    assert f"LoRA adapter merged into {base}" in card.notes
+    assert not any("probe-kit-adapter" in note for note in card.notes)
+    untrained = load_model(family, str(alone), random_weights=True, **options)
+    assert untrained.card.settings == expected.settings
+
+
+def doubled(values: Any) -> Any:
+    """The same JSON with every number of a statistic twice as large."""
+    if isinstance(values, dict):
+        return {name: own if name == "mask" else doubled(own) for name, own in values.items()}
+    if isinstance(values, list):
+        return [doubled(own) for own in values]
+    return values * 2 if isinstance(values, float) else values
+
+
+def read(file: Path) -> Any:
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def openvlas(base: Path) -> Any:
+    return doubled(read(base / "config.json")["norm_stats"])
+
+
+def xiaomis(base: Path) -> Any:
+    content = read(base / "preprocessor_config.json")
+    return {**content, "action_config": doubled(content["action_config"])}
+
+
+def spatialvlas(base: Path) -> Any:
+    content = read(base / "processor_config.json")
+    return {**content, "statistics": doubled(content["statistics"])}
+
+
+STATISTICS: dict[str, tuple[str, Callable[[Path], Any]]] = {
+    "openvla": ("dataset_statistics.json", openvlas),
+    "magma": ("dataset_statistics.json", lambda _: doubled(dict(shipped_statistics()))),
+    "internvla-m1": ("dataset_statistics.json", lambda base: doubled(read(base / "dataset_statistics.json"))),
+    "xiaomi-r0": ("preprocessor_config.json", xiaomis),
+    "spatialvla": ("processor_config.json", spatialvlas),
+}
+
+
+@pytest.mark.filterwarnings("ignore:the model put out tokens")
+@pytest.mark.parametrize("family", list(STATISTICS))
+def test_statistics_in_the_folder_of_an_adapter_replace_its_bases(family: str, tmp_path: Path) -> None:
+    write, options = WRITERS[family]
+    base = write(tmp_path / "base")
+    first = chunk(family, base, options)
+    file, content = STATISTICS[family]
+    alone = without_effect(family, base, tmp_path / "alone", options)
+    np.testing.assert_array_equal(chunk(family, alone, options), first)
+    (alone / file).write_text(json.dumps(content(base)), encoding="utf-8")
+    np.testing.assert_allclose(chunk(family, alone, options), 2 * first, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("family", ["pi05", "molmoact2", "smolvla"])
+@pytest.mark.parametrize("with_steps", [True, False])
+def test_tensors_of_processors_in_the_folder_of_an_adapter_replace_its_bases(
+    family: str, with_steps: bool, tmp_path: Path
 ) -> None:
+    write, options = WRITERS[family]
+    base = write(tmp_path / "base")
+    first = chunk(family, base, options)
+    alone = without_effect(family, base, tmp_path / "alone", options)
+    (file,) = base.glob("policy_postprocessor*.safetensors")
+    save_file({name: 2 * own if own.is_floating_point() else own for name, own in load_file(file).items()},
+              alone / file.name)  # fmt: skip
+    if with_steps:
+        shutil.copy(base / "policy_postprocessor.json", alone)
+    np.testing.assert_allclose(chunk(family, alone, options), 2 * first, rtol=1e-4, atol=1e-6)
+
+
+def chunk(family: str, folder: Path, options: dict[str, Any]) -> Any:
+    """The first three numbers of the actions of one inference."""
+    policy = load_policy(family, str(folder), **options)
+    seen = Observation(
+        image=np.full((64, 64, 3), 90, np.uint8),
+        state=np.zeros(8, np.float32),
+        instruction="red",
+        intrinsics=np.array([[60, 0, 32], [0, 60, 32], [0, 0, 1]], np.float32),
+    )
+    return policy.act([seen], [3])[..., :3]
+
+
+def without_effect(family: str, base: Path, folder: Path, options: dict[str, Any]) -> Path:
+    """An adapter alone whose factors add nothing."""
+    plain = load_model(family, str(base), **options)
+    module = last_linear(network_of(plain))
+    own = factors(module, network_of(plain).state_dict()[f"{module}.weight"])
+    folder.mkdir()
+    return write_adapter(folder, {name: 0 * tensor for name, tensor in own.items()}, str(base))
+
+
+@pytest.mark.parametrize("family", ["pi0", "openvla", "xvla", "magma", "spatialvla"])
+@pytest.mark.parametrize("untrained", [False, True])
+def test_an_adapter_whose_base_is_not_here_is_refused_by_name(
+    family: str, untrained: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("probe_kit.hooks.checkpoints.checkpoint.unreachable", lambda: "offline mode")
     alone = tmp_path / "tuned"
     alone.mkdir()
     write_adapter(alone, factors("q_proj", torch.zeros(4, 4)), "lab/base")
-    with pytest.raises(CheckpointError, match=r"LoRA adapter of lab/base without config\.json.*Copy config\.json"):
+    with pytest.raises(CheckpointError, match=r"was trained on 'lab/base'.*Correct base_model_name_or_path"):
         load_model(family, str(alone), random_weights=untrained)
+
+
+def test_an_adapter_whose_base_has_no_configuration_is_refused_by_name(tmp_path: Path) -> None:
+    for name in ("base", "tuned"):
+        (tmp_path / name).mkdir()
+    write_adapter(tmp_path / "tuned", factors("q_proj", torch.zeros(4, 4)), "../base")
+    with pytest.raises(CheckpointError, match=r"without config\.json, and its base .*base has none either.*copy"):
+        load_model("pi0", str(tmp_path / "tuned"))

@@ -13,7 +13,8 @@ from torch.nn import functional
 
 from probe_kit.errors import InstructionError
 from probe_kit.hooks import ModelCard, Observation, Policy, Roles, Site, Stream, Tap
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 

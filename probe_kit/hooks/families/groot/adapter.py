@@ -20,7 +20,8 @@ from torch import Tensor, nn
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.gradients import frozen
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, side_files
+from probe_kit.hooks.checkpoints.checkpoint import side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles

@@ -11,7 +11,8 @@ from lerobot.policies.groot.utils import stat_dim_from_entry
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES, checkpoint_folder
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.families.groot.processor_fields import check_widths, processor_settings, read_state_fields
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE

@@ -18,6 +18,8 @@ from probe_kit.hooks.families.groot.processor_fields import StateFields
 from probe_kit.hooks.families.shared.lerobot.normaliser import USUAL_DEVIATIONS, outside
 from probe_kit.models.bounds import check_bounds, check_deviations
 
+_TURN = 2 * np.pi
+
 
 @dataclass(frozen=True)
 class BoundedUnits:
@@ -145,10 +147,13 @@ class StateUnits:
         return self.bounded.slopes(values)
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D): outside the bounds, or far from the mean; never of an angle or of what is not read."""
+        """(..., D): outside the bounds, or far from the mean; never of what is not read.
+
+        An angle in radians comes back after a turn; one in degrees lies outside the bounds and beyond a turn.
+        """
         beyond = self.bounded.unusual(values)
         for begin, end in self.angles:
-            beyond[..., begin:end] = False
+            beyond[..., begin:end] &= np.abs(values[..., begin:end]) > _TURN
         return np.zeros_like(beyond) if self.excluded else beyond
 
 

@@ -13,7 +13,8 @@ from typing import Any
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.adapter_files import adapter_in
-from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, checkpoint_folder, hub_files
+from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, hub_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import (
     INDEX_FILE,
     SINGLE_FILE,

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, content_hashes, side_files
-from probe_kit.hooks.checkpoints.file_checks import check_own_config
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, content_hashes, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Policy, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
@@ -377,7 +377,6 @@ def check_magma_words(
     """See `Family.words`."""
     folder = checkpoint_folder(checkpoint, SMALL_FILES)
     own = folder if tokenizer is None else Path(tokenizer).expanduser()
-    check_own_config(folder)
     text = ChatText.of(own, MagmaConfig.from_folder(folder), prompt == "act2answer")
     for instruction in instructions:
         text.prompt(ACTION_QUESTION.format(instruction=instruction))

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from probe_kit.errors import UsageError, WeightsError
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype
-from probe_kit.hooks.checkpoints.file_checks import check_own_config
+from probe_kit.hooks.checkpoints.checkpoint import chosen_dtype
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.magma import UNUSED_WEIGHTS, MagmaConfig, MagmaNetwork, build_magma, shipped_statistics
+from probe_kit.models.sizes_only import building_device
 from probe_kit.models.statistics_choice import STATISTICS_FILE, chosen_name, read_statistics, stored_statistics
 
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -63,7 +64,6 @@ def load_checkpoint(
     Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
     """
     folder = checkpoint_folder(checkpoint)
-    check_own_config(folder)
     config = MagmaConfig.from_folder(folder)
     name = chosen_dtype(dtype, config.dtype, _DTYPES)
     if random_weights:
@@ -93,7 +93,7 @@ def load_checkpoint(
 def _random(
     config: MagmaConfig, dtype: torch.dtype, checkpoint: str, seed: int
 ) -> tuple[MagmaNetwork, WeightsAudit]:
-    network = build_magma(config, dtype, device="cpu")
+    network = build_magma(config, dtype, device=building_device())
     initialise(network, seed)
     with torch.no_grad():
         for name, parameter in network.named_parameters():

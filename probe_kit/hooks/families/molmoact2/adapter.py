@@ -21,7 +21,8 @@ from torch import Tensor, nn
 
 from probe_kit.errors import CaptureError, CheckpointError
 from probe_kit.hooks.capturing.gradients import frozen
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles

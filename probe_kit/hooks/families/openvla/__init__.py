@@ -36,7 +36,6 @@ FAMILIES = (
         packages=(("timm", "openvla"),),
         notes="MIT, Llama 2 licence; extra openvla; about 16 GB in bfloat16",
         verifier="probe_kit.hooks.families.openvla.verify:verify_openvla",
-        bare_adapters=True,
         config_types=("openvla", "prismatic"),
         source="prismatic",
         words="probe_kit.hooks.families.openvla.adapter:check_openvla_words",

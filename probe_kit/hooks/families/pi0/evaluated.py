@@ -11,7 +11,7 @@ from torch import Tensor
 
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, without_revision
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS, laid_out
 from probe_kit.hooks.families.pi0.old_layout import current_config, is_old_layout
 from probe_kit.hooks.families.shared.lerobot.evaluation import Picture
@@ -80,7 +80,7 @@ class EvaluatedPi0(LerobotFlow):
         """As given; or, for a checkpoint without own ones, from its folder or its evaluation. Else None."""
         given = self.evaluation.statistics
         if given is None and self._own(STATE, "STATE") is None and self._own("action", "ACTION") is None:
-            given = statistics_in(self.folder) or EVALUATED_WITH.get(self.checkpoint)
+            given = statistics_in(self.folder) or EVALUATED_WITH.get(str(without_revision(self.checkpoint)))
         return None if given in (None, NO_STATISTICS) else StatisticsFile.read(str(given))
 
     @cached_property

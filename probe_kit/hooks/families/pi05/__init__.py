@@ -33,6 +33,7 @@ FAMILIES = (
         },
         full_size="probe_kit.models.lerobot.pi05:full_size_pi05",
         parameters={"": 4_143_404_816},
+        not_acting=("lerobot/pi05_base",),
         options=EVALUATION_OPTIONS,
         interventions=FLOW,
     ),

@@ -43,6 +43,7 @@ FAMILIES = (
         },
         full_size="probe_kit.models.lerobot.pi0_fast:full_size_pi0_fast",
         parameters={"": 3_449_982_704},
+        not_acting=("lerobot/pi0fast-base",),
         options=(
             Option("captured_tokens", int, "Action tokens whose positions are sites.", str(CAPTURED)),
             Option("lowercase", bool, "Instruction in lower case, as openpi has it.", "false, as lerobot"),

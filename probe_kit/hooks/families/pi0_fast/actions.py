@@ -18,7 +18,7 @@ from tokenizers import Tokenizer
 
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 
 FILES = ("tokenizer.json", "processor_config.json")
 _BROKEN = "\ufffd"

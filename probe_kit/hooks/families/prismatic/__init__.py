@@ -24,7 +24,6 @@ FAMILIES = (
             "also folders in the layout of PrismaticForConditionalGeneration"
         ),
         verifier="probe_kit.hooks.families.prismatic.verify:verify_prismatic",
-        bare_adapters=True,
         config_types=("prismatic", "openvla"),
         files=(*PATTERNS, RUN_WEIGHTS),
         hub=(

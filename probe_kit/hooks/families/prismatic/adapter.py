@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Model, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture

@@ -10,12 +10,14 @@ from torch import Tensor
 
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks.checkpoints.adapter_files import AdapterFiles, adapter_in
-from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, checkpoint_folder, chosen_dtype
+from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, chosen_dtype
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights, with_adapter
 from probe_kit.hooks.families.prismatic.quantised import check_quantisation, quantise
 from probe_kit.hooks.families.prismatic.release import read_release
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.prismatic import PrismaticConfig, PrismaticNetwork, build_prismatic
+from probe_kit.models.sizes_only import building_device
 from probe_kit.models.statistics_choice import stored_statistics
 
 FILES = (*PATTERNS, RUN_WEIGHTS)
@@ -59,7 +61,7 @@ def checkpoint_folders(checkpoint: str, files: Sequence[str] = FILES) -> tuple[P
     """Where the files of a checkpoint may lie: an adapter's own folder before that of its base."""
     folder = checkpoint_folder(checkpoint, files)
     adapter = adapter_in(folder)
-    return (folder,) if adapter is None else tuple(dict.fromkeys((folder, adapter.base_folder())))
+    return (folder,) if adapter is None else tuple(dict.fromkeys((folder, adapter.base_folder(files))))
 
 
 def load_checkpoint(
@@ -123,7 +125,7 @@ def _check_other_heads(folders: tuple[Path, ...]) -> None:
 def _random(
     config: PrismaticConfig, dtype: torch.dtype, checkpoint: str, seed: int
 ) -> tuple[PrismaticNetwork, WeightsAudit]:
-    network = build_prismatic(config, dtype, device="cpu")
+    network = build_prismatic(config, dtype, device=building_device())
     initialise(network, seed)
     weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
     return network, load_weights(network, weights, weights.tensors)

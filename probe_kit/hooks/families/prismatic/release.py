@@ -14,7 +14,7 @@ from torch import Tensor
 
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import WeightsError
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import SINGLE_FILE, Weights, check_kinds, unpickled
 from probe_kit.models.prismatic import PrismaticConfig, TowerConfig
 

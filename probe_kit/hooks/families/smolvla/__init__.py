@@ -26,6 +26,7 @@ FAMILIES = (
         full_size="probe_kit.models.lerobot.smolvla:full_size_smolvla",
         always_float32=True,
         parameters={"": 450_046_176},
+        not_acting=("lerobot/smolvla_base",),
         interventions=FLOW,
     ),
 )

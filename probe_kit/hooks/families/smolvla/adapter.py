@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, is_on_hub, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, is_on_hub, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.attention_weights import Note, shares
 from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow
@@ -49,6 +50,8 @@ class SmolVLA(LerobotFlow):
                 "SmolVLA runs in float32 here, because lerobot's mixed precision depends on how its VLM was "
                 "loaded. Leave --dtype out"
             )
+        config.vlm_named = locate_vlm(config, folder)
+        config.vlm_model_name = str(_folder_of(config.vlm_named))
         network: nn.Module = build_smolvla(config, folder)
         return network
 
@@ -78,10 +81,13 @@ class SmolVLA(LerobotFlow):
 
         if (saved := tokenizer_folder(self.folder)) is not None:
             return load_pretrained(AutoTokenizer, saved)
-        named, vlm = tokenizer_name(self.folder), locate_vlm(self.config, self.folder)
+        named = tokenizer_name(self.folder)
+        vlm = getattr(self.config, "vlm_named", None) or locate_vlm(self.config, self.folder)
         if named is not None and named != vlm and is_on_hub(named) and is_on_hub(vlm):
             return load_pretrained(AutoTokenizer, checkpoint_folder(named, SMALL_FILES))
-        return self._joint.processor.tokenizer if hasattr(self, "network") else load_pretrained(AutoTokenizer, vlm)
+        if hasattr(self, "network"):
+            return self._joint.processor.tokenizer
+        return load_pretrained(AutoTokenizer, _folder_of(vlm))
 
     def side_files(self) -> dict[str, Path]:
         """Also the VLM's configuration and tokenizer, where they lie in a folder here."""
@@ -157,6 +163,11 @@ class SmolVLA(LerobotFlow):
 def check_smolvla_words(checkpoint: str, instructions: Sequence[str]) -> None:
     """See `Family.words`."""
     SmolVLA.check_words(checkpoint, instructions)
+
+
+def _folder_of(vlm: str) -> Path:
+    """Where the small files of the vision-language model are, a folder or a hub id."""
+    return checkpoint_folder(vlm, SMALL_FILES) if is_on_hub(vlm) else Path(vlm)
 
 
 def load_smolvla(

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
 from probe_kit.hashing import sha256_json
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, content_hashes, side_files
-from probe_kit.hooks.checkpoints.file_checks import check_own_config
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, content_hashes, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
@@ -350,7 +350,6 @@ def check_spatialvla_words(
 ) -> None:
     """See `Family.words`."""
     folder = checkpoint_folder(checkpoint, SMALL_FILES)
-    check_own_config(folder)
     speech = Speech.of(SpatialVLAConfig.from_folder(folder), folder, prompt, lowercase, tokenizer)
     for instruction in instructions:
         speech.prompt(instruction)

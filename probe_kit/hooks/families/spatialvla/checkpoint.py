@@ -9,10 +9,11 @@ import torch
 
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, chosen_dtype
-from probe_kit.hooks.checkpoints.file_checks import check_own_config
+from probe_kit.hooks.checkpoints.checkpoint import chosen_dtype
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
+from probe_kit.models.sizes_only import building_device
 from probe_kit.models.spatialvla import SpatialVLAConfig, SpatialVLANetwork, build_spatialvla
 
 PROCESSOR_FILE = "processor_config.json"
@@ -64,7 +65,6 @@ def load_checkpoint(
     for another dtype.
     """
     folder = checkpoint_folder(checkpoint)
-    check_own_config(folder)
     config = SpatialVLAConfig.from_folder(folder)
     name = chosen_dtype(dtype, config.dtype, _DTYPES)
     processor = read_processor(folder)
@@ -99,7 +99,7 @@ def read_processor(folder: Path) -> dict[str, Any]:
 def _random(
     config: SpatialVLAConfig, dtype: torch.dtype, checkpoint: str, seed: int
 ) -> tuple[SpatialVLANetwork, WeightsAudit]:
-    network = build_spatialvla(config, dtype, device="cpu")
+    network = build_spatialvla(config, dtype, device=building_device())
     initialise(network, seed)
     weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
     return network, load_weights(network, weights, weights.tensors)

@@ -19,14 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import (
-    SMALL_FILES,
-    checkpoint_folder,
-    chosen_dtype,
-    content_hashes,
-    side_files,
-)
-from probe_kit.hooks.checkpoints.file_checks import check_own_config
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, chosen_dtype, content_hashes, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import read_weights
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Tap
@@ -174,6 +168,11 @@ class Xiaomi(QwenVLA):
         """The middle of the picture, at the size the robot's pictures have."""
         return look(seen.image, self.robot)
 
+    @property
+    def unguarded_state(self) -> str | None:
+        """The release has statistics of actions alone."""
+        return f"the state is read as it is, and {STATISTICS_FILE} has statistics of actions alone"
+
     # -- acting ------------------------------------------------------------------------------------------
 
     def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
@@ -265,7 +264,6 @@ def xiaomi_units(checkpoint: str, *, robot: str | None = None, **_: Any) -> str:
     """See `Family.units`; a checkpoint without statistics says so, since it can be captured."""
     folder = checkpoint_folder(checkpoint, SMALL_FILES)
     try:
-        check_own_config(folder)
         units = read_units(folder, robot, XiaomiConfig.from_folder(folder).action_dim)
     except CheckpointError as error:
         return f"none: {error}"
@@ -294,7 +292,6 @@ def load_xiaomi(
         raise UsageError(f"{steps} Euler steps make no action; expected 1 or more")
     name = checkpoint or DEFAULT_CHECKPOINT
     folder = checkpoint_folder(name)
-    check_own_config(folder)
     config = XiaomiConfig.from_folder(folder)
 
     def build(kind: torch.dtype, place: str) -> XiaomiNetwork:

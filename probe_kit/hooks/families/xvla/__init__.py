@@ -43,6 +43,7 @@ FAMILIES = (
         words="probe_kit.hooks.families.xvla.adapter:check_xvla_words",
         full_size="probe_kit.models.lerobot.xvla:full_size_xvla",
         parameters={"": 879_851_096},
+        not_acting=("lerobot/xvla-base", "2toINF/X-VLA-WidowX"),
         declared={
             "": (
                 DeclaredStream(

@@ -22,7 +22,8 @@ from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
 from probe_kit.hooks.capturing.gradients import frozen
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, checkpoint_folder, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
@@ -206,6 +207,11 @@ class Xvla(LerobotPolicy):
             del batch[STATE]
         batch["domain_id"] = torch.full((len(seen),), self.steps.domain, device=self.config.device)
         return batch
+
+    @property
+    def unguarded_state(self) -> str | None:
+        """Also where its network reads none."""
+        return super().unguarded_state if self.config.use_proprio else "no state is read (use_proprio: false)"
 
     def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
         """The end of the denoising from the noise of the seeds."""

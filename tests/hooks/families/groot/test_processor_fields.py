@@ -84,7 +84,8 @@ def test_angles_are_read_as_sines_then_cosines_in_the_place_of_their_group(chang
     own = expected(_MINMAX[:3], np.sin(angles), np.cos(angles), _MINMAX[6:])
     np.testing.assert_allclose(state_read(policy), own, atol=1e-6)
     assert any("SIN_COS" in note for note in policy.card.notes)
-    assert not policy.state_units.unusual(np.full((1, 8), 99, np.float32))[0, 3:6].any()
+    assert not policy.state_units.unusual(np.full((1, 8), -6, np.float32))[0, 3:6].any()  # less than a turn
+    assert policy.state_units.unusual(np.full((1, 8), 99, np.float32))[0, 3:6].all()  # degrees
     assert policy.act(seen(policy), [0]).shape[-1] == 7
 
 

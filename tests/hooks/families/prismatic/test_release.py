@@ -12,7 +12,8 @@ from timm.layers import resample_abs_pos_embed
 
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks import Prompt
-from probe_kit.hooks.checkpoints.checkpoint import checkpoint_folder, hub_name
+from probe_kit.hooks.checkpoints.checkpoint import hub_name
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
 from probe_kit.hooks.registry import find_family
@@ -78,6 +79,7 @@ def test_no_other_model_of_the_repository_is_asked_for(cache: Path, monkeypatch:
         return str(folder.parent)
 
     monkeypatch.setattr("huggingface_hub.snapshot_download", download)
+    monkeypatch.setattr("probe_kit.hooks.checkpoints.checkpoint.unreachable", lambda: "")
     find_family("prismatic").check(None)
     ((repository, patterns),) = asked
     assert repository == "TRI-ML/prismatic-vlms"

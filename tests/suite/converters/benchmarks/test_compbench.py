@@ -3,7 +3,9 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters import convert
 
@@ -100,3 +102,16 @@ def test_a_tree_without_annotations_is_refused_with_what_was_looked_for(tmp_path
         SuiteError, match=r"no annotation file found .*fer2013_label/fer2013_0_720_rebalanced\.json"
     ):
         convert("mllm-compbench", tmp_path, tmp_path / "suite")
+
+
+def test_the_command_counts_by_name_what_it_leaves_out(compbench_root: Path, tmp_path: Path) -> None:
+    path = compbench_root / "Labeled_data/fer2013_label/fer2013_0_720_rebalanced.json"
+    records = json.loads(path.read_text(encoding="utf-8"))
+    records[0]["answer"], records[1]["answer"] = "Same", "left"
+    path.write_text(json.dumps(records), encoding="utf-8")
+    place = str(tmp_path / "suite")
+    options = ["--root", str(compbench_root), "--out", place, "--categories", "emotion"]
+    said = " ".join(CliRunner().invoke(app, ["suite", "convert", "mllm-compbench", *options]).stderr.split())
+    assert (
+        "records left out: answer is 'Same', not Left or Right 1×; answer is 'left', not Left or Right 1×" in said
+    )

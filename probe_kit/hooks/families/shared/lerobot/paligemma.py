@@ -11,13 +11,14 @@ from transformers import AutoTokenizer
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import side_files
-from probe_kit.hooks.checkpoints.hub import unreachable
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.pipelines import tokenizer_folder, tokenizer_name
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
 from probe_kit.models.pretrained import load_pretrained
 
 _TOKENIZER = "google/paligemma-3b-pt-224"
+_TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json", "config.json")
 LEAST_BYTES = 1_000_000_000
 """Of weights in the released sizes, which have 3 billion parameters or more."""
 
@@ -53,8 +54,8 @@ class PaliGemmaPolicy(LerobotPolicy):
             return load_pretrained(AutoTokenizer, place)
         named = tokenizer_name(self.folder) or _TOKENIZER
         try:
-            return load_pretrained(AutoTokenizer, named, local_files_only=bool(unreachable()))
-        except (OSError, ValueError) as error:
+            return load_pretrained(AutoTokenizer, checkpoint_folder(named, _TOKENIZER_FILES))
+        except (CheckpointError, OSError, ValueError) as error:
             gated = "gated " if named == _TOKENIZER else ""
             raise CheckpointError(
                 f"{self.folder} has no tokenizer.json and the {gated}{named} cannot be fetched. Run "

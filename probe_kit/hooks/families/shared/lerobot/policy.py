@@ -21,8 +21,8 @@ from torch import Tensor, nn
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, checkpoint_folder, content_hashes, side_files
-from probe_kit.hooks.checkpoints.file_checks import check_own_config
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, content_hashes, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import Policy
@@ -58,6 +58,8 @@ IMAGES, STATE = "observation.images.", "observation.state"
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 MOST_TOKENS = 1 << 16
 """Of a prompt: far beyond any policy, and no memory without end."""
+UNCOMPARED = ("IDENTITY", "EXCLUDED")
+"""Modes of units without statistics: the state is read as it is, or not at all."""
 _DIMENSIONS = 7
 """Of the arm's actions."""
 
@@ -218,7 +220,6 @@ class LerobotPolicy(Policy):
 
     @classmethod
     def _read_config(cls, folder: Path, evaluation: Evaluation) -> Any:
-        check_own_config(folder)
         if not (folder / "config.json").is_file():
             raise CheckpointError(f"{folder / 'config.json'} is missing; {folder} is not a lerobot checkpoint")
         config: Any = cls.parse_config(folder, evaluation)
@@ -359,6 +360,17 @@ class LerobotPolicy(Policy):
         """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
         return self.state_units.unusual(states)
 
+    @property
+    def unguarded_state(self) -> str | None:
+        """Also for a checkpoint that reads the state as it is, or without its units."""
+        try:
+            units = self.state_units
+        except CheckpointError as error:
+            return str(error)
+        if units.mode.startswith(UNCOMPARED):
+            return f"the state is {units.mode} by {units.source}"
+        return None
+
     def unusual_actions(self, actions: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
         return self.action_units.unusual(actions)
@@ -380,13 +392,17 @@ class LerobotPolicy(Policy):
         """The state, where it has other numbers than the arm's, or no units."""
         return ("state",) if self._state_misfit() else ()
 
-    def _action_misfit(self) -> str | None:
+    def configured_mismatch(self) -> str | None:
+        """Other actions than an end-effector delta."""
         dimensions = self.config.output_features["action"].shape[0]
         if dimensions != _DIMENSIONS:
             return f"{self.checkpoint} acts in {dimensions} dimensions; the arm needs a 7-DoF end-effector delta"
         if self._lacks_state:
             return f"{self.checkpoint} predicts changes relative to the state, and nothing here adds the state"
-        return _problem(lambda: self.action_units)
+        return None
+
+    def _action_misfit(self) -> str | None:
+        return self.configured_mismatch() or _problem(lambda: self.action_units)
 
     def _state_misfit(self) -> str | None:
         example = self.laid_out(np.zeros((1, ARM_NUMBERS), np.float32)).shape[1]
@@ -572,6 +588,10 @@ class LerobotPolicy(Policy):
         special = frozenset(self.tokenizer.all_special_ids)
         labels = ["special" if one in special else "language" for one in ids]
         return [label if kept else PADDING for label, kept in zip(labels, valid, strict=True)]
+
+    def read_late_files(self) -> None:
+        """The tokenizer."""
+        self.tokenizer  # noqa: B018 - read once, and kept
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each instruction, without padding."""

@@ -12,7 +12,8 @@ from torch import nn
 
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, checkpoint_folder
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import read_weights
 from probe_kit.hooks.families.shared.network_loading import fill, twin
 from probe_kit.hooks.families.shared.vlm.adapter import Loaded

@@ -1,0 +1,152 @@
+"""A model without numbers, of the configuration that is here: for plans, which read no weights. No torch."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from probe_kit.errors import ProbeKitError
+from probe_kit.hooks.checkpoints.adapter_files import ADAPTER_WEIGHTS
+from probe_kit.hooks.checkpoints.checkpoint import (
+    ADAPTER_FILE,
+    CONFIG_FILE,
+    NotCachedError,
+    cached_folder,
+    is_on_hub,
+    missing_weights,
+    weights_sizes,
+)
+from probe_kit.hooks.checkpoints.hub import without_network
+
+if TYPE_CHECKING:
+    from probe_kit.hooks.contract.model import Model
+
+_CONFIGURATIONS = (CONFIG_FILE, ADAPTER_FILE, "config.yaml")
+_OUTLINES: dict[tuple[object, ...], "Outline"] = {}
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A model on the meta device, with streams, roles and units but without numbers.
+
+    model: None where it could not be built. reason: why not. complete: whether its weights are here too, so that
+    no file of statistics can be missing.
+    """
+
+    model: "Model | None"
+    reason: str = ""
+    complete: bool = True
+
+    @property
+    def checkpoint(self) -> str:
+        """Folder or hub id, as the model's card has it."""
+        return "" if self.model is None else self.model.card.checkpoint
+
+    def misfit(self) -> str | None:
+        """Why a policy cannot move an arm here, as far as the files that are here say; None if it can."""
+        from probe_kit.hooks.contract.model import Policy
+
+        if not isinstance(self.model, Policy):
+            return None
+        return self.model.embodiment_mismatch() if self.complete else self.model.configured_mismatch()
+
+
+def outline_of(
+    name: str, load: Any, place: str | None, dtype: str | None, options: Mapping[str, Any]
+) -> Outline | None:
+    """The outline of the checkpoint `place`; None where its configuration is not here.
+
+    name: of the family. load: its loader. options: as the loader gets them. No network is asked and no weights are
+    read. Raises what loading raises for a checkpoint in a folder.
+    """
+    folder = _folder(place)
+    if place is None or folder is None:
+        return None
+    complete = is_complete(place)
+    key = (name, place, dtype, repr(sorted(options.items())), complete, _state(folder))
+    if key in _OUTLINES:
+        return _OUTLINES[key]
+    outline = _built(load, place, dtype, options, complete)
+    if outline.model is not None:  # what another repository lacks may arrive
+        _OUTLINES[key] = outline
+    return outline
+
+
+def _built(load: Any, place: str, dtype: str | None, options: Mapping[str, Any], complete: bool) -> Outline:
+    from probe_kit.models.sizes_only import sizes_only
+
+    try:
+        with without_network(), sizes_only():
+            return Outline(load(place, "meta", dtype, True, **options), complete=complete)
+    except ProbeKitError as error:
+        if not is_on_hub(place) and not _lacks_repository(error):
+            raise
+        return Outline(None, str(error), complete)
+    except Exception as error:  # noqa: BLE001 - a network may need numbers while it is built
+        return Outline(None, f"{type(error).__name__}: {str(error).partition(chr(10))[0]}", complete)
+
+
+def _lacks_repository(error: BaseException | None) -> bool:
+    """Whether another repository of the hub that the checkpoint names is not in the cache."""
+    while error is not None:
+        if isinstance(error, NotCachedError):
+            return True
+        error = error.__cause__
+    return False
+
+
+def is_configured(place: str | None) -> bool:
+    """Whether the configuration of a checkpoint is in a folder or in the hub's cache. Asks no network."""
+    return _folder(place) is not None
+
+
+def _folder(place: str | None) -> Path | None:
+    """Where the configuration of a checkpoint is; None where it is not here."""
+    if place is None:
+        return None
+    if not is_on_hub(place):
+        local = Path(place).expanduser()
+        return local if local.exists() else None
+    folder = cached_folder(place)
+    configured = folder is not None and any((folder / name).is_file() for name in _CONFIGURATIONS)
+    return folder if configured else None
+
+
+def _state(folder: Path) -> tuple[object, ...]:
+    """A value that changes with the small files of a folder."""
+    files = folder.glob("*.json") if folder.is_dir() else [folder]
+    return tuple(sorted((path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in files))
+
+
+def is_complete(place: str) -> bool:
+    """Whether a checkpoint with its weights, and those of an adapter's base, is here. Asks no network."""
+    folder = cached_folder(place) if is_on_hub(place) else Path(place).expanduser()
+    if folder is None:
+        return False
+    base = _base(folder)
+    if base is not None:
+        own = any((folder / name).is_file() for name in ADAPTER_WEIGHTS)
+        return own and (base == "." or is_complete(str(folder / base) if (folder / base).is_dir() else base))
+    return not is_on_hub(place) or not missing_weights(folder)
+
+
+def bytes_to_fetch(place: str) -> int | None:
+    """Bytes of the weights that the cache lacks, from the index of their files; None where it is not here."""
+    folder = cached_folder(place) if is_on_hub(place) else Path(place).expanduser()
+    if folder is None:
+        return None
+    base = _base(folder)
+    if base is not None and base != ".":
+        beside = folder / base
+        return 0 if is_complete(place) else bytes_to_fetch(str(beside) if beside.is_dir() else base)
+    return weights_sizes(folder)
+
+
+def _base(folder: Path) -> str | None:
+    """The base that an adapter in `folder` names; None where there is no adapter."""
+    from probe_kit._system.bounded_json import load_json
+
+    try:
+        return str(load_json(folder / ADAPTER_FILE)["base_model_name_or_path"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
