@@ -90,8 +90,9 @@ def _near_duplicates(looks: Sequence[Look]) -> Iterator[tuple[int, int]]:
 
 def enough_items(suite: Suite) -> Iterator[Finding]:
     """W04: at least 30 items per category, and as many as were asked for."""
-    requested = suite.card.get("options", {}).get("items_per_category")
+    option = suite.card.get("options", {}).get("items_per_category")
     for category, count in count_by_category(suite.items).items():
+        requested = option.get(category) if isinstance(option, dict) else option
         if requested is not None and count != requested:
             yield warning("W04", category_of(category).title, f"{count} of {requested} requested")
         elif count < FEWEST_ITEMS:
