@@ -1,7 +1,7 @@
 """Make the tables and figures of README and docs that come from the demo: `python scripts/make_docs.py FOLDER`.
 
-FOLDER/demo: what `probe-kit demo` makes; FOLDER/compare: what `probe-kit demo --compare` makes. What is not there is
-made first: 2 minutes and 20 to 40 minutes on two cores. The numbers go to `docs/demo.json`, and from there, by
+FOLDER/demo: what `probe-kit demo` makes; FOLDER/compare: what `probe-kit demo --compare` makes. What is missing
+is made first: 2 minutes and 20 to 40 minutes on two cores. The numbers go to `docs/demo.json`, and from there, by
 `docs_tables`, into the pages; a test compares them. `--demo-only` keeps the stored numbers of `--compare`.
 """
 
@@ -54,9 +54,7 @@ def main() -> None:
 
 def _of_trained(made: Demo) -> list[Finding]:
     rows = [row for row in made.table.rows if row.category != MEAN and row.run.mode == "acts"]
-    return [
-        Finding(TRAINED.name, row.category, TRAINED.expected(row.category), verdict(row), row) for row in rows
-    ]
+    return [Finding(TRAINED.name, row.category, TRAINED.expected(row.category), verdict(row), row) for row in rows]
 
 
 def _compared(folder: Path, stage: NamedProgress) -> dict[str, Any]:

@@ -25,9 +25,7 @@ def demo(
     ] = False,
     full: Annotated[
         bool,
-        typer.Option(
-            "--full", help="Ask 24 items of 4 categories, and permute 200 times, as --compare does for each policy."
-        ),
+        typer.Option("--full", help="Ask 24 items of 4 categories, and permute 200 times, as --compare does."),
     ] = False,
 ) -> None:
     """Run the whole pipeline on the embedded models: answers, episodes, activations, probes, retention.

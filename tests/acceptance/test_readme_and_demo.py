@@ -51,7 +51,7 @@ def test_the_readme_shows_the_numbers_of_the_demo(category: str) -> None:
 
 
 def test_the_demo_says_what_its_policy_was_trained_for() -> None:
-    """The policy acts on Color and Shape. State is decodable and does not reach the action. Counting is not shown."""
+    """The policy acts on Color and Shape. State is decodable and is not used. Counting is not shown."""
     compared = {row["category"]: row for row in DEMO["compare"]["organisms"] if row["organism"] == "trained"}
     assert {name for name, row in TRAINED.items() if row["verdict"] == "shown"} == {"color", "state"}
     assert {name for name, row in compared.items() if row["verdict"] == "shown"} == {"color", "shape", "state"}

@@ -56,9 +56,7 @@ def test_each_category_may_have_its_number_of_items(small_suite: Suite, tmp_path
     """Its items are those of a suite with the same number everywhere."""
     calls: list[tuple[int, int]] = []
     counts = {"color": 2, "shape": 12}
-    suite = build_suite(
-        tmp_path / "suite", ["color", "shape"], counts, progress=lambda *call: calls.append(call)
-    )
+    suite = build_suite(tmp_path / "suite", ["color", "shape"], counts, progress=lambda *call: calls.append(call))
     assert suite.card["counts"] == counts == suite.card["options"]["items_per_category"]
     assert calls[-1] == (14, 14)
     assert suite.select(["shape"]).content_sha256 == small_suite.select(["shape"]).content_sha256
