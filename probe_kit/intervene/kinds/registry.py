@@ -90,7 +90,7 @@ _ENTRIES = (
         options={
             "sites": "where tokens are moved; required",
             "roles": "the one whose tokens are moved; required",
-            "direction": "mean-difference (default) or probe",
+            "direction": "mean-difference (default), probe or mean-difference:K",
             "controls": "random directions; default 5",
             "coefficients": "in half class-mean differences; default 1,2,4",
             "target_side": "wrong (default), correct, left or right",
