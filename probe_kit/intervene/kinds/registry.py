@@ -86,7 +86,7 @@ _ENTRIES = (
         effects="probe_kit.intervene.kinds.site_effects:measured_patches",
         table="probe_kit.intervene.kinds.site_table:site_table",
         sentences="probe_kit.intervene.kinds.site_table:site_sentences",
-        notes="probe_kit.intervene.kinds.site_effects:large_change_notes",
+        notes="probe_kit.intervene.kinds.site_effects:steering_notes",
         options={
             "sites": "where tokens are moved; required",
             "roles": "the one whose tokens are moved; required",

@@ -121,16 +121,14 @@ def fit_token_directions(
                 found |= {
                     (name, episode): eraser.removed[0].astype(np.float32) for episode, eraser in of_episode.items()
                 }
-            halves.setdefault((place, role), {}).update(_half_differences(own, fits, direction))
+            halves.setdefault((place, role), {}).update(half_differences_of(own, fits, direction))
     left = {cell: found for cell, found in bases.items() if not passed_over.holds(*cell)}
     passed_over.check_some_left(list(left))
-    return {
-        cell: TokenDirections(found, halves[cell], control_names(controls)) for cell, found in left.items()
-    }
+    return {cell: TokenDirections(found, halves[cell], control_names(controls)) for cell, found in left.items()}
 
 
-def _half_differences(own: TokenFeatures, fits: Fits, direction: str) -> dict[str, NDArray[np.float64]]:
-    """By episode (T, K), of the folds that it is not in."""
+def half_differences_of(own: TokenFeatures, fits: Fits, direction: str) -> dict[str, NDArray[np.float64]]:
+    """Return by episode (T, K) half the differences of the class means, of the folds that it is not in."""
     found: dict[str, NDArray[np.float64]] = {}
     for fold, fitted in fits:
         halves = half_differences(own.tokens.only(fold.train), own.left[fold.train], fitted[direction])
