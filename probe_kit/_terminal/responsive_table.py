@@ -184,7 +184,7 @@ class ResponsiveTable:
 
 
 def _fill(table: "Table", rows: Iterable[tuple[str, str, Sequence[Cell]]]) -> None:
-    """Add rows of a name, a style and cells. A name stands beside the first line of its cells."""
+    """Add rows of a name, a style and cells. A name has the height of the first line of its cells."""
     from rich.text import Text
 
     for name, style, cells in rows:
