@@ -74,7 +74,7 @@ def test_the_demo_runs_and_gives_the_documented_numbers(tmp_path: Path) -> None:
         assert list((tmp_path / "probe-kit-demo").rglob(picture)), f"the demo writes no {picture}"
     for category, row in TRAINED.items():
         (cells,) = [text for text in printed.splitlines() if text.casefold().startswith(category)][:1]
-        assert round(100 * row["sr"], 1) in numbers(cells), cells
+        assert round(100 * row["sr"]) in numbers(cells), cells
     runs = [path.parent for path in (tmp_path / "probe-kit-demo").rglob("run.json")]
     acted = [run for run in map(pk.open_run, runs) if run.model.startswith("pi0")]
     assert len(acted) == 1
