@@ -31,25 +31,28 @@ def blocks(page: str) -> list[str]:
 
 def trained_table(data: Mapping[str, Any]) -> str:
     """What the demo prints of the trained policy, a row per category."""
-    rows = _of(data, TRAINED)
-    heading = ("demo", f"SR % (Δ {_span(rows, 'chance_margin')})", *PROBED)
-    return _table(heading, [_cells(row) for row in rows])
+    rows = _of(data["demo"], TRAINED)
+    heading = ("demo", "items", f"SR % (Δ {_span(rows, 'chance_margin')})", *PROBED)
+    lines = [(category, str(row["items"]), *cells) for row in rows for category, *cells in [_cells(row)]]
+    return _table(heading, lines)
 
 
 def organisms_table(data: Mapping[str, Any]) -> str:
     """The verdicts on all organisms; those of untrained ones in a line each, since nothing is to be seen."""
     heading = ("policy", "category", "expected", "measured", "agreement", "SR %", *PROBED)
     lines: list[tuple[str, ...]] = []
-    for name in dict.fromkeys(row["organism"] for row in data["organisms"]):
-        rows = _of(data, name)
+    compared = data["compare"]
+    for name in dict.fromkeys(row["organism"] for row in compared["organisms"]):
+        rows = _of(compared, name)
         if len({(row["expected"], row["measured"], row["retention"]) for row in rows}) == 1 < len(rows):
             lines.append(_joined(rows))
         else:
             lines += [_with_verdict(row) for row in rows]
-    agreements = count_agreements([row["agreement"] for row in data["organisms"]])
-    margin = _span(data["organisms"], "chance_margin")
+    agreements = count_agreements([row["agreement"] for row in compared["organisms"]])
+    margin = _span(compared["organisms"], "chance_margin")
+    episodes = 2 * compared["organisms"][0]["items"]
     note = (
-        f"{data['episodes']} episodes per category, Δ of {margin} points, {data['permutations']} "
+        f"{episodes} episodes per category, Δ of {margin} points, {compared['permutations']} "
         f"permutations: {agreements}."
     )
     return f"{_table(heading, lines)}\n\n{note}"
@@ -58,8 +61,8 @@ def organisms_table(data: Mapping[str, Any]) -> str:
 _TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {"trained": trained_table, "organisms": organisms_table}
 
 
-def _of(data: Mapping[str, Any], organism: str) -> list[Row]:
-    rows = [row for row in data["organisms"] if row["organism"] == organism]
+def _of(measured: Mapping[str, Any], organism: str) -> list[Row]:
+    rows = [row for row in measured["organisms"] if row["organism"] == organism]
     order = {"color": 0, "shape": 1, "state": 2}
     return sorted(rows, key=lambda row: order.get(row["category"], len(order)))
 

@@ -269,7 +269,11 @@ def test_suite_build_list_and_show_go_together(tmp_path: Path) -> None:
 def test_the_demo_makes_everything_it_promises(tmp_path: Path) -> None:
     answer = probe_kit("demo", "--out", tmp_path / "demo")
     assert answer.returncode == 0, answer.stderr
-    assert "knowledge" in answer.stdout
+    rows = [re.split(r"\s{2,}", line.strip()) for line in answer.stdout.splitlines()]
+    verdicts = {cells[0]: cells[-1] for cells in rows if len(cells) == 7}
+    assert {name: verdicts[name] for name in ("Color", "State")} == {"Color": "used", "State": "not used"}
+    (counting,) = (cells for cells in rows if cells[0] == "Counting")
+    assert not any("✓" in cell for cell in counting), "Counting is not shown"
     assert re.fullmatch(r"Open +probe-kit view \S+run \S+run-vlm", answer.stdout.splitlines()[-1].strip())
     for name in ("run/run.json", "layer_curves.png", "table.md", "episode.gif", "report.html"):
         assert (tmp_path / "demo" / name).is_file()

@@ -31,8 +31,11 @@ def install_folder_command(folder: Path) -> str:
 
 
 def install_here_command() -> str:
-    """The same for the folder in which the shell is, in an activated environment and on any machine."""
-    return "pip install -e ." if _has_pip() else "uv pip install -e ."
+    """The same for the folder in which the shell is, in an activated environment.
+
+    It holds on any machine, unless uv is the one that `with-uv` fetched into its folder.
+    """
+    return "pip install -e ." if _has_pip() else f"{_uv()} pip install -e ."
 
 
 def _is_of_checkout() -> bool:

@@ -184,11 +184,14 @@ class ResponsiveTable:
 
 
 def _fill(table: "Table", rows: Iterable[tuple[str, str, Sequence[Cell]]]) -> None:
-    """Add rows of a name, a style and cells."""
+    """Add rows of a name, a style and cells. A name has the height of the first line of its cells."""
     from rich.text import Text
 
     for name, style, cells in rows:
-        table.add_row(Text(name), *(Text(cell.text, style=cell.style) for cell in cells), style=style)
+        below = max((cell.text.count("\n") for cell in cells), default=0)
+        table.add_row(
+            Text(name + "\n" * below), *(Text(cell.text, style=cell.style) for cell in cells), style=style
+        )
 
 
 def _split(part: Part, room: int) -> Iterator[Part]:

@@ -2,6 +2,7 @@
 
 import shlex
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,9 +18,22 @@ from probe_kit.retention.displays import layer_curve
 from probe_kit.retention.report import write_report
 from probe_kit.suite import Suite, build_suite
 
-CATEGORIES = ("color", "shape", "state", "counting")
-ITEMS = 24
-PERMUTATIONS = 200
+
+@dataclass(frozen=True)
+class Size:
+    """How much is measured. items: per category; permutations: of the labels, for the probes."""
+
+    items: Mapping[str, int]
+    permutations: int
+
+
+QUICK = Size({"color": 12, "state": 24, "counting": 12}, permutations=100)
+"""A category that is used, one that is known and not used, and one that was never trained.
+
+*Not used* is shown with 11 independent groups of items or more, so that State has twice as many items.
+"""
+FULL = Size(dict.fromkeys(("color", "shape", "state", "counting"), 24), permutations=200)
+"""What organisms are compared on."""
 
 
 @dataclass(frozen=True)
@@ -55,22 +69,22 @@ class Demo:
 
 
 def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:
-    """The demo's questions put to policies of which the truth is known; see `probe_kit.demo.organisms`."""
-    return compare(_questions(folder, stage), folder, PERMUTATIONS, stage)
+    """Put the questions of `FULL` to policies of which the truth is known; see `probe_kit.demo.organisms`."""
+    return compare(_questions(folder, FULL, stage), folder, FULL.permutations, stage)
 
 
-def _questions(folder: Path, stage: NamedProgress) -> Suite:
-    return build_suite(folder / "suite", CATEGORIES, ITEMS, progress=stage("drawing questions"))
+def _questions(folder: Path, size: Size, stage: NamedProgress) -> Suite:
+    return build_suite(folder / "suite", tuple(size.items), size.items, progress=stage("drawing questions"))
 
 
-def run_demo(folder: Path, stage: NamedProgress) -> Demo:
+def run_demo(folder: Path, stage: NamedProgress, size: Size = QUICK) -> Demo:
     """Suite, answers, episodes, probes, table, figure, film and report in `folder`; called again, it continues.
 
     stage: gives a progress callback (done, total, …) for a stage of this name.
     """
-    suite = _questions(folder, stage)
+    suite = _questions(folder, size, stage)
     asked = answered(VLM, suite, folder, stage)
-    run, results = probed(TRAINED, suite, folder, PERMUTATIONS, stage)
+    run, results = probed(TRAINED, suite, folder, size.permutations, stage)
     table = retention_table([asked, run])
     layer_curve(results).savefig(folder / "layer_curves.png")
     write_whole(folder / "table.md", table.to_markdown())

@@ -125,6 +125,8 @@ def run(
         say(marked("[red]{}[/]", failure))
     if failed or plan.totals()["missing"]:
         raise typer.Exit(UNFINISHED)
+    if study.study.tables:
+        say(marked("next: [bold]probe-kit study table {}[/]", file))
 
 
 def _print(plan: "StudyPlan", as_json: bool) -> None:

@@ -29,28 +29,30 @@ ITEMS = 150
 def build_suite(
     folder: Path | str,
     categories: Sequence[str] | None = None,
-    items_per_category: int = ITEMS,
+    items_per_category: int | Mapping[str, int] = ITEMS,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Suite:
     """The embedded suite, drawn and written to `folder`.
 
     categories: slugs, all embedded ones by default. Which others are built changes no item of a category, and
-    fewer items per category are the beginning of more. progress: called with items done and items in all.
-    Raises UnknownCategoryError, UsageError for a number of items that is not a positive even one, and SuiteError
-    if `folder` holds anything but this very suite.
+    fewer items per category are the beginning of more. items_per_category: one number, or a number for each of
+    `categories`. progress: called with items done and items in all.
+    Raises UnknownCategoryError, UsageError for a number of items that is not a positive even one or that a
+    category lacks, and SuiteError if `folder` holds anything but this very suite.
     """
     folder = Path(folder)
     options = _options(categories, items_per_category, seed)
+    counts = _counts(options["categories"], options["items_per_category"])
     check_foreign_folder(folder)
     items: list[Item] = []
     pictures: dict[str, bytes] = {}
-    for category in options["categories"]:
-        for twins in draw_twins(category, items_per_category // 2, seed):
+    for category, count in counts.items():
+        for twins in draw_twins(category, count // 2, seed):
             items += twins.items
             pictures |= {picture.file_name: picture.png for picture in twins.pictures}
             if progress:
-                progress(len(items), items_per_category * len(options["categories"]))
+                progress(len(items), sum(counts.values()))
     suite = new_suite(SUITE_NAME, SUITE_VERSION, with_groups(items), options)
     return save_suite(suite, pictures, _stats(suite), folder)
 
@@ -84,22 +86,40 @@ def default_identity() -> str:
     return f"{SUITE_NAME}@{SUITE_VERSION}"
 
 
-def _options(categories: Sequence[str] | None, items_per_category: int, seed: int) -> dict[str, Any]:
-    """The arguments in one spelling, checked."""
+def _options(
+    categories: Sequence[str] | None, items_per_category: int | Mapping[str, int], seed: int
+) -> dict[str, Any]:
+    """The arguments in one spelling, checked: equal numbers of items are one number."""
     embedded = [slug for slug in CATEGORIES if slug in GENERATORS]
     wanted = embedded if categories is None else check_categories(categories, embedded)
     if not wanted:
         raise UsageError("no category to build. Name at least one, or leave `categories` out for all.")
-    if items_per_category < 2 or items_per_category % 2:
-        raise UsageError(
-            f"items_per_category is {items_per_category}; expected a positive even number, because every pair of "
-            "pictures is asked for both ways."
-        )
+    ordered = [slug for slug in embedded if slug in wanted]
+    counts = _counts(ordered, items_per_category)
+    for count in counts.values():
+        if count < 2 or count % 2:
+            raise UsageError(
+                f"items_per_category is {count}; expected a positive even number, because every pair of "
+                "pictures is asked for both ways."
+            )
+    different = set(counts.values())
     return {
-        "categories": [slug for slug in embedded if slug in wanted],
-        "items_per_category": items_per_category,
+        "categories": ordered,
+        "items_per_category": counts if len(different) > 1 else different.pop(),
         "seed": seed,
     }
+
+
+def _counts(categories: Sequence[str], items_per_category: int | Mapping[str, int]) -> dict[str, int]:
+    """How many items each category gets."""
+    if isinstance(items_per_category, int):
+        return dict.fromkeys(categories, items_per_category)
+    if items_per_category.keys() != set(categories):
+        raise UsageError(
+            f"items_per_category has a number for {', '.join(sorted(items_per_category)) or 'no category'}; "
+            f"expected one for each of {', '.join(sorted(categories))}."
+        )
+    return {category: items_per_category[category] for category in categories}
 
 
 def _stats(suite: Suite) -> dict[str, dict[str, int]]:

@@ -16,7 +16,7 @@ from tests.acceptance.product import ROOT, address_of, environment, lines_of, pr
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 DEMO: dict[str, Any] = json.loads((ROOT / "docs" / "demo.json").read_text(encoding="utf-8"))
-TRAINED = {row["category"]: row for row in DEMO["organisms"] if row["organism"] == "trained"}
+TRAINED = {row["category"]: row for row in DEMO["demo"]["organisms"]}
 TYPED = "## Your own study"
 
 
@@ -32,10 +32,11 @@ def numbers(cell: str) -> list[float]:
     return [float(text) for text in re.findall(r"-?\d+(?:\.\d+)?", cell.replace("−", "-"))]
 
 
-@pytest.mark.parametrize("category", ["color", "shape", "state", "counting"])
+@pytest.mark.parametrize("category", TRAINED)
 def test_the_readme_shows_the_numbers_of_the_demo(category: str) -> None:
-    rate, backbone, action, retention = cells_of_the_table()[category]
+    items, rate, backbone, action, retention = cells_of_the_table()[category]
     row = TRAINED[category]
+    assert numbers(items) == [row["items"]]
     assert numbers(rate) == [pytest.approx(100 * row["sr"], abs=0.06)]
     score, low, high, *_ = numbers(backbone)
     assert score == pytest.approx(100 * row["backbone"], abs=0.06)
@@ -50,14 +51,19 @@ def test_the_readme_shows_the_numbers_of_the_demo(category: str) -> None:
 
 
 def test_the_demo_says_what_its_policy_was_trained_for() -> None:
-    """The policy acts on Color and Shape. State is decodable and does not reach the action. Counting is absent."""
-    assert {name for name, row in TRAINED.items() if row["verdict"] == "shown"} == {"color", "shape", "state"}
-    assert min(TRAINED["color"]["retention"], TRAINED["shape"]["retention"]) > 0.7
-    assert TRAINED["state"]["retention"] < 0.5
-    assert TRAINED["counting"]["retention"] is None
-    for row in DEMO["organisms"]:
+    """The policy acts on Color and Shape. State is decodable and is not used. Counting is not shown."""
+    compared = {row["category"]: row for row in DEMO["compare"]["organisms"] if row["organism"] == "trained"}
+    assert {name for name, row in TRAINED.items() if row["verdict"] == "shown"} == {"color", "state"}
+    assert {name for name, row in compared.items() if row["verdict"] == "shown"} == {"color", "shape", "state"}
+    assert min(TRAINED["color"]["retention"], compared["color"]["retention"], compared["shape"]["retention"]) > 0.7
+    for rows in (TRAINED, compared):
+        assert rows["color"]["measured"] == "used"
+        assert rows["state"]["measured"] == "not used"
+        assert rows["state"]["retention"] < 0.5
+        assert rows["counting"]["retention"] is None
+    for row in DEMO["demo"]["organisms"] + DEMO["compare"]["organisms"]:
         assert row["backbone_ci"][0] <= row["backbone"] <= row["backbone_ci"][1]
-        assert row["agreement"] != "false", row
+        assert row["agreement"] != "wrong", row
 
 
 @pytest.mark.slow
@@ -68,7 +74,7 @@ def test_the_demo_runs_and_gives_the_documented_numbers(tmp_path: Path) -> None:
         assert list((tmp_path / "probe-kit-demo").rglob(picture)), f"the demo writes no {picture}"
     for category, row in TRAINED.items():
         (cells,) = [text for text in printed.splitlines() if text.casefold().startswith(category)][:1]
-        assert round(100 * row["sr"], 1) in numbers(cells), cells
+        assert round(100 * row["sr"]) in numbers(cells), cells
     runs = [path.parent for path in (tmp_path / "probe-kit-demo").rglob("run.json")]
     acted = [run for run in map(pk.open_run, runs) if run.model.startswith("pi0")]
     assert len(acted) == 1

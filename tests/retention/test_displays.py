@@ -1,6 +1,7 @@
 """Displays: the numbers they carry are those of the run, and what they draw says where it comes from."""
 
 import io
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,7 +37,8 @@ from probe_kit.retention.displays import (
     save_figures,
 )
 from probe_kit.retention.displays.base.label_placement import place_labels
-from probe_kit.retention.displays.base.style import FILLED, OPEN
+from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.style import FILLED, OPEN, caption
 from probe_kit.retention.displays.heat_table import heat_colour
 from probe_kit.train import ArrayRun, load_results
 
@@ -311,3 +313,12 @@ def test_runs_whose_folders_have_one_name_get_figures_of_their_own(tmp_path: Pat
     names = [exhibit.name for exhibit in collect_figures(runs, retention_table(runs))]
     assert len(set(names)) == len(names)
     assert {"run-final-positions", "run-2-final-positions", "run-3-final-positions"} <= set(names)
+
+
+def test_the_line_below_a_figure_has_no_hole_where_one_model_was_not_probed() -> None:
+    probed = ProvenanceLine("pi0", False, "a" * 64, "suite@1", "n = 4 episodes", "s" * 64, "probes1", call=0)
+    asked = replace(probed, model="vlm", probes=None, call=None)
+    figure = Figure()
+    caption(figure, asked, probed)
+    assert not re.search(r"(^|·)\s*,|,\s*(·|$)", figure.get_supxlabel())
+    assert "call 0" in figure.get_supxlabel()

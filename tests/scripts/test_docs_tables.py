@@ -9,6 +9,8 @@ from docs_tables import DATA, PAGES, README, blocks, filled
 from PIL import Image
 from readme_picture import MADE_FROM, TARGET
 
+from probe_kit.demo.pipeline import FULL, QUICK
+
 DOCS = DATA.parent
 FIGURE = re.compile(r"\d[\d,.]*\s?(%|×|ms|s\b|MB/s|GB\b)")
 
@@ -22,7 +24,7 @@ def test_every_table_of_the_demo_is_the_one_its_numbers_make(page: Path) -> None
 
 def test_another_number_makes_another_page() -> None:
     data = json.loads(DATA.read_text(encoding="utf-8"))
-    data["organisms"][0]["sr"] = 0.123
+    data["demo"]["organisms"][0]["sr"] = 0.123
     text = README.read_text(encoding="utf-8")
     assert "12.3" in filled(text, data)
     assert "12.3" not in text
@@ -31,8 +33,15 @@ def test_another_number_makes_another_page() -> None:
 def test_the_picture_shows_the_probes_whose_numbers_are_printed() -> None:
     data = json.loads(DATA.read_text(encoding="utf-8"))
     with Image.open(TARGET) as picture:
-        assert picture.info[MADE_FROM] == data["probes"]
-    assert "trained" in {row["organism"] for row in data["organisms"]}
+        assert picture.info[MADE_FROM] == data["demo"]["probes"]
+    assert {row["organism"] for row in data["demo"]["organisms"]} == {"trained"}
+
+
+def test_the_numbers_are_those_of_the_present_size_of_the_demo() -> None:
+    data = json.loads(DATA.read_text(encoding="utf-8"))
+    for name, size in {"demo": QUICK, "compare": FULL}.items():
+        assert data[name]["permutations"] == size.permutations
+        assert {row["category"]: row["items"] for row in data[name]["organisms"]} == dict(size.items)
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +55,9 @@ def test_the_sample_report_has_at_most_one_megabyte_and_no_path(sample: str) -> 
 
 
 def test_the_sample_report_is_of_the_probes_and_numbers_that_are_printed(sample: str) -> None:
-    data = json.loads(DATA.read_text(encoding="utf-8"))
+    data = json.loads(DATA.read_text(encoding="utf-8"))["demo"]
     assert f"probes {data['probes']}" in sample
-    for row in (one for one in data["organisms"] if one["organism"] == "trained"):
+    for row in data["organisms"]:
         cells = re.search(rf"<tr><td[^>]*>{row['category'].title()}</td>.*?</tr>", sample)
         assert cells, row["category"]
         shown = re.findall(r'data-heading="(\w+)[^"]*" data-sort="([\d.]+|n/a)', cells[0])
@@ -69,7 +78,8 @@ def test_the_controls_of_the_sample_report_are_those_of_the_demo(sample: str) ->
 def test_no_page_repeats_the_demos_numbers_outside_its_tables() -> None:
     """A number in two places is soon two numbers."""
     data = json.loads(DATA.read_text(encoding="utf-8"))
-    rates = {f"{100 * row['sr']:.1f}" for row in data["organisms"] if 0.5 < row["sr"] < 1}
+    rows = data["demo"]["organisms"] + data["compare"]["organisms"]
+    rates = {f"{100 * row['sr']:.1f}" for row in rows if 0.5 < row["sr"] < 1}
     assert rates
     for page in (README, DOCS / "index.md", *PAGES):
         text = re.sub(

@@ -52,6 +52,30 @@ def test_a_number_of_items_without_twins_is_refused(tmp_path: Path, count: int) 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_each_category_may_have_its_number_of_items(small_suite: Suite, tmp_path: Path) -> None:
+    """Its items are those of a suite with the same number everywhere."""
+    calls: list[tuple[int, int]] = []
+    counts = {"color": 2, "shape": 12}
+    suite = build_suite(tmp_path / "suite", ["color", "shape"], counts, progress=lambda *call: calls.append(call))
+    assert suite.card["counts"] == counts == suite.card["options"]["items_per_category"]
+    assert calls[-1] == (14, 14)
+    assert suite.select(["shape"]).content_sha256 == small_suite.select(["shape"]).content_sha256
+
+
+def test_equal_numbers_of_items_are_one_number(small_suite: Suite, tmp_path: Path) -> None:
+    again = build_suite(tmp_path / "again", ["color", "shape"], {"shape": 12, "color": 12})
+    assert contents(again.folder) == contents(small_suite.folder)
+
+
+@pytest.mark.parametrize("counts", [{"color": 2}, {"color": 2, "shape": 2, "state": 2}, {}])
+def test_numbers_of_items_of_other_categories_are_refused(tmp_path: Path, counts: dict[str, int]) -> None:
+    with pytest.raises(UsageError, match="expected one for each of color, shape"):
+        build_suite(tmp_path / "suite", ["color", "shape"], counts)
+    with pytest.raises(UsageError, match="is 3; expected a positive even number"):
+        build_suite(tmp_path / "suite", ["color", "shape"], {"color": 2, "shape": 3})
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_unknown_category_is_refused_with_the_nearest_name(tmp_path: Path) -> None:
     with pytest.raises(UnknownCategoryError, match="Did you mean 'counting'"):
         build_suite(tmp_path / "suite", ["Countin"])

@@ -114,16 +114,21 @@ class OfOneHead:
 
 @dataclass(frozen=True)
 class AddVector:
-    """Add a vector (D,), the same for every token."""
+    """Add a vector (D,), the same for every token, or the t-th of (T, D) to the t-th token; T may be more."""
 
     vector: NDArray[np.float32]
 
     def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
-        """own + vector."""
+        """own + vector. Raises CaptureError for more tokens than vectors."""
         import torch
 
         del site, where
-        found: Tensor = own + torch.tensor(self.vector, device=own.device)
+        vector, tokens = self.vector, own.shape[1]
+        if vector.ndim == 2:
+            if len(vector) < tokens:
+                raise CaptureError(f"there are {tokens} tokens, and vectors for {len(vector)}")
+            vector = vector[:tokens]
+        found: Tensor = own + torch.tensor(vector, device=own.device)
         return found
 
 

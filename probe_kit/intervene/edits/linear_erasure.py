@@ -269,6 +269,16 @@ def _differences(centred: Array, present: NDArray[np.bool_], left: NDArray[np.bo
     return np.asarray(sums[0] - sums[1])
 
 
+def half_differences(tokens: PaddedTokens, left: NDArray[np.bool_], eraser: Eraser) -> Array:
+    """(T, K) halves of the differences of class means along an eraser's shared directions, toward `left`.
+
+    Zero at the positions at which nothing was fitted.
+    """
+    centred, _ = tokens.centred()
+    halves = _differences(centred, tokens.present, left) @ eraser.removed[0].T / 2
+    return np.where(eraser.fitted[:, None], halves, 0.0)
+
+
 def _shared(differences: Array, rank: int, size: float) -> Array:
     """(1, K, D): the directions along which differences (T, D) of positions lie most, the same for every token.
 

@@ -54,6 +54,10 @@ class PooledDirections:
         """Half the distance of the class means, for this episode."""
         return float(self.half_differences[category][self.fold_of[episode]])
 
+    def shift(self, name: str, episode: str, category: str, strength: float) -> Vector:
+        """(D,) so many half differences of the class means, toward `left`."""
+        return np.float32(strength * self.half_difference(episode, category)) * self.of(name, episode, category)
+
 
 def control_names(count: int) -> tuple[str, ...]:
     """Of so many random directions beside another one."""

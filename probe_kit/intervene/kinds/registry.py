@@ -86,11 +86,11 @@ _ENTRIES = (
         effects="probe_kit.intervene.kinds.site_effects:measured_patches",
         table="probe_kit.intervene.kinds.site_table:site_table",
         sentences="probe_kit.intervene.kinds.site_table:site_sentences",
-        notes="probe_kit.intervene.kinds.site_effects:large_change_notes",
+        notes="probe_kit.intervene.kinds.site_effects:steering_notes",
         options={
             "sites": "where tokens are moved; required",
             "roles": "the one whose tokens are moved; required",
-            "direction": "mean-difference (default) or probe",
+            "direction": "mean-difference (default), probe or mean-difference:K",
             "controls": "random directions; default 5",
             "coefficients": "in half class-mean differences; default 1,2,4",
             "target_side": "wrong (default), correct, left or right",

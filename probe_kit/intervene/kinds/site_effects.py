@@ -22,6 +22,7 @@ from probe_kit.intervene.kinds.base import (
     test_against_controls,
 )
 from probe_kit.intervene.kinds.image_swap.effects import net_interval, swap_sign
+from probe_kit.intervene.kinds.reach import SMALLEST_REACH
 from probe_kit.intervene.kinds.swap_shares import share_of_swap
 from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -95,14 +96,26 @@ def patch_effects(
     ]
 
 
-def large_change_notes(rows: Sequence[PatchEffect], _: Measurement) -> list[str]:
-    """What a reader of steering must know."""
+def steering_notes(rows: Sequence[PatchEffect], _: Measurement) -> list[str]:
+    """Return what a reader of steering must know: too large a change, and a vector that cannot move the answer."""
     steered = {row.name: row.relative_change for row in rows if row.coefficient}
-    return [
+    large = [
         f"{name} moves tokens by {ratio:.1f} times their own norm; what that does is little evidence."
         for name, ratio in steered.items()
         if ratio > LARGE_CHANGE
     ]
+    return large + [
+        f"{category}: one vector that is added to every token moves no action. An answer that lies in which "
+        "tokens are marked has no such vector; --direction mean-difference:1 has a vector for each position."
+        for category in _unmoved_by_one_vector(rows)
+    ]
+
+
+def _unmoved_by_one_vector(rows: Sequence[PatchEffect]) -> list[str]:
+    """Categories in which steering along a direction of the tokens' mean moves no action by a smallest reach."""
+    pooled = [row for row in rows if row.coefficient not in ("", "0") and ":" not in row.direction]
+    moved = {row.category for row in pooled if abs(row.mean_displacement) >= SMALLEST_REACH}
+    return [name for name in dict.fromkeys(row.category for row in pooled) if name not in moved]
 
 
 def target_sign(outcomes: ConditionOutcomes, target_side: str) -> NDArray[np.float64]:

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.intervene.edits.linear_erasure import Method
+from probe_kit.intervene.edits.linear_erasure import Method, half_differences
 from probe_kit.intervene.edits.pooled_directions import (
     DIRECTIONS,
     MEAN_DIFFERENCE,
@@ -23,7 +24,13 @@ from probe_kit.intervene.edits.pooled_directions import (
 from probe_kit.intervene.edits.sites import SiteGroup
 from probe_kit.intervene.replay.passed_over import PassedOver
 from probe_kit.intervene.replay.session import ReplaySession
-from probe_kit.intervene.replay.token_features import by_episode, collect_token_features, fit_by_fold
+from probe_kit.intervene.replay.token_features import (
+    Fits,
+    TokenFeatures,
+    by_episode,
+    collect_token_features,
+    fit_by_fold,
+)
 
 
 class DirectionBasis(Protocol):
@@ -36,18 +43,34 @@ class DirectionBasis(Protocol):
     def basis(self, name: str, episode: str, category: str) -> Vector:
         """(K, D) float32, orthonormal."""
 
+    def shift(self, name: str, episode: str, category: str, strength: float) -> Vector:
+        """(D,) or (T, D) float32, so many half differences of the class means, toward `left`.
+
+        (T, D): the t-th row belongs to the role's t-th token. Of a control: as far, along its own directions.
+        """
+
 
 @dataclass(frozen=True)
 class TokenDirections:
-    """Of one site and role. bases: by name and episode, (K, D) float32."""
+    """Of one site and role.
+
+    bases: by name and episode, (K, D) float32. half_differences: by episode (T, K), half the differences of the
+    class means at the role's positions along the directions that were asked for.
+    """
 
     bases: Mapping[tuple[str, str], Vector]
+    half_differences: Mapping[str, NDArray[np.float64]]
     control_names: tuple[str, ...] = ()
 
     def basis(self, name: str, episode: str, category: str) -> Vector:
         """(K, D) the directions that never saw this episode."""
         del category  # an episode has one
         return self.bases[name, episode]
+
+    def shift(self, name: str, episode: str, category: str, strength: float) -> Vector:
+        """(T, D) of all positions; a mark on either tile has its own sign at the positions of each."""
+        del category
+        return np.float32(strength * self.half_differences[episode]) @ self.bases[name, episode]
 
 
 def check_direction(direction: str) -> None:
@@ -89,6 +112,7 @@ def fit_token_directions(
         passed_over.check_some_left(list(pooled))
         return pooled
     bases: dict[tuple[SiteGroup, str], dict[tuple[str, str], Vector]] = {}
+    halves: dict[tuple[SiteGroup, str], dict[str, NDArray[np.float64]]] = {}
     for place, role, category, own in collect_token_features(session, items, wanted):
         with passed_over.fitting(place, role):
             fits = fit_by_fold(own, place.only_site, role, Method.of(direction), controls, seed, category)
@@ -97,6 +121,16 @@ def fit_token_directions(
                 found |= {
                     (name, episode): eraser.removed[0].astype(np.float32) for episode, eraser in of_episode.items()
                 }
+            halves.setdefault((place, role), {}).update(half_differences_of(own, fits, direction))
     left = {cell: found for cell, found in bases.items() if not passed_over.holds(*cell)}
     passed_over.check_some_left(list(left))
-    return {cell: TokenDirections(found, control_names(controls)) for cell, found in left.items()}
+    return {cell: TokenDirections(found, halves[cell], control_names(controls)) for cell, found in left.items()}
+
+
+def half_differences_of(own: TokenFeatures, fits: Fits, direction: str) -> dict[str, NDArray[np.float64]]:
+    """Return by episode (T, K) half the differences of the class means, of the folds that it is not in."""
+    found: dict[str, NDArray[np.float64]] = {}
+    for fold, fitted in fits:
+        halves = half_differences(own.tokens.only(fold.train), own.left[fold.train], fitted[direction])
+        found |= dict.fromkeys((own.episodes[row] for row in fold.test), halves)
+    return found

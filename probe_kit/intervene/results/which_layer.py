@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.hooks.registry import get_family
+from probe_kit.intervene.edits.pooled_directions import MEAN_DIFFERENCE
 from probe_kit.intervene.edits.sites import ALL, list_places
 from probe_kit.intervene.edits.unread import unread_places
 from probe_kit.intervene.kinds.site_effects import PatchEffect
@@ -23,6 +24,8 @@ from probe_kit.train.data.run_reader import RunReader
 if TYPE_CHECKING:
     from probe_kit.train.results.probe_results import ProbeResults
 
+ALONG = f"{MEAN_DIFFERENCE}:1"
+"""Direction that moves an answer in every token alike, and one that lies in which tokens are marked."""
 _NOT_PATCHED = "was not patched"
 _TIES: dict[TieAtSite, str] = {
     "read": "is read",
@@ -50,7 +53,7 @@ def which_layer(run: RunReader, results: "ProbeResults | None", categories: Sequ
             _best_site(run, results, name, rows, along.get(name, [])),
         ]
         if cell is not None and is_backbone_layer(cell):
-            parts.append(f"steer at {cell.place} {cell.role}")
+            parts.append(f"steer at {cell.place} {cell.role} (--direction {ALONG})")
         found[name] = f"Which layer, {category_of(name).title}: {'; '.join(filter(None, parts))}."
     return found
 

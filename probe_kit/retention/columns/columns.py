@@ -14,6 +14,7 @@ from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.modes import Modes
 from probe_kit.retention.columns.text import (
+    P_DECIDES,
     action_place,
     backbone_place,
     baseline,
@@ -155,15 +156,17 @@ DIFFERENCE_P = Column(
     key="difference.p",
     heading="p (Holm)",
     help="Of a difference between two runs: probability that two equally good ones differ so much on these "
-    "questions. Signs of whole groups are flipped. In brackets: corrected by Holm for all categories and pairs.",
+    "questions. Signs of whole groups are flipped. In brackets: corrected by Holm for all categories and pairs. "
+    f"{P_DECIDES[:1].upper()}{P_DECIDES[1:]}.",
     text=lambda _: "",
     sort=lambda _: None,
     difference=difference_test,
 )
 _MODELS = (
     "Of a difference between groups of models: exact p of exchanging the models' labels, the model as the unit. "
-    "In brackets the least p that so few models allow, and Welch's 95 % interval over models. Other numbers of "
-    "the row are of these models on other items."
+    "In brackets the least p that so few models allow, and Welch's 95 % interval over models, which is no "
+    "inversion of this test: where the two disagree, p decides. Other numbers of the row are of these models on "
+    "other items."
 )
 SR_MODELS = Column(
     key="difference.sr_models",

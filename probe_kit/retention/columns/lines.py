@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from probe_kit.retention.columns.text import model_name
+from probe_kit.retention.columns.text import P_DECIDES, model_name
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
@@ -50,7 +50,7 @@ def difference_legend(differences: Sequence[Difference], behaviour: bool = True)
     own = "" if all(row.paired for row in differences) else "of other items: each side's own groups"
     tests = (
         "p of the share right: exact, signs of groups flipped, in means over all items (Holm: all categories and "
-        "pairs)"
+        f"pairs); {P_DECIDES}"
     )
     shown = tests if behaviour and any(row.p is not None for row in differences) else ""
     models = "these models, other items" if any(row.sr_models for row in differences) else ""

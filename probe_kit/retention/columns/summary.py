@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from probe_kit.intervene.kinds.image_swap.verdict import describe_readouts
 from probe_kit.retention.columns.sentences import chance_only, describe_category, knows, verdict
 from probe_kit.retention.columns.text import (
+    P_DECIDES,
     difference_interval,
     difference_test,
     is_vlm,
@@ -34,7 +35,8 @@ _LEGENDS = {
 }
 """What a column shows."""
 _TESTS = {
-    "p (Holm)": "p: exact, of a difference in success or answers, (corrected for all categories and pairs)",
+    "p (Holm)": "p: exact, of a difference in success or answers, (corrected for all categories and pairs); "
+    f"{P_DECIDES}",
     "p over models (least)": "p over models: exact, models as the unit (the least that so few models allow)",
 }
 """What a column of differences shows."""

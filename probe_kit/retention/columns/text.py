@@ -12,6 +12,8 @@ NOT_ACTED = "n/a"
 """In place of a success rate, for a model that did not act."""
 ABOVE_CHANCE = "above chance"
 """How a cell ends that tables colour red: the suite gives the answer away without a model."""
+P_DECIDES = "intervals are of another method than p: where one of the two excludes zero alone, p decides"
+"""The exact test under no difference has no inversion: it would be of zero width where all groups agree."""
 _REGIMES = {
     Regime.KNOWLEDGE: "knowledge",
     Regime.NO_RELIABLE_KNOWLEDGE: "not reliable",

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 from probe_kit.retention.columns.text import (
+    P_DECIDES,
     is_vlm,
     model_name,
     number,
@@ -104,7 +105,7 @@ def _gap_table(asked: str, acted: str, rows: Sequence[VlmVlaDifference]) -> Text
     return TextTable(
         f"VLM − VLA: {asked} − {acted}",
         f"{items}; {seen}; {_SOURCES[rows[0].source]}; p: exact, whole groups of items flipped; (Holm): over the "
-        "categories of all pairs shown, means by themselves",
+        f"categories of all pairs shown, means by themselves; {P_DECIDES}",
         tuple(name for name, _ in _GAPS),
         tuple(tuple(cell(row) for _, cell in _GAPS) for row in rows),
     )

@@ -13,7 +13,7 @@ from probe_kit.retention.columns.text import model_name, once_per_category, rule
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
-from probe_kit.retention.displays.base.style import axes_for, caption
+from probe_kit.retention.displays.base.style import axes_for, caption, legend_above
 from probe_kit.retention.formats.heat import HEAT, heat_colour
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
@@ -22,6 +22,7 @@ from probe_kit.retention.text import spell
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
 _CELL_WIDTH, _ROW_HEIGHT = 0.66, 0.36  # inches
 _NAME_WIDTH = 0.085  # inches per character of a model's name
@@ -100,7 +101,7 @@ class HeatTableDisplay(Display):
         if figure is None:
             axes.set_title(self.title + self.rule_words, fontsize=10, loc="left", pad=34)
         else:
-            self._draw_key(figure)
+            legend_above(figure, self._key(), f"{self.title}{self.rule_words}\n{self.note}")
         caption(figure, *self.certificates)
         self.ax_ = axes
         return self
@@ -130,18 +131,14 @@ class HeatTableDisplay(Display):
         if self.columns[-1] == "mean" and len(self.columns) > 1:
             axes.axvline(len(self.columns) - 1, color="0.35", lw=0.9)
 
-    def _draw_key(self, figure: "Figure") -> None:
+    def _key(self) -> "list[Patch]":
+        """The colours and the numbers that they stand for."""
         from matplotlib.patches import Patch
 
         bounds = [0.0, *(bound for bound, _, _ in HEAT[:-1])]
         labels = [f"{self.scale * bound:g}–{self.scale * (bound + 0.2):g}" for bound in bounds]
         labels[0], labels[-1] = f"< {self.scale * 0.2:g}", f"≥ {self.scale * 0.8:g}"
-        patches = [Patch(fc=f"#{rgb}", label=label) for (_, _, rgb), label in zip(HEAT, labels, strict=True)]
-        figure.legend(
-            handles=patches, loc="outside upper left", ncols=5, fontsize=7, frameon=False, handlelength=1.2,
-            columnspacing=1.2, title=f"{self.title}{self.rule_words}\n{self.note}", title_fontsize=8,
-            alignment="left",
-        )  # fmt: skip
+        return [Patch(fc=f"#{rgb}", label=label) for (_, _, rgb), label in zip(HEAT, labels, strict=True)]
 
 
 class SuccessTableDisplay(HeatTableDisplay):

@@ -1,7 +1,8 @@
 """Retention tables on a console: one block per table, whole at any width."""
 
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,8 +23,8 @@ if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, Group, RenderableType
     from rich.text import Text
 
-WIDE = 100
-"""Columns from which on the summary has room for intervals."""
+_VALUE = re.compile(r"(?P<value>\S+) (?P<limits>\[.*\])(?P<mark>.*)")
+"""A cell of the summary with an interval."""
 _Letters = Mapping[tuple[str | None, str], str]
 """By group and run, what it is called in a table of several."""
 
@@ -63,15 +64,28 @@ def rich_tables(
 
 @dataclass(frozen=True)
 class _Summary:
-    """The summary's table; where it would not fit, intervals stand in the sentences only."""
+    """The summary's table; where it would not fit, cells have two lines, and else no intervals."""
 
     found: Sequence[RunSummary]
     differences: Sequence[Difference]
 
     def __rich_console__(self, _: "Console", options: "ConsoleOptions") -> "Iterator[RenderableType]":
-        tables = (summary_table(self.found, self.differences, wide) for wide in (True, False))
-        whole, short = map(responsive_table, tables)
-        yield whole if options.max_width >= max(WIDE, whole.width) else short
+        whole, short = (summary_table(self.found, self.differences, intervals) for intervals in (True, False))
+        tables = [responsive_table(table) for table in (whole, _folded(whole), short, _folded(short))]
+        yield next((table for table in tables if table.width <= options.max_width), tables[-1])
+
+
+def _folded(table: TextTable) -> TextTable:
+    """The same with intervals below their values, and verdicts broken at commas."""
+    verdicts = table.columns.index("verdict") if "verdict" in table.columns else None
+    cells = tuple(
+        tuple(
+            text.replace(", ", ",\n") if at == verdicts else _VALUE.sub(r"\g<value>\g<mark>\n\g<limits>", text)
+            for at, text in enumerate(line)
+        )
+        for line in table.cells
+    )
+    return replace(table, cells=cells)
 
 
 def _sentences(found: Sequence[RunSummary]) -> "Iterator[Text]":

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from probe_kit.retention.columns.text import (
+    P_DECIDES,
     difference_interval,
     difference_test,
     models_test,
@@ -22,7 +23,10 @@ from probe_kit.statistics.multiple_testing import corrected
 from probe_kit.study.tables.named_table import NamedTable, Number, caption
 from probe_kit.suite.categories import category_of
 
-_TEST = "p: exact, signs of whole groups of items flipped; (Holm) over all categories and pairs of this comparison"
+_TEST = (
+    "p: exact, signs of whole groups of items flipped; (Holm) over all categories and pairs of this comparison; "
+    f"{P_DECIDES}"
+)
 FEWEST_GROUPS = 10
 """Of items, with which a difference is tested."""
 _FEW = "!"

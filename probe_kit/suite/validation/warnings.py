@@ -12,6 +12,7 @@ from PIL import Image
 
 from probe_kit.statistics.folds import OUTER_FOLDS
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, category_of
+from probe_kit.suite.counterparts import counterparts_of
 from probe_kit.suite.items import Item
 from probe_kit.suite.pictures import load_picture
 from probe_kit.suite.suite import Suite, count_by_category
@@ -55,10 +56,22 @@ def roles_balanced(suite: Suite) -> Iterator[Finding]:
 
 
 def role_counts(items: Sequence[Item]) -> dict[tuple[str, str], tuple[int, int]]:
-    """Per category and concept, how often it is the target and how often the distractor."""
+    """Per category and concept, how often it is the target and how often the distractor.
+
+    What the wrong picture shows is what its counterpart asks for, where there is one: a table of one's own names
+    the correct picture alone.
+    """
+    twins = counterparts_of(items)
     targets = Counter((item.category, item.target_concept) for item in items)
-    distractors = Counter((item.category, item.distractor_concept) for item in items)
+    distractors = Counter((item.category, _distractor(item, twins.get(item.item_id))) for item in items)
     return {key: (targets[key], distractors[key]) for key in sorted(targets | distractors)}
+
+
+def _distractor(item: Item, twin: Item | None) -> str:
+    """The concept of an item's wrong picture."""
+    if twin is None or twin.target_concept == item.target_concept:
+        return item.distractor_concept
+    return twin.target_concept
 
 
 def pictures_distinct(suite: Suite) -> Iterator[Finding]:
@@ -90,8 +103,9 @@ def _near_duplicates(looks: Sequence[Look]) -> Iterator[tuple[int, int]]:
 
 def enough_items(suite: Suite) -> Iterator[Finding]:
     """W04: at least 30 items per category, and as many as were asked for."""
-    requested = suite.card.get("options", {}).get("items_per_category")
+    option = suite.card.get("options", {}).get("items_per_category")
     for category, count in count_by_category(suite.items).items():
+        requested = option.get(category) if isinstance(option, dict) else option
         if requested is not None and count != requested:
             yield warning("W04", category_of(category).title, f"{count} of {requested} requested")
         elif count < FEWEST_ITEMS:

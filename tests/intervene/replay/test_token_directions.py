@@ -11,8 +11,13 @@ from probe_kit.hooks import Site, capture
 from probe_kit.intervene import ClosedLoop, Interchange, ReplaySource, Steering, run_intervention
 from probe_kit.intervene.edits.linear_erasure import Method, PaddedTokens
 from probe_kit.intervene.edits.sites import resolve_sites
+from probe_kit.intervene.replay.passed_over import PassedOver
 from probe_kit.intervene.replay.session import ReplaySession
-from probe_kit.intervene.replay.token_directions import TokenDirections, fit_token_directions
+from probe_kit.intervene.replay.token_directions import (
+    TokenDirections,
+    fit_token_directions,
+    half_differences_of,
+)
 from probe_kit.intervene.replay.token_features import TokenFeatures, by_episode, fit_by_fold
 
 pytestmark = pytest.mark.slow
@@ -90,7 +95,10 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
     (place,) = resolve_sites("backbone.02", session.policy)
     captured: list[tuple[int, int]] = []
     session.on_fit_progress = lambda done, total, _: captured.append((done, total))
-    (axes,) = fit_token_directions(session, items, {place: ["image"]}, "mean-difference:2", 1, seed=0).values()
+    passed_over = PassedOver(session, ("backbone.02",))
+    (axes,) = fit_token_directions(
+        session, items, {place: ["image"]}, "mean-difference:2", 1, 0, passed_over
+    ).values()
     session.on_fit_progress = None
     assert captured == [(done, len(items)) for done in range(1, len(items) + 1)]
     assert isinstance(axes, TokenDirections)
@@ -150,6 +158,38 @@ def test_what_is_no_direction_is_refused_before_anything_is_loaded(intervention:
         intervention(direction)  # type: ignore[operator]
 
 
-def test_no_dose_is_added_along_directions_of_tokens() -> None:
-    with pytest.raises(UsageError, match="adds one vector to every token"):
-        Steering(sites=("backbone.02",), role="image", direction="mean-difference:1")
+def test_a_dose_of_two_takes_the_marks_from_one_half_of_the_tokens_to_the_other() -> None:
+    """Marks are planted; the vector of every position is the difference of the class means there."""
+    mark = np.eye(WIDTH)[3]
+    own, method = marked(mark), "mean-difference:1"
+    fits = fit_by_fold(own, SITE, "image", Method.of(method), 1, 0, "color")
+    bases = {
+        (name, episode): eraser.removed[0].astype(np.float32)
+        for name, of_episode in by_episode(own, fits).items()
+        for episode, eraser in of_episode.items()
+    }
+    axes = TokenDirections(bases, half_differences_of(own, fits, method), ("control-1",))
+    first = np.arange(POSITIONS) < POSITIONS // 2
+    for episode, left in zip(own.episodes, own.left, strict=True):
+        shift = axes.shift(method, episode, "color", -2.0 if left else 2.0)
+        expected = np.where(first == left, -1.0, 1.0)[:, None] * mark
+        np.testing.assert_allclose(shift, expected, atol=0.1)
+        control = axes.shift("control-1", episode, "color", -2.0 if left else 2.0)
+        np.testing.assert_allclose(
+            np.linalg.norm(control, axis=1), np.linalg.norm(shift, axis=1), rtol=1e-4, err_msg=episode
+        )
+
+
+def test_steering_along_directions_of_tokens_moves_them_as_far_as_its_control(
+    copy: Run, source: ReplaySource, twin: "Policy"
+) -> None:
+    intervention = Steering(
+        categories=("color",), items=2, sites=("backbone.02",), role="image", direction="mean-difference:1",
+        coefficients=(2.0,), controls=1,
+    )  # fmt: skip
+    assert intervention.fits_first
+    edits = run_intervention(copy, intervention, source, load=lambda *_: twin).certificate["edits"]
+    assert edits["backbone.02|image|mean-difference:1|0"]["max_action_change"] == 0.0
+    own, control = (edits[f"backbone.02|image|{name}|2"] for name in ("mean-difference:1", "control-1"))
+    assert own["change"] > 0
+    assert control["change"] == pytest.approx(own["change"], rel=1e-4)

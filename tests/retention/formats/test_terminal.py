@@ -10,6 +10,8 @@ import pytest
 from rich.console import Console
 
 from probe_kit.retention import RetentionTable, retention_table
+from probe_kit.retention.columns import summary
+from probe_kit.retention.columns.sentences import VERDICT_HELP
 from probe_kit.train import ArrayRun, BaselineScore, Controls, UntrainedScore, load_results, save_results
 
 ProbedRun = Callable[..., ArrayRun]
@@ -235,3 +237,31 @@ def test_a_policy_without_an_expert_has_the_same_columns(probed_run: ProbedRun) 
     assert [row.retention.value for row in table.rows] == [table.rows[0].retention.value] * 2 != [None, None]
     headings = [line for line in printed(table, 160).splitlines() if "backbone % [95 %]" in line]
     assert len(headings) == 1
+
+
+@pytest.mark.parametrize("words", sorted(VERDICT_HELP, key=len)[-6:])
+@pytest.mark.parametrize(("width", "lines"), [(80, 2), (100, 1), (120, 1)])
+def test_the_summary_has_its_intervals_on_a_usual_console_whatever_the_verdict(
+    probed_run: ProbedRun, monkeypatch: pytest.MonkeyPatch, words: str, width: int, lines: int
+) -> None:
+    """A line per category where there is room, else two: a value and below it the limits."""
+    monkeypatch.setattr(summary, "verdict", lambda _: words)
+    table = retention_table([probed_run({"color": SIGNAL, "counting": NONE})])
+    whole = printed_summary(table, width)
+    assert max(map(len, whole)) <= width
+    row = re.split(r"^Counting", "\n".join(whole).partition("Color")[2], flags=re.MULTILINE)[0]
+    assert len(row.splitlines()) == lines
+    (found,) = (one for one in table.rows if one.category == "color")
+    assert found.success.ci
+    for limits in (found.backbone.ci, found.action.ci, found.success.ci):
+        low, high = (round(100 * limit) for limit in limits or () if limit is not None)
+        assert f"[{low}, {high}]" in row
+    assert "".join(re.findall(r"[a-z]+", words)) in "".join(re.findall(r"[a-z]+", row))
+
+
+def printed_summary(table: RetentionTable, width: int) -> list[str]:
+    """The lines of the last table, from its title on."""
+    console = Console(width=width, file=io.StringIO())
+    console.print(table.to_rich())
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    return str(text).partition("Summary: ")[2].partition("\n\n")[0].splitlines()

@@ -51,6 +51,20 @@ def test_a_six_picture_study_is_a_valid_suite(pictures: Path) -> None:
         assert seen == Image.new("RGB", (1, 1), colour).getpixel((0, 0))
 
 
+def test_questions_that_are_asked_both_ways_have_no_concept_that_is_always_right(pictures: Path) -> None:
+    """The wrong picture is what its counterpart asks for, though the table names the correct one alone."""
+    pairs = [(f"{kind}-1", f"{kind}-2") for kind in FRUIT]
+    for number, name in enumerate(name for pair in pairs for name in pair):
+        Image.new("RGB", (80, 80), (20 * number, 255 - 20 * number, 90)).save(pictures / f"{name}.png")
+    lines = [
+        f"Put the cube on the {kind},{correct}.png,{wrong}.png,,ripeness"
+        for one, other in pairs
+        for kind, correct, wrong in (("ripe fruit", one, other), ("unripe fruit", other, one))
+    ]
+    both = validate_suite(made(pictures, *lines).folder)
+    assert not [str(finding) for finding in both.warnings if finding.rule == "W02"]
+
+
 def test_rows_of_a_group_or_with_a_common_picture_stay_together(pictures: Path) -> None:
     suite = made(
         pictures,

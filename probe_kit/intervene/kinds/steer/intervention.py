@@ -1,5 +1,8 @@
 """Steering: a direction added to the tokens of one role, with matched controls of the same norm.
 
+One vector for all tokens cannot move an answer that lies in *which* tokens are marked: it marks all of them alike.
+`mean-difference:K` has a vector for each position, which takes the mark from one tile to the other.
+
 A supplement to the interchange, not a replacement. The sum may lie off the network's distribution, a coefficient
 has no natural size, and at a large one every direction disrupts the task. So coefficients count half class-mean
 differences (2 goes from one mean to the other), controls are orthogonal directions of the data's own covariance
@@ -10,17 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self, get_args
 
-import numpy as np
-
 from probe_kit.errors import UsageError
 from probe_kit.extract.store.run import Run
 from probe_kit.hooks.capturing.edit_engine import apply_patch
 from probe_kit.hooks.capturing.token_edits import AddVector
-from probe_kit.intervene.edits.pooled_directions import (
-    DIRECTIONS,
-    MEAN_DIFFERENCE,
-    PooledDirections,
-)
+from probe_kit.intervene.edits.pooled_directions import MEAN_DIFFERENCE
 from probe_kit.intervene.edits.sites import SiteGroup, resolve_all
 from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.replay.conditions import (
@@ -33,7 +30,7 @@ from probe_kit.intervene.replay.conditions import (
 from probe_kit.intervene.replay.image_tokens import TILES, role_tokens
 from probe_kit.intervene.replay.passed_over import PassedOver
 from probe_kit.intervene.replay.session import ReplaySession
-from probe_kit.intervene.replay.token_directions import fit_token_directions
+from probe_kit.intervene.replay.token_directions import DirectionBasis, check_direction, fit_token_directions
 from probe_kit.intervene.store.settings import items_of
 
 TargetSide = Literal["wrong", "correct", "left", "right"]
@@ -44,7 +41,9 @@ COEFFICIENTS = (1.0, 2.0, 4.0)
 class Steering(Intervention):
     """Every place and coefficient, toward one side, and the same for the controls; 0 is always played as well.
 
-    sites: patterns of places. role: whose tokens are moved, along the direction found in their own mean.
+    sites: patterns of places. role: whose tokens are moved. direction: `mean-difference` or `probe`, one vector
+    found in the mean of these tokens and added to each; or `mean-difference:K`, at each position the difference of
+    the class means there, within the K directions that positions share.
     coefficients: in half class-mean differences along the direction. target_side: `wrong` and `correct` are those
     of the clean images. controls: so many orthogonal directions. Raises UsageError for a coefficient or side that
     does not exist.
@@ -65,11 +64,7 @@ class Steering(Intervention):
                 f"{self.role} has no mean in the run from which a direction could be found; steer `image`, or "
                 "patch the tile (--kind interchange)"
             )
-        if self.direction not in DIRECTIONS:
-            raise UsageError(
-                f"{self.direction!r} is no direction of one vector: steering adds one vector to every token. Use "
-                f"{' or '.join(DIRECTIONS)}"
-            )
+        check_direction(self.direction)
         if self.target_side not in get_args(TargetSide):
             raise UsageError(
                 f"target_side is {self.target_side!r}; expected one of {', '.join(get_args(TargetSide))}"
@@ -94,6 +89,11 @@ class Steering(Intervention):
         """`steer`."""
         return "steer"
 
+    @property
+    def fits_first(self) -> bool:
+        """Where its direction is of tokens."""
+        return ":" in self.direction
+
     def parameters(self) -> dict[str, Any]:
         """Where, along what, how far and to which side."""
         return {
@@ -114,7 +114,6 @@ class Steering(Intervention):
         )
         conditions: list[Condition] = [CleanRun()]
         for (place, _), axes in fitted.items():
-            assert isinstance(axes, PooledDirections)
             conditions.append(Steered(place, self.role, self.direction, 0.0, self.target_side, axes))
             conditions += [
                 Steered(place, self.role, name, coefficient, self.target_side, axes)
@@ -133,7 +132,7 @@ class Steered:
     direction: str
     coefficient: float
     target_side: TargetSide
-    axes: PooledDirections
+    axes: DirectionBasis
 
     @property
     def name(self) -> str:
@@ -145,15 +144,9 @@ class Steered:
         replay_input, session = context.replay_input, context.session
         left = replay_input.side_correct == "left"
         side = {"left": 1.0, "right": -1.0, "correct": 1.0 if left else -1.0, "wrong": -1.0 if left else 1.0}
-        length = (
-            self.coefficient
-            * self.axes.half_difference(replay_input.episode_id, replay_input.category)
-            * side[self.target_side]
-        )
-        unit = self.axes.of(self.direction, replay_input.episode_id, replay_input.category)
+        strength = self.coefficient * side[self.target_side]
+        shift = self.axes.shift(self.direction, replay_input.episode_id, replay_input.category, strength)
         tokens = role_tokens(session.policy, replay_input, self.place.stream, self.role, context.memo)
-        with apply_patch(
-            session.policy, self.place.sites, tokens, AddVector(np.float32(length) * unit)
-        ) as edit_log:
+        with apply_patch(session.policy, self.place.sites, tokens, AddVector(shift)) as edit_log:
             chunk = session.act(replay_input.seen, replay_input.seed)
         return ConditionResult(chunk, edit_log)

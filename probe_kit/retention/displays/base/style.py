@@ -150,8 +150,8 @@ def caption(figure: "Figure | None", *certificates: ProvenanceLine) -> None:
         return
     certificates = tuple(dict.fromkeys(certificates))
     groups = zip(*(certificate.parts for certificate in certificates), strict=True)
-    parts = dict.fromkeys(", ".join(dict.fromkeys(group)) for group in groups)
-    footer(figure, " · ".join(part for part in parts if part.strip(", ")))
+    parts = dict.fromkeys(", ".join(filter(None, dict.fromkeys(group))) for group in groups)
+    footer(figure, " · ".join(filter(None, parts)))
     figure.caption = "; ".join(certificate.line for certificate in certificates)  # type: ignore[attr-defined]
 
 
@@ -161,10 +161,10 @@ def footer(figure: "Figure", text: str) -> None:
     figure.supxlabel(text, fontsize=_CAPTION_SIZE, color="0.25", wrap=True)
 
 
-def legend_above(figure: "Figure", handles: "Sequence[Artist]") -> None:
+def legend_above(figure: "Figure", handles: "Sequence[Artist]", title: str = "") -> None:
     """A legend along the upper side, in as many columns as the figure has room for; many rows make it higher.
 
-    matplotlib fills a legend column by column, and leaves their number to its caller.
+    matplotlib fills a legend column by column, and leaves their number to its caller. title: lines above it.
     """
     lengths = [len(str(handle.get_label())) + _MARK for handle in handles]
     room = _LETTERS_PER_INCH * figure.get_figwidth()
@@ -174,9 +174,12 @@ def legend_above(figure: "Figure", handles: "Sequence[Artist]") -> None:
         if sum(int(column.max()) for column in np.array_split(lengths, columns)) <= room
     ]
     columns = max(fitting, default=1)
-    rows = ceil(len(lengths) / columns)
+    rows = ceil(len(lengths) / columns) + len(title.splitlines())
     figure.set_figheight(figure.get_figheight() + _ROW_HEIGHT * max(0, rows - _LEGEND_ROWS))
-    figure.legend(handles=handles, loc="outside upper left", ncols=columns, fontsize=_LEGEND_SIZE, frameon=False)
+    figure.legend(
+        handles=handles, loc="outside upper left", ncols=columns, fontsize=_LEGEND_SIZE, frameon=False,
+        title=title or None, title_fontsize=_LEGEND_SIZE, alignment="left",
+    )  # fmt: skip
 
 
 def significance_handles(colour: str = "0.3") -> "list[Line2D]":
