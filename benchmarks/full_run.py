@@ -113,7 +113,8 @@ def write_full_run(folder: Path, episodes: int, say: Callable[[str], None] = pri
     known = set(list(dict.fromkeys(one.episode.item.category for one in plan.episodes))[::2])
     settings = {
         "model": "synthetic", "weights_sha256": None, "random_weights": False, "captured_calls": 1,
-        "tokens": "pooled", "codec": "zstd", "seed": SEED, "suite": {"identity": suite.identity},
+        "tokens": "pooled", "codec": "zstd", "seed": SEED,
+        "suite": {"identity": suite.identity, "seed_text": suite.seed_text},
         "scene": scene.to_json(),
     }  # fmt: skip
     location = locate(folder / "run")

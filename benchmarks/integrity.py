@@ -73,7 +73,7 @@ def episode(plan: Plan, number: int) -> Rollout:
 def settings(codec: str) -> dict[str, Any]:
     """Settings of a synthetic run."""
     return {"captured_calls": 1, "tokens": "all", "codec": codec, "model": "synthetic", "weights_sha256": None,
-            "random_weights": False, "suite": {"identity": "synthetic"}}  # fmt: skip
+            "random_weights": False, "suite": {"identity": "synthetic", "seed_text": "synthetic"}}  # fmt: skip
 
 
 def bench_writing(suite: Suite, folder: Path, width: int, repeats: int) -> None:

@@ -59,7 +59,8 @@ def free_accuracy(suite: Suite, width: int) -> dict[str, tuple[float, float]]:
     run = ArrayRun(suite.folder, "none", suite.identity, _episodes(suite), {})
     inputs = RandomFeatureInputs.of(run, suite)
     settings = ProbeSettings(
-        model="none", random_weights=True, weights=None, suite=suite.identity, run_settings=run.settings_sha256,
+        model="none", random_weights=True, weights=None, suite=suite.identity,
+        seed_text=suite.seed_text, run_settings=run.settings_sha256,
         episodes=episodes_sha256(run), categories=tuple(suite.categories), views=("mean",), target="correct",
         permutations=0, seed=0,
     )  # fmt: skip

@@ -199,7 +199,11 @@ class Plan(RowPlan):
         """What was selected of which suite, as it stands among a run's settings; no part of its identity."""
         suite = self.suite
         return {
-            "suite": {"identity": suite.identity, "content_sha256": suite.content_sha256},
+            "suite": {
+                "identity": suite.identity,
+                "content_sha256": suite.content_sha256,
+                "seed_text": suite.seed_text,
+            },
             "categories": list(suite.categories),
             "items": len(suite.items),
             **({} if self.wordings is None else {"wordings": self.wordings}),

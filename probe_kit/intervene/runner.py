@@ -96,7 +96,7 @@ def _execute(
     outcomes = outcomes_of(run, [condition.name for condition in conditions], parts)
     further = intervention.extra_files(run, conditions, parts)
     measurement = Measurement(
-        outcomes, run.suite, settings, certificate, further.__getitem__, tiles_apart=tiles_apart(run)
+        outcomes, run.seed_text, settings, certificate, further.__getitem__, tiles_apart=tiles_apart(run)
     )
     effects = effects_csv(measurement)
     save(run.location, settings, key, outcomes, effects, certificate, further)

@@ -322,16 +322,16 @@ def retention_table(
 
 
 def _rescored(
-    results: Mapping[str, ProbeResults], iterations: Iterations, one: RowWithEstimates, suite: str
+    results: Mapping[str, ProbeResults], iterations: Iterations, one: RowWithEstimates, seed_text: str
 ) -> StreamScores | None:
     """A row's scores on the halvings of its groups in another suite, which items in common may come from.
 
-    The scores stay those of the row; only what is measured on halvings, the covariance, is that of `suite`.
+    The scores stay those of the row; only what is measured on halvings, the covariance, is that of `seed_text`.
     """
     own, row = one.estimates.streams, one.row
     if own is None or row.view is None:
         return None
-    found = curve_scores(results[row.run.location].curves[row.category, row.view], iterations, suite)
+    found = curve_scores(results[row.run.location].curves[row.category, row.view], iterations, seed_text)
     if found is None:
         return None
     return replace(own, fit=replace(own.fit, differences=found.fit.differences, seed=found.fit.seed))

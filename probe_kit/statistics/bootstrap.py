@@ -137,12 +137,13 @@ def _commonest(each: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
     return least, largest
 
 
-def units_seed(names: ArrayLike, suite: str) -> int:
+def units_seed(names: ArrayLike, seed_text: str) -> int:
     """The seed by which groups or items of these names are drawn, wherever an interval is made of them.
 
+    seed_text: of the suite whose groups they are, see `suite.Suite.seed_text`.
     One number then has one interval, in whatever table it stands; and runs on the same units are paired.
     """
-    return derive_seed("units", 0, suite, *np.unique(np.asarray(names)).tolist())
+    return derive_seed("units", 0, seed_text, *np.unique(np.asarray(names)).tolist())
 
 
 @lru_cache(maxsize=4)  # of one table: its groups and items, drawn for every number alike

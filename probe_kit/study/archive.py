@@ -20,12 +20,13 @@ import tempfile
 import zlib
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, Final, Literal, Self
 from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile, ZipInfo
 
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
+from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import DiskSpaceError, RunDamagedError, UsageError
 
@@ -34,10 +35,14 @@ RUNS, TABLES = "runs", "tables"
 SCHEMA: Final = 2
 MOST_FILES, MOST_BYTES, MOST_RECORD_BYTES = 1_000_000, 256 << 30, 64 << 20
 """Bounds of an archive: its files, their bytes together, and the bytes of `pack.json` and `SHA256SUMS`."""
+MOST_NAME_BYTES = 255
+"""Of a name with its folders, which any file system takes below a folder of one's own."""
 MOST_EXPANSION, FREE_EXPANSION = 200, 64 << 20
 """Bytes that a byte of a zip file may unpack to, and bytes that are free of this bound. JSON gives 10 to 30."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 _RESTORE = "Fetch the archive again, or make it anew with `probe-kit study pack`"
+_DEVICE = re.compile(r"(aux|con|nul|prn|(com|lpt)[0-9¹²³]) *(\..*)?", re.IGNORECASE)
+"""A name that Windows gives to a device, whatever its ending is."""
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
 
@@ -157,16 +162,23 @@ def _unpack(archive: ZipFile, file: Path, folder: Path) -> None:
         )
     for member in members:
         target = folder / member.filename
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with archive.open(member) as source, target.open("xb") as unpacked_file:
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            unpacked_file = target.open("xb")
+        except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
+            raise RunDamagedError(
+                f"{file} has {member.filename!r}, and a file and a folder of one name. {_RESTORE}"
+            ) from error
+        with archive.open(member) as source, unpacked_file:
             shutil.copyfileobj(source, unpacked_file)  # zipfile ends at the size that the member declares
 
 
 def _check_name(name: str, where: str) -> None:
-    """Raise RunDamagedError for a name that is not the plain name of a file below a folder."""
+    """Raise RunDamagedError for a name that is not the plain name of a file below a folder, on any system."""
     path = PurePosixPath(name)
     plain = path.as_posix() == name and not path.is_absolute() and ".." not in path.parts and "\\" not in name
-    if not plain or not name.isprintable():
+    of_windows = PureWindowsPath(name).drive or any(_DEVICE.fullmatch(part) for part in path.parts)
+    if not plain or of_windows or not name.isprintable() or len(name.encode()) > MOST_NAME_BYTES:
         raise RunDamagedError(f"{where} names {name!r}, which is no file below its folder. {_RESTORE}")
 
 
@@ -180,9 +192,12 @@ def _check_sizes(files: int, size: int, where: str) -> None:
 
 def _read_bounded(file: Path) -> bytes:
     """The bytes of `pack.json` or of the sums. Raises RunDamagedError for more than such a file has."""
-    if (size := file.stat().st_size) > MOST_RECORD_BYTES:
-        raise RunDamagedError(f"{file} has {size:,} bytes; expected at most {MOST_RECORD_BYTES:,}. {_RESTORE}")
-    return file.read_bytes()
+    try:
+        return read_regular(file, MOST_RECORD_BYTES)
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise RunDamagedError(f"{file}: {error.strerror}. {_RESTORE}") from error
 
 
 def write_zip(folder: Path, out: Path) -> None:
@@ -191,7 +206,9 @@ def write_zip(folder: Path, out: Path) -> None:
         for file in files_of(folder):
             info = ZipInfo(file.relative_to(folder).as_posix(), _DATE)
             info.compress_type, info.external_attr = ZIP_DEFLATED, (stat.S_IFREG | 0o644) << 16
-            archive.writestr(info, file.read_bytes())
+            info.file_size = file.stat().st_size  # by which zipfile decides whether sizes take 64 bits
+            with file.open("rb") as source, archive.open(info, "w") as member:
+                shutil.copyfileobj(source, member)
 
 
 def files_of(folder: Path) -> Iterator[Path]:

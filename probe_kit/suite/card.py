@@ -8,7 +8,7 @@ import numpy as np
 import PIL
 from PIL import features
 
-from probe_kit.suite.items import Item
+from probe_kit.suite.items import SCHEMA_VERSION, Item
 from probe_kit.suite.suite import Suite, content_sha256, count_by_category, missing_categories
 from probe_kit.version import __version__
 
@@ -27,7 +27,7 @@ def new_suite(
     card = {
         "name": name,
         "version": version,
-        "schema_version": "1.0",
+        "schema_version": SCHEMA_VERSION,
         "tool": {"probe_kit": __version__},
         "options": dict(options),
         "counts": count_by_category(items),
@@ -37,7 +37,7 @@ def new_suite(
         "licenses": sorted({item.license for item in items}),
         "contains_real_faces": any(item.contains_real_face for item in items),
         "environment": drawing_libraries(),
-        "content_sha256": content_sha256(items),
+        "content_sha256": content_sha256(items, name, version, SCHEMA_VERSION),
         **(extra or {}),
     }
     return Suite(name, version, items, Path(), card)

@@ -9,9 +9,11 @@ from probe_kit.hashing import sha256_json
 Side = Literal["left", "right"]
 Layout = Literal["original", "swapped"]
 LAYOUTS: tuple[Layout, Layout] = ("original", "swapped")
-# What makes two items, and so two suites, the same: what is asked, what is seen, and what belongs together. File
-# names, encoders and licences may differ.
-_CONTENT = (
+SCHEMA_VERSION = "1.0"
+"""Format of the suites that are written."""
+# What is asked, what the pictures show, and which items are drawn together. Random draws are seeded with these
+# fields, so a field that is added here moves intervals and Monte-Carlo p values: it belongs in _CONTENT instead.
+_QUESTION = (
     "item_id",
     "category",
     "instruction",
@@ -24,6 +26,8 @@ _CONTENT = (
     "distractor_concept",
     "group_id",
 )
+# What makes two items, and so two suites, the same. File names, encoders and licences may differ.
+_CONTENT = (*_QUESTION, "pair_id", "schema_version")
 
 
 def other_side(side: Side) -> Side:
@@ -72,10 +76,15 @@ class Item:
     split: str
     source: dict[str, Any]
     gen: dict[str, Any]
-    schema_version: str = "1.0"
+    schema_version: str = SCHEMA_VERSION
     side_word: bool = False
     wordings: dict[str, str] = field(default_factory=dict)
     folder: Path = field(default=Path(), compare=False)
+
+    @property
+    def question(self) -> dict[str, str]:
+        """The words, pictures, side and group of this item, by name: what `Suite.seed_text` is made of."""
+        return {name: getattr(self, name) for name in _QUESTION}
 
     @property
     def content(self) -> dict[str, str]:
@@ -84,7 +93,7 @@ class Item:
 
     @property
     def content_sha256(self) -> str:
-        """Hex sha256 of `content`: items with equal hashes ask and show the same."""
+        """Hex sha256 of `content`: items with equal hashes ask and show the same, and have the same twin."""
         return sha256_json(self.content)
 
     def file_name(self, side: Side) -> str:

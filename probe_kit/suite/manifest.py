@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from probe_kit._system.bounded_files import MOST_BYTES
+from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.csv_text import csv_of_rows
 from probe_kit._system.drafts import draft_of
 from probe_kit.errors import SuiteError, UsageError
@@ -170,9 +170,10 @@ def _read_card(folder: Path) -> dict[str, Any] | list[Finding]:
     path = folder / CARD
     if not path.is_file():
         raise UsageError(f"{folder} is not a suite: it holds no {CARD}. Name the folder a suite was written to.")
-    if (size := path.stat().st_size) > MOST_BYTES:
-        return [error("E01", CARD, f"has {size / 1e6:,.0f} MB; expected at most {MOST_BYTES / 1e6:,.0f}")]
-    card = parse_line(path.read_bytes(), CARD)
+    try:
+        card = parse_line(read_regular(path), CARD)
+    except OSError as problem:
+        return [error("E01", CARD, str(problem.strerror))]
     if isinstance(card, Finding):
         return [card]
     return list(check_schema(card, CARD)) or list(check_card(card)) or card
@@ -182,11 +183,13 @@ def _read_items(folder: Path) -> tuple[tuple[Item, ...], list[Finding]]:
     path = folder / METADATA
     if not path.is_file():
         return (), [error("E01", METADATA, "the file is missing")]
-    if (size := path.stat().st_size) > MOST_BYTES:
-        return (), [error("E01", METADATA, f"has {size / 1e6:,.0f} MB; expected at most {MOST_BYTES / 1e6:,.0f}")]
+    try:
+        lines = read_regular(path).splitlines()
+    except OSError as problem:
+        return (), [error("E01", METADATA, str(problem.strerror))]
     items, findings = [], []
     lines_of: dict[str, list[int]] = {}
-    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
+    for number, line in enumerate(lines, start=1):
         where = f"{METADATA}:{number}"
         if number > MOST_ITEMS:
             findings.append(error("E01", where, f"more than {MOST_ITEMS:,} items; split the suite"))

@@ -10,13 +10,29 @@ from typing import Any
 from probe_kit.errors import UsageError
 from probe_kit.hashing import canonical_json, sha256_text
 from probe_kit.suite.categories import CATEGORIES, check_categories, in_order
-from probe_kit.suite.items import LAYOUTS, Episode, Item
+from probe_kit.suite.items import LAYOUTS, SCHEMA_VERSION, Episode, Item
 
 
-def content_sha256(items: Iterable[Item]) -> str:
-    """Hex sha256 over the meaning of the items, whatever their order."""
-    ordered = sorted(items, key=lambda item: item.item_id)
-    return sha256_text("\n".join(canonical_json(item.content) for item in ordered))
+def content_sha256(items: Iterable[Item], name: str, version: str, schema_version: str) -> str:
+    """Hex sha256 of a suite's identity: name, version, format, and the content of its items in any order.
+
+    Suites are compared by this hash. Seeds come from `questions_sha256`, which pairs and versions leave alone.
+    """
+    head = {"name": name, "version": version, "schema_version": schema_version}
+    return _sha256_of_lines([head, *(item.content for item in _by_id(items))])
+
+
+def questions_sha256(items: Iterable[Item]) -> str:
+    """Hex sha256 of what the items ask and show, and of their groups, in any order. Seeds are made of it."""
+    return _sha256_of_lines(item.question for item in _by_id(items))
+
+
+def _by_id(items: Iterable[Item]) -> list[Item]:
+    return sorted(items, key=lambda item: item.item_id)
+
+
+def _sha256_of_lines(records: Iterable[dict[str, str]]) -> str:
+    return sha256_text("\n".join(map(canonical_json, records)))
 
 
 def count_by_category(items: Iterable[Item]) -> dict[str, int]:
@@ -56,13 +72,35 @@ class Suite:
 
     @cached_property
     def content_sha256(self) -> str:
-        """Hex sha256 over the meaning of the items."""
-        return content_sha256(self.items)
+        """Hex sha256 of the suite's identity, see `content_sha256`."""
+        return self.content_sha256_of(self.items)
+
+    def content_sha256_of(self, items: Iterable[Item]) -> str:
+        """Hex sha256 that this suite had with other items, such as some of its own."""
+        return content_sha256(items, self.name, self.version, self.schema_version)
+
+    @cached_property
+    def questions_sha256(self) -> str:
+        """Hex sha256 of what the items ask and show, see `questions_sha256`."""
+        return questions_sha256(self.items)
+
+    @property
+    def schema_version(self) -> str:
+        """Version of the format that `suite.json` names."""
+        return str(self.card.get("schema_version", SCHEMA_VERSION))
 
     @property
     def identity(self) -> str:
         """`name@version#first12`, as results name the suite they were made with."""
         return f"{self.name}@{self.version}#{self.content_sha256[:12]}"
+
+    @property
+    def seed_text(self) -> str:
+        """`name@version#first12` of the questions: what intervals and p values of the suite are seeded with.
+
+        Two suites of one name and version that differ in pairs alone give the same draws.
+        """
+        return f"{self.name}@{self.version}#{self.questions_sha256[:12]}"
 
     @property
     def parent(self) -> str | None:
@@ -100,7 +138,7 @@ class Suite:
             "parent": self.content_sha256,
             "counts": count_by_category(items),
             "missing": missing_categories(items),
-            "content_sha256": content_sha256(items),
+            "content_sha256": self.content_sha256_of(items),
         }
         return Suite(self.name, self.version, items, self.folder, card, selected_from=self)
 

@@ -15,7 +15,7 @@ from probe_kit.train.choices import Baseline, Incomplete, LabelControl, Target
 from probe_kit.train.controls.fit_controls import add_baselines, add_untrained, check_untrained, prepare_baselines
 from probe_kit.train.crossval.category_problem import POOLED, CategoryProblem, category_problem
 from probe_kit.train.data.captured_call import restrict_to_call
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
 from probe_kit.train.data.samples import is_token_view, read_samples, sites_of
 from probe_kit.train.execution.dispatch import probe_columns
 from probe_kit.train.execution.executor import ExecutionSettings, Key, Probed
@@ -303,6 +303,7 @@ def _settings(
         random_weights=run.random_weights,
         weights=run.weights_sha256,
         suite=run.suite,
+        seed_text=seed_text_of(run),
         run_settings=run.settings_sha256,
         episodes=episodes_sha256(run),
         categories=tuple(categories),

@@ -8,18 +8,22 @@ from probe_kit.hashing import sha256_json
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import Incomplete, Target
 
-LABEL_FORMAT = "labels-1"  # of probes of a label of one's own, which are stored beside the others
-FORMAT = 4  # raise when settings have other fields or would give other numbers
+LABEL_FORMAT = "labels-2"  # of probes of a label of one's own, which are stored beside the others
+FORMAT = 5  # raise when settings have other fields or would give other numbers
 
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """Everything that decides the numbers; its hash is the results' key."""
+    """Everything that decides the numbers; its hash is the results' key.
+
+    seed_text: of the run, see `seed_text_of`; intervals are drawn by it.
+    """
 
     model: str
     random_weights: bool
     weights: str | None
     suite: str
+    seed_text: str
     run_settings: str
     episodes: str  # sha256 of the episode ids, so that a run that grew is probed again
     categories: tuple[str, ...]

@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
+from probe_kit._system.bounded_files import open_regular
 from probe_kit._system.drafts import draft_of
 from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.extract import Run
@@ -54,9 +55,14 @@ def _check_folder(folder: Path) -> None:
         raise UsageError(f"{folder} is a file; give a folder")
     names = sorted(entry.name for entry in folder.iterdir())
     readme = folder / "README"
-    ours = readme.is_file() and readme.read_text(encoding="utf-8", errors="replace").startswith(_MARK)
+    ours = readme.is_file() and _is_marked(readme)
     if names and not (ours and set(names) <= {"README", "app", "data", "index.html"}):
         raise UsageError(f"{folder} holds {names[0]} and is no former export. Give an empty or a new folder")
+
+
+def _is_marked(readme: Path) -> bool:
+    with open_regular(readme) as file:
+        return file.read(len(_MARK.encode())) == _MARK.encode()
 
 
 def _write(catalogue: Catalogue, folder: Path, frames: bool, categories: Collection[str] | None) -> None:

@@ -44,6 +44,7 @@ from probe_kit.retention.estimators.by_call import CallCurves
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.results.by_call import load_results_by_call
+from tests.support.little_run import suite_record
 
 STREAM = StoredStream("backbone", 2, 8, None, 6, ("mean", "last", "mean:language"))
 CALLS = 3
@@ -64,7 +65,7 @@ def write_run(where: Path, suite: Suite, later_views: LaterViews = "all") -> Run
     settings = {
         "captured_calls": CALLS, "tokens": "all" if with_tokens else "pooled", "codec": "zstd",
         "model": "synthetic", "random_weights": False, "weights_sha256": None,
-        "suite": {"identity": suite.identity}, **({} if with_tokens else {"later_views": later_views}),
+        "suite": suite_record(suite), **({} if with_tokens else {"later_views": later_views}),
     }  # fmt: skip
     plan = make_plan(suite, [STREAM], 0, CALLS, with_tokens, later_views=later_views)
     writer = RunWriter(locate(where), plan, settings)
@@ -280,7 +281,7 @@ def early(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """
     settings = {
         "captured_calls": 6, "tokens": "pooled", "codec": "zstd", "model": "synthetic", "random_weights": False,
-        "weights_sha256": None, "suite": {"identity": small_suite.identity},
+        "weights_sha256": None, "suite": suite_record(small_suite),
     }  # fmt: skip
     plan = make_plan(small_suite, [STREAM], 0, 6, False)
     writer = RunWriter(locate(tmp_path_factory.mktemp("early") / "run"), plan, settings)

@@ -57,7 +57,7 @@ def habit(episodes: int) -> tuple[Cell, Cell]:
 
 def store_outcomes(
     location: Location,
-    suite: str,
+    seed_text: str,
     settings: Mapping[str, Any],
     outcomes: ConditionOutcomes,
     certificate: Mapping[str, Any] | None = None,
@@ -66,6 +66,6 @@ def store_outcomes(
     """Stored as if they had been measured, with the effects of their kind; gives the key."""
     check = {"replay": {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}}
     said, files, key = certificate or check, further or {}, key_of(settings)
-    effects = effects_csv(Measurement(outcomes, suite, settings, said, files.__getitem__))
+    effects = effects_csv(Measurement(outcomes, seed_text, settings, said, files.__getitem__))
     save(location, settings, key, outcomes, effects, said, files)
     return key

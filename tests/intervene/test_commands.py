@@ -23,7 +23,7 @@ def run(recorded_run: Run, tmp_path: Path) -> Run:
     outcomes = outcomes_of({"color": follower(24), "shape": habit(24)})
     settings = settings_of(ImageSwap(), copy)
     certificate = {"replay": {"episodes": 48, "compared": 48, "equal": 47, "largest_difference": 1e-7}}
-    store_outcomes(copy.location, copy.suite, settings, outcomes, certificate)
+    store_outcomes(copy.location, copy.seed_text, settings, outcomes, certificate)
     return copy
 
 

@@ -102,7 +102,8 @@ def probes(
             null=np.tile(np.linspace(1 - null_top, null_top, 99), (len(shares), 1)),
         )
     settings = ProbeSettings(
-        model=run.model, random_weights=False, weights=None, suite=run.suite, run_settings=run.settings_sha256,
+        model=run.model, random_weights=False, weights=None, suite=run.suite, seed_text=run.suite,
+        run_settings=run.settings_sha256,
         episodes=episodes_sha256(run), categories=tuple(accuracies), views=("mean",), target="correct",
         permutations=99, seed=0,
     )  # fmt: skip

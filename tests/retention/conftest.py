@@ -110,6 +110,7 @@ def runs_in(folder: Path) -> Callable[..., ArrayRun]:
             random_weights=random_weights,
             weights=None,
             suite=suite,
+            seed_text=suite,
             run_settings=run.settings_sha256,
             episodes=episodes_sha256(run),
             categories=tuple(accuracies),

@@ -134,12 +134,12 @@ def test_equal_runs_differ_by_nothing_and_not_surely_so(table: RetentionTable) -
 def test_one_number_has_one_interval_in_rows_curves_and_scores(table: RetentionTable) -> None:
     for row in table.rows:
         curve = table.results[row.run.location].curves[row.category, "mean"]
-        streams = curve_scores(curve, suite=row.run.suite)
+        streams = curve_scores(curve, seed_text=row.run.suite)
         assert streams is not None
         for name, part in (("backbone", row.backbone), ("action", row.action)):
             assert part.score == streams.accuracy(name)
             assert part.ci == limits(streams.interval(name))
-        again = measure_retention(curve, suite=row.run.suite)
+        again = measure_retention(curve, seed_text=row.run.suite)
         assert again is not None
         value = None if isnan(again.value) else again.value
         assert (row.retention.value, row.retention.ci) == (value, limits(again.interval))
@@ -203,7 +203,7 @@ def test_a_mean_is_as_wide_as_its_only_category_and_else_as_its_parts_together(t
 
 
 def scores_of(table: RetentionTable, row: RetentionRow) -> Scores:
-    found = curve_scores(table.results[row.run.location].curves[row.category, "mean"], suite=row.run.suite)
+    found = curve_scores(table.results[row.run.location].curves[row.category, "mean"], seed_text=row.run.suite)
     assert found is not None
     return found.scores
 
@@ -327,7 +327,8 @@ def test_four_groups_that_all_agree_are_too_few_for_a_ratio_and_so_is_every_diff
 ) -> None:
     """Not the mean with a category of many groups: its backbone is known well enough to divide by."""
     few, many = (
-        curve_scores(curve_of(outcome_table(2 * items, 0, 0), [1.0], [[1.0]]), suite="suite") for items in (4, 60)
+        curve_scores(curve_of(outcome_table(2 * items, 0, 0), [1.0], [[1.0]]), seed_text="suite")
+        for items in (4, 60)
     )
     assert few is not None
     assert many is not None

@@ -52,7 +52,7 @@ def test_possible_flips_are_those_that_are_made(groups: int) -> None:
 @pytest.mark.parametrize("groups", range(3, 9))
 def test_train_refuses_and_warns_where_the_plan_says_so(groups: int) -> None:
     settings = ProbeSettings(
-        model="little", random_weights=True, weights=None, suite="", run_settings="", episodes="",
+        model="little", random_weights=True, weights=None, suite="", seed_text="", run_settings="", episodes="",
         categories=("color",), views=("mean",), target="correct", permutations=1000, seed=0,
     )  # fmt: skip
     with warnings.catch_warnings(record=True) as said:

@@ -113,9 +113,7 @@ def test_a_suite_with_wordings_that_mean_nothing_is_refused(wordings, suite):
 
 
 def test_wordings_change_no_suites_identity(suite):
-    from probe_kit.suite.suite import content_sha256
-
-    assert content_sha256(replace(item, wordings={}) for item in suite.items) == suite.content_sha256
+    assert suite.content_sha256_of(replace(item, wordings={}) for item in suite.items) == suite.content_sha256
 
 
 def test_no_plainer_words_name_a_side_though_a_right_triangle_is_drawn(tmp_path):

@@ -6,11 +6,12 @@ import pytest
 
 from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.suite import Suite
-from probe_kit.suite.suite import content_sha256
+from probe_kit.suite.suite import questions_sha256
 
 
 def test_the_hash_does_not_depend_on_the_order_of_the_items(small_suite: Suite) -> None:
-    assert content_sha256(reversed(small_suite.items)) == small_suite.content_sha256
+    assert small_suite.content_sha256_of(reversed(small_suite.items)) == small_suite.content_sha256
+    assert questions_sha256(reversed(small_suite.items)) == small_suite.questions_sha256
 
 
 @pytest.mark.parametrize(
@@ -28,7 +29,7 @@ def test_the_hash_does_not_depend_on_the_order_of_the_items(small_suite: Suite) 
 def test_files_licences_and_places_do_not_enter_the_hash(small_suite: Suite, field: str, value: object) -> None:
     first, *others = small_suite.items
     changed = replace(first, **{field: value})
-    assert content_sha256([changed, *others]) == small_suite.content_sha256
+    assert small_suite.content_sha256_of([changed, *others]) == small_suite.content_sha256
 
 
 @pytest.mark.parametrize(
@@ -50,11 +51,31 @@ def test_files_licences_and_places_do_not_enter_the_hash(small_suite: Suite, fie
 def test_whatever_changes_the_question_changes_the_hash(small_suite: Suite, field: str) -> None:
     first, *others = small_suite.items
     changed = replace(first, **{field: getattr(first, field) + "!"})
-    assert content_sha256([changed, *others]) != small_suite.content_sha256
+    assert small_suite.content_sha256_of([changed, *others]) != small_suite.content_sha256
+    assert questions_sha256([changed, *others]) != small_suite.questions_sha256
+
+
+@pytest.mark.parametrize("field", ["pair_id", "schema_version"])
+def test_other_twins_or_another_format_change_the_hash_and_no_seed(small_suite: Suite, field: str) -> None:
+    """Intervals and p values are drawn by the questions; suites are told apart by all that a run depends on."""
+    first, *others = small_suite.items
+    changed = replace(small_suite, items=(replace(first, **{field: getattr(first, field) + "!"}), *others))
+    assert changed.content_sha256 != small_suite.content_sha256
+    assert changed.items[0].content_sha256 != first.content_sha256
+    assert changed.seed_text == small_suite.seed_text
+
+
+@pytest.mark.parametrize("field", ["name", "version", "schema_version"])
+def test_name_version_and_format_of_a_suite_stand_in_its_hash(small_suite: Suite, field: str) -> None:
+    own = {field: "1.7"} if field != "schema_version" else {"card": small_suite.card | {field: "1.7"}}
+    changed = replace(small_suite, **own)  # type: ignore[arg-type]
+    assert changed.content_sha256 != small_suite.content_sha256
+    assert changed.questions_sha256 == small_suite.questions_sha256
 
 
 def test_identity_names_the_suite_its_version_and_its_content(small_suite: Suite) -> None:
     assert small_suite.identity == f"a2a-embedded@2.0.0#{small_suite.content_sha256[:12]}"
+    assert small_suite.seed_text == f"a2a-embedded@2.0.0#{small_suite.questions_sha256[:12]}"
 
 
 def test_categories_come_in_the_order_of_the_paper_whatever_the_order_of_the_items(small_suite: Suite) -> None:

@@ -41,7 +41,7 @@ def label_results(
         np.ones((len(sites), 5)),
     )  # fmt: skip
     settings = LabelSettings(
-        "made", False, None, suite, "0" * 64, "0" * 64, (), ("mean",), "drawer", task,  # type: ignore[arg-type]
+        "made", False, None, suite, suite, "0" * 64, "0" * 64, (), ("mean",), "drawer", task,  # type: ignore[arg-type]
         "1" * 64, "group_id", "all", "2" * 64, window, 0, permutations, 0,
     )  # fmt: skip
     names = np.repeat([f"group-{number:03d}" for number in range(groups)], each)

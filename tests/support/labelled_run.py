@@ -36,7 +36,7 @@ def write_labelled_run(where: Path | str, suite: Suite, seed: int = 0, weights: 
         "tokens": "pooled",
         "codec": "zstd",
         "seed": seed,
-        "suite": {"identity": "labelled@1#0123456789ab"},
+        "suite": {"identity": "labelled@1#0123456789ab", "seed_text": "labelled@1#0123456789ab"},
         "scene": SceneSpec(max_steps=STEPS).to_json(),
     }
     writer = RunWriter(locate(where), plan, settings)

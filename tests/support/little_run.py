@@ -39,6 +39,12 @@ def little_plan(suite: Suite, seed: int = 0, episodes: int | None = None) -> Pla
     return replace(plan, episodes=plan.episodes[:episodes])
 
 
+def suite_record(suite: Suite) -> dict[str, str]:
+    """The part of a run's settings that names its suite."""
+    record: dict[str, str] = little_plan(suite).selection["suite"]
+    return record
+
+
 def little_settings(seed: int = 0, codec: str = "zstd") -> dict[str, Any]:
     return {
         "model": "little",
@@ -48,7 +54,7 @@ def little_settings(seed: int = 0, codec: str = "zstd") -> dict[str, Any]:
         "tokens": "all",
         "codec": codec,
         "seed": seed,
-        "suite": {"identity": "little@1#0123456789ab"},
+        "suite": {"identity": "little@1#0123456789ab", "seed_text": "little@1#0123456789ab"},
         "scene": SceneSpec(max_steps=STEPS).to_json(),
     }
 

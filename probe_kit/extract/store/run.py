@@ -206,6 +206,14 @@ class Run:
             return f"{self.settings['played']['name']}@{self.settings[ENVIRONMENT]['revision']}"
         return str(self.settings["suite"]["identity"])
 
+    @property
+    def seed_text(self) -> str:
+        """The text that random draws over the run's items are seeded with; see `suite.Suite.seed_text`.
+
+        Runs that show no suite have `suite` here.
+        """
+        return str(self.settings["suite"]["seed_text"]) if "suite" in self.settings else self.suite
+
     @cached_property
     def inputs(self) -> StoredInputs | None:
         """State, actions and small pictures of every shown frame; None for a run of scenes.

@@ -51,11 +51,12 @@ class CategoryVerdict(Protocol):
 class Measurement:
     """What effects are computed from.
 
-    read: a further stored file by its name. tiles_apart: metres between the tiles of the run's scene.
+    seed_text: of the run, by which random draws are made. read: a further stored file by its name.
+    tiles_apart: metres between the tiles of the run's scene.
     """
 
     outcomes: ConditionOutcomes
-    suite: str
+    seed_text: str
     settings: Mapping[str, Any]
     certificate: Mapping[str, Any]
     read: Callable[[str], bytes]
@@ -187,14 +188,14 @@ def test_against_controls(
     values: Values,
     names: Sequence[ConditionName],
     outcomes: ConditionOutcomes,
-    suite: str,
+    seed_text: str,
     untested: Collection[int],
     no_controls: Collection[int],
 ) -> list[ControlTest]:
     """Every condition that is no control against its own controls, in the order of the conditions.
 
-    values: (K, E) what is tested to be above zero. outcomes: of one category. suite: its identity, of which sign
-    flips are drawn. untested: further rows that are not tested. no_controls: rows that are no controls.
+    values: (K, E) what is tested to be above zero. outcomes: of one category. seed_text: of the run, by which
+    sign flips are drawn. untested: further rows that are not tested. no_controls: rows that are no controls.
     """
     controls = [
         [at for at, other in enumerate(names) if other.is_control_of(name) and at not in no_controls]
@@ -207,7 +208,7 @@ def test_against_controls(
     beyond = np.array(
         [values[at] - values[controls[at]].mean(axis=0) if controls[at] else values[at] for at in tested]
     )
-    seed = derive_seed("sign flips", suite, str(outcomes.categories[0]))
+    seed = derive_seed("sign flips", seed_text, str(outcomes.categories[0]))
     for at, own, *tests in zip(tested, beyond, *max_t(beyond, outcomes.items, outcomes.groups, seed), strict=True):
         found[at] = ControlTest(controls[at], own, *map(float, tests))
     return found

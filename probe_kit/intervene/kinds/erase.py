@@ -315,17 +315,17 @@ class ErasureEffect(EffectRow):
 def measured_erasure(measurement: Measurement) -> list[ErasureEffect]:
     """The effects of a stored erasure."""
     read = measurement.certificate.get(PROBE_ACCURACY, {})
-    return erasure_effects(measurement.outcomes, measurement.suite, measurement.key, read)
+    return erasure_effects(measurement.outcomes, measurement.seed_text, measurement.key, read)
 
 
 def erasure_effects(
-    outcomes: ConditionOutcomes, suite: str, key: str = "", probe_accuracy: ProbeAccuracies = _NOTHING
+    outcomes: ConditionOutcomes, seed_text: str, key: str = "", probe_accuracy: ProbeAccuracies = _NOTHING
 ) -> list[ErasureEffect]:
     """One per category and condition. probe_accuracy: as a certificate has it."""
     return [
         row
         for category, own in outcomes.by_category()
-        for row in _of_category(own, category, suite, key, probe_accuracy)
+        for row in _of_category(own, category, seed_text, key, probe_accuracy)
     ]
 
 
@@ -345,7 +345,7 @@ def erasure_notes(rows: Sequence[ErasureEffect], _: Measurement) -> list[str]:
 
 
 def _of_category(
-    outcomes: ConditionOutcomes, category: str, suite: str, key: str, probe_accuracy: ProbeAccuracies
+    outcomes: ConditionOutcomes, category: str, seed_text: str, key: str, probe_accuracy: ProbeAccuracies
 ) -> list[ErasureEffect]:
     sign = outcomes.correct_sign
     clean = sign * outcomes.of(CLEAN)
@@ -354,7 +354,7 @@ def _of_category(
     values = np.array([sign * outcomes.of(condition) for condition in conditions])
     away = clean - values
     untouched = [at for at, name in enumerate(names) if name.coefficient]
-    tests = test_against_controls(away, names, outcomes, suite, untouched, ())
+    tests = test_against_controls(away, names, outcomes, seed_text, untouched, ())
     goes_there = paired_greater_p(clean, outcomes.items, outcomes.groups) < SIGNIFICANCE
     kept = values.sum(axis=1) / clean.sum() if goes_there else None
     net = (clean > 0).astype(float) - (values > 0)
@@ -370,7 +370,7 @@ def _of_category(
                 right=float((values[at] > 0).mean()),
                 kept=None if kept is None else float(kept[at]),
                 net=float(net[at].mean()),
-                net_ci=net_interval(net[at], outcomes, suite),
+                net_ci=net_interval(net[at], outcomes, seed_text),
                 mean_displacement=float(away[at].mean()),
                 control_kept=_mean(kept, test.controls),
                 control_net=_mean(net.mean(axis=1), test.controls),

@@ -82,17 +82,17 @@ class PatchEffect(EffectRow):
 def measured_patches(measurement: Measurement) -> list[PatchEffect]:
     """The effects of an interchange or a steering."""
     target_side = str(measurement.settings.get("target_side", IMAGE_SWAP))
-    return patch_effects(measurement.outcomes, measurement.suite, target_side, measurement.key)
+    return patch_effects(measurement.outcomes, measurement.seed_text, target_side, measurement.key)
 
 
 def patch_effects(
-    outcomes: ConditionOutcomes, suite: str, target_side: str = IMAGE_SWAP, key: str = ""
+    outcomes: ConditionOutcomes, seed_text: str, target_side: str = IMAGE_SWAP, key: str = ""
 ) -> list[PatchEffect]:
     """One per category and edit. target_side: `image_swap`, or the side that is steered to, see `Steering`."""
     return [
         row
         for category, own in outcomes.by_category()
-        for row in _of_category(own, category, suite, target_side, key)
+        for row in _of_category(own, category, seed_text, target_side, key)
     ]
 
 
@@ -127,7 +127,7 @@ def target_sign(outcomes: ConditionOutcomes, target_side: str) -> NDArray[np.flo
 
 
 def _of_category(
-    outcomes: ConditionOutcomes, category: str, suite: str, target_side: str, key: str
+    outcomes: ConditionOutcomes, category: str, seed_text: str, target_side: str, key: str
 ) -> list[PatchEffect]:
     push, clean = target_sign(outcomes, target_side), outcomes.of(CLEAN)
     rows = [row for row, name in enumerate(outcomes.conditions) if name not in UNCHANGED]
@@ -136,11 +136,11 @@ def _of_category(
     names = [ConditionName.parse(outcomes.conditions[row]) for row in rows]
     displacements = push * (outcomes.displacement[rows] - clean)
     sign = swap_sign(outcomes) if target_side == IMAGE_SWAP else 1.0
-    tests = test_against_controls(sign * displacements, names, outcomes, suite, (), ())
+    tests = test_against_controls(sign * displacements, names, outcomes, seed_text, (), ())
     found = []
     for at, (row, name, test) in enumerate(zip(rows, names, tests, strict=True)):
         flips = _flips(push, clean, outcomes.displacement[row])
-        share = share_of_swap(outcomes, outcomes.displacement[row] - clean, suite)
+        share = share_of_swap(outcomes, outcomes.displacement[row] - clean, seed_text)
         columns: dict[str, Any] = common_columns(outcomes, row, name)
         found.append(
             PatchEffect(
@@ -150,7 +150,7 @@ def _of_category(
                 effect=None if share is None else share.value,
                 effect_ci=None if share is None else (share.low, share.high),
                 net=float(flips.mean()),
-                net_ci=net_interval(flips, outcomes, suite),
+                net_ci=net_interval(flips, outcomes, seed_text),
                 net_left=_mean(flips[push > 0]),
                 net_right=_mean(flips[push < 0]),
                 mean_displacement=float(displacements[at].mean()),

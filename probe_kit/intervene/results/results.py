@@ -25,7 +25,7 @@ from probe_kit.intervene.store.answers import ConditionOutcomes, StoredIntervent
 from probe_kit.intervene.store.settings import PER_STEP
 from probe_kit.statistics.sign_flips import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
 from probe_kit.train.results.store import load_results
 
 if TYPE_CHECKING:
@@ -41,12 +41,14 @@ _VERDICT_COLUMNS = ("verdict", "behaviour", "reversed", "reason", "place", "tie"
 class InterventionResult:
     """One intervention: its settings, what it gave, and what that means.
 
-    label: of the run. measurement: what effects are computed from. verdicts: by category, from this and what else
-    is stored with the run. layers: by category a line about the layer, of a kind that edits places.
+    label: of the run. suite: its identity. measurement: what effects are computed from. verdicts: by
+    category, from this and what else is stored with the run. layers: by category a line about the layer, of a kind
+    that edits places.
     """
 
     label: str
     random_weights: bool
+    suite: str
     measurement: Measurement = field(repr=False)
     verdicts: dict[str, UseVerdict] = field(default_factory=dict)
     layers: dict[str, str] = field(default_factory=dict)
@@ -55,11 +57,6 @@ class InterventionResult:
     def key(self) -> str:
         """Name of its folder."""
         return self.measurement.key
-
-    @property
-    def suite(self) -> str:
-        """Identity of the run's suite."""
-        return self.measurement.suite
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -205,10 +202,10 @@ def load_effects(run: RunReader, key: str | None = None, kind: str | None = None
 def effects_of(run: RunReader, stored: StoredIntervention) -> InterventionResult:
     """Read one stored intervention."""
     measurement = Measurement(
-        stored.outcomes(), run.suite, stored.settings, stored.certificate(), stored.bundle.read, stored.key,
-        tiles_apart(run),
+        stored.outcomes(), seed_text_of(run), stored.settings, stored.certificate(), stored.bundle.read,
+        stored.key, tiles_apart(run),
     )  # fmt: skip
-    found = InterventionResult(run.label, run.random_weights, measurement)
+    found = InterventionResult(run.label, run.random_weights, run.suite, measurement)
     shown = found.effects if kind_of(found.kind).has_verdict else ()
     found.verdicts.update(verdicts_of(run, shown))
     if kind_of(found.kind).asks_where:

@@ -14,7 +14,7 @@ from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.site_effects import PatchEffect, patch_effects
 from probe_kit.intervene.store.answers import IMAGE_SWAP
 from probe_kit.intervene.store.selection import PooledConditions, Rank, pool_conditions, stored_results
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
 
 BACKBONE = "backbone"
 WHOLE, USUAL, WRONG = "none", "mean-difference", "wrong"
@@ -41,7 +41,7 @@ def stored_steering(run: RunReader) -> dict[str, dict[str, list[PatchEffect]]]:
     (`backbone.02 image, probe, toward left`).
     """
     found: dict[str, dict[str, list[PatchEffect]]] = {}
-    for one, rows in _rows_of(_steering(run), run.suite):
+    for one, rows in _rows_of(_steering(run), seed_text_of(run)):
         found.setdefault(one.group.like.category, {})[_in_words(one)] = rows
     return found
 
@@ -163,21 +163,21 @@ def _by_place(group: PooledConditions) -> dict[tuple[str, str], tuple[str, ...]]
     return {cell: tuple(names) for cell, names in found.items()}
 
 
-def _rows_of(chosen: Sequence[_Selection], suite: str) -> Iterator[tuple[_Selection, list[PatchEffect]]]:
+def _rows_of(chosen: Sequence[_Selection], seed_text: str) -> Iterator[tuple[_Selection, list[PatchEffect]]]:
     """The numbers of each, tested against everything that its group tried in the same stream."""
     tested: dict[tuple[int, str], dict[str, PatchEffect]] = {}
     for one in chosen:
         stream = _stream(one.conditions[0])
         at = id(one.group), stream
         if at not in tested:
-            tested[at] = _test_together(one.group, stream, suite)
+            tested[at] = _test_together(one.group, stream, seed_text)
         yield one, [tested[at][name] for name in one.conditions]
 
 
-def _test_together(group: PooledConditions, stream: str, suite: str) -> dict[str, PatchEffect]:
+def _test_together(group: PooledConditions, stream: str, seed_text: str) -> dict[str, PatchEffect]:
     conditions = sorted(name for name in group.sources if _stream(name) == stream)
     target_side = str(group.like.stored.settings.get("target_side", IMAGE_SWAP))
-    rows = patch_effects(group.outcomes(conditions), suite, target_side)
+    rows = patch_effects(group.outcomes(conditions), seed_text, target_side)
     return {
         name: replace(row, key=group.sources[name].stored.key) for name, row in zip(conditions, rows, strict=True)
     }
@@ -185,7 +185,7 @@ def _test_together(group: PooledConditions, stream: str, suite: str) -> dict[str
 
 def _by_category(run: RunReader, chosen: Sequence[_Selection]) -> dict[str, list[PatchEffect]]:
     found: dict[str, list[PatchEffect]] = {}
-    for one, rows in _rows_of(chosen, run.suite):
+    for one, rows in _rows_of(chosen, seed_text_of(run)):
         found.setdefault(one.group.like.category, []).extend(rows)
     return found
 

@@ -136,14 +136,14 @@ def _correct(episodes: "pd.DataFrame") -> "pd.Series[float]":
     return episodes[[]].assign(correct=shares_of(episodes, "correct"))["correct"]
 
 
-def success_share(episodes: "pd.DataFrame", suite: str = "") -> Share:
-    """SR with groups of items as the unit; `suite` tells groups of several suites apart."""
-    return Share.of(shares_of(episodes, "correct"), group_names(episodes, suite))
+def success_share(episodes: "pd.DataFrame", seed_text: str = "") -> Share:
+    """SR with groups of items as the unit; the run's `seed_text` tells groups of several suites apart."""
+    return Share.of(shares_of(episodes, "correct"), group_names(episodes, seed_text))
 
 
-def group_names(episodes: "pd.DataFrame", suite: str) -> "NDArray[np.str_]":
-    """(E,) groups of items, named after their suite too."""
-    return np.char.add(f"{suite}/", units_of(episodes))
+def group_names(episodes: "pd.DataFrame", seed_text: str) -> "NDArray[np.str_]":
+    """(E,) groups of items, named after the questions of their suite too."""
+    return np.char.add(f"{seed_text}/", units_of(episodes))
 
 
 def success_rate(episodes: "pd.DataFrame") -> SuccessRate:

@@ -23,7 +23,7 @@ from probe_kit.retention.compare.differences import (
 )
 from probe_kit.retention.estimators.stream_scores import RowEstimates, StreamScores
 from probe_kit.retention.rows.build import RowWithEstimates
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
 
 
 @dataclass(frozen=True)
@@ -37,10 +37,10 @@ class PairedRuns:
 
 
 class Rescore(Protocol):
-    """Scores of a row's streams, on the halvings that groups of another suite's name have."""
+    """Scores of a row's streams, on the halvings that another suite's groups have."""
 
-    def __call__(self, one: RowWithEstimates, suite: str) -> StreamScores | None:
-        """The row's own scores with halvings of `suite`; None without probes."""
+    def __call__(self, one: RowWithEstimates, seed_text: str) -> StreamScores | None:
+        """The row's own scores with halvings by `seed_text`; None without probes."""
 
 
 def compare_runs(
@@ -77,7 +77,7 @@ def compare_runs(
             for run in (here, there)
         ]
         unpaired += _left_out(both, items)
-        pairs.append(_on_common_items((sides[0], sides[1]), items, here.suite, rescore))
+        pairs.append(_on_common_items((sides[0], sides[1]), items, [here, there], rescore))
     if not vlm_vla and chosen is None and len({ask_of(run) is None for run in runs}) == 2:
         unpaired.append("VLM runs and policy runs are not compared with each other here; --vlm-vla does that.")
     return PairedRuns(pair_differences(pairs), tuple(unpaired))
@@ -101,27 +101,32 @@ def compare_groups(
         items = {name: one for name, one in common_items(runs).items() if one.is_many}
         sides = [Side(name, [one for one in drawn if one.row.group == name]) for name in names]
         notes += _left_out(" and ".join(names), items)
-        pairs.append(_on_common_items((sides[0], sides[1]), items, runs[0].suite, rescore, others_too=True))
+        pairs.append(_on_common_items((sides[0], sides[1]), items, runs, rescore, others_too=True))
     return PairedRuns(pair_differences(pairs), tuple(notes))
 
 
 def _on_common_items(
     sides: tuple[Side, Side],
     items: Mapping[str, CommonItems],
-    suite: str,
+    runs: Sequence[RunReader],
     rescore: Rescore,
     others_too: bool = False,
 ) -> ComparedSides:
-    """Both sides on the same items, which are then of one name. others_too: keep categories without such items."""
+    """Both sides on the same items, with the draws of the first of `runs`.
+
+    others_too: keep categories without such items.
+    """
+    seed_texts = {_place(run): seed_text_of(run) for run in runs}
+    seed_text = seed_text_of(runs[0])
 
     def common(one: RowWithEstimates) -> RowWithEstimates:
         own = items.get(one.row.category)
-        if own is None or (own.whole and one.row.run.suite == suite):
+        if own is None or (own.whole and seed_texts[one.row.run.location] == seed_text):
             return one
         outcomes = None if one.outcomes is None else own.select(one.outcomes)
-        rates = {} if outcomes is None else {"sr": success_share(outcomes, suite)}
+        rates = {} if outcomes is None else {"sr": success_share(outcomes, seed_text)}
         return replace(
-            one, estimates=RowEstimates(rates, rescore(one, suite) if own.whole else None), outcomes=outcomes
+            one, estimates=RowEstimates(rates, rescore(one, seed_text) if own.whole else None), outcomes=outcomes
         )
 
     kept = {name for name, own in items.items() if own.n_items}

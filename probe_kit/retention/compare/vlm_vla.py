@@ -13,7 +13,7 @@ from probe_kit.retention.estimators.stream_scores import Limits, Rate, limits
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.statistics.multiple_testing import corrected
 from probe_kit.statistics.paired_tests import flip_p
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -120,10 +120,10 @@ def _compare(
     pair: _Episodes, runs: tuple[RunReader, RunReader], called: Mapping[str, str]
 ) -> tuple[VlmVlaDifference, Rate]:
     vlm, policy = runs
-    suites = vlm.suite, vlm.suite if pair.paired else policy.suite
+    seed_texts = seed_text_of(vlm), seed_text_of(vlm if pair.paired else policy)
     accuracy, sr = (
-        Rate.pooled([success_share(frame, suite)])
-        for frame, suite in zip((pair.here, pair.there), suites, strict=True)
+        Rate.pooled([success_share(frame, seed_text)])
+        for frame, seed_text in zip((pair.here, pair.there), seed_texts, strict=True)
     )
     gap = accuracy.minus(sr)
     row = VlmVlaDifference(

@@ -151,9 +151,9 @@ class CallCurves:
         return curve.parts[int(curve.stream(stream)[0])]
 
     def _accuracy(self, curve: ProbeCurve, stream: str) -> tuple[float, float, float]:
-        suite = next(iter(self.results.values())).settings.suite
+        seed_text = next(iter(self.results.values())).settings.seed_text
         try:
-            found = score_streams(curve, {stream: curve.stream(stream)}, suite)
+            found = score_streams(curve, {stream: curve.stream(stream)}, seed_text)
         except TooFewGroupsError:
             return float(curve.sums.only(curve.stream(stream)).accuracies.max()), np.nan, np.nan
         assert found is not None, "one stream was given"

@@ -103,24 +103,24 @@ def stream_peaks(curve: ProbeCurve, iterations: Iterations = "all") -> dict[str,
     return {name: peak for name, peak in found.items() if peak is not None}
 
 
-def curve_scores(curve: ProbeCurve, iterations: Iterations = "all", suite: str = "") -> StreamScores | None:
+def curve_scores(curve: ProbeCurve, iterations: Iterations = "all", seed_text: str = "") -> StreamScores | None:
     """Cross-fitted scores of the backbone and of the stream the action is made in, as far as they were probed.
 
     None with too few groups, or where a fold was trained on one side only: then no score is defined.
     """
     rows = {ACTION: _action_rows(curve, iterations), BACKBONE: curve.stream(BACKBONE)}
     try:
-        return score_streams(curve, {name: found for name, found in rows.items() if found.size}, suite)
+        return score_streams(curve, {name: found for name, found in rows.items() if found.size}, seed_text)
     except (TooFewGroupsError, UnbalancedEpisodesError):
         return None
 
 
 def measure_retention(
-    curve: ProbeCurve, iterations: Iterations = "all", suite: str = "", exceeds: Exceeds | None = None
+    curve: ProbeCurve, iterations: Iterations = "all", seed_text: str = "", exceeds: Exceeds | None = None
 ) -> Retention | None:
     """Retention of `curve`, or None if it lacks the backbone or the stream the action is made in.
 
-    suite: of the run; with the names of the groups it seeds the halvings, so that runs on the same groups are
+    seed_text: of the run; with the names of the groups it seeds the halvings, so that runs on the same groups are
     compared on the same halves. exceeds: what the backbone's best site is better than, as `Controls.exceeds` says;
     chance alone by default. Raises UsageError if the action's stream has no such iteration.
     """
@@ -129,7 +129,7 @@ def measure_retention(
         return None
     backbone = peaks[BACKBONE]
     exceeds = exceeds or Controls().exceeds("", "", str(backbone.site), backbone.p_fwe)
-    streams = curve_scores(curve, iterations, suite)
+    streams = curve_scores(curve, iterations, seed_text)
     found = estimate_retention(peaks, streams, exceeds)
     return Retention(backbone=backbone, action=peaks[ACTION], streams=streams, **vars(found))
 

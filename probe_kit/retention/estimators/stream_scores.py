@@ -57,7 +57,7 @@ class StreamScores:
         return float(self.fit.peaks[self.names.index(name)])
 
 
-def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], suite: str) -> StreamScores | None:
+def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], seed_text: str) -> StreamScores | None:
     """The scores of streams by their rows of a curve; None without any.
 
     Raises TooFewGroupsError for fewer than 4 groups, UnbalancedEpisodesError for a fold trained on one side only.
@@ -69,7 +69,7 @@ def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], suite
     for name, found in rows.items():
         sites = [curve.sites[row] for row in found]
         streams.append(Stream.of(own[name], [s.layer for s in sites], [s.iteration or 0 for s in sites]))
-    fit = crossfit(streams, units_seed(curve.groups, suite))
+    fit = crossfit(streams, units_seed(curve.groups, seed_text))
     return StreamScores(tuple(rows), fit, {name: at_most(part) for name, part in own.items()})
 
 

@@ -105,7 +105,7 @@ def measure_label_retention(
     curve = results.curves[view]
     rows = {ACTION: _rows(curve, ACTION, iterations), BACKBONE: _rows(curve, BACKBONE, "all")}
     above = [_above_chance(curve, found, results.groups) for found in rows.values()]
-    scores = Scores.of(crossfit(above, units_seed(results.groups, own.suite), chance=0.0))
+    scores = Scores.of(crossfit(above, units_seed(results.groups, own.seed_text), chance=0.0))
     action, backbone = (
         _peak(results, view, found, scores, place) for place, found in enumerate(rows.values())
     )  # fmt: skip

@@ -41,7 +41,7 @@ from probe_kit.retention.rows.parts import (
 )
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, verdict
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
 from probe_kit.train.results.control_scores import Controls, Exceeds, UntrainedScore, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
@@ -129,7 +129,7 @@ def _row(
         radii = settings.epsilons if settings.rule == DEFAULT_RULE else ()
         by_radius = {f"{radius:g}": rate for radius, rate in sensitivity(episodes, radii).items()}
         rules = replace(judged.part(episodes), sr_by_epsilon=by_radius)
-        estimates = RowEstimates({"sr": success_share(episodes, run.suite), **judged.shares(episodes)})
+        estimates = RowEstimates({"sr": success_share(episodes, seed_text_of(run)), **judged.shares(episodes)})
     row = RetentionRow(
         category=category,
         view=view,
@@ -153,7 +153,7 @@ def _with_probes(
     if row.view is None or curve is None:
         note = f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
         return replace(row, retention=RetentionPart(note=note)), None
-    streams = curve_scores(curve, settings.iterations, run.suite)
+    streams = curve_scores(curve, settings.iterations, seed_text_of(run))
     peaks = stream_peaks(curve, settings.iterations)
     exceeds = {
         name: results.controls.exceeds(row.category, row.view, str(peak.site), peak.p_fwe)

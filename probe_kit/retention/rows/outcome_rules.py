@@ -12,7 +12,7 @@ from probe_kit.retention.behaviour.success_rate import capture_only, group_names
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.stream_scores import Limits, limits
 from probe_kit.statistics.estimates.shares import Share
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -158,7 +158,7 @@ class RunUnderRule:
             return None
         counted = weights > 0
         right = np.divide(shares_of(episodes, "correct"), weights, out=np.zeros(weights.size), where=counted)
-        return Share.of(right.clip(0, 1), group_names(episodes, self.run.suite), weights)
+        return Share.of(right.clip(0, 1), group_names(episodes, seed_text_of(self.run)), weights)
 
 
 def _idle_side(idle: "pd.Series[str]", sides: "pd.Series[str]") -> str:

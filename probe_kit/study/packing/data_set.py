@@ -1,10 +1,12 @@
 """The data set of a study: a folder as the hub shows it, with card, episodes, tables, archive and sums."""
 
 import hashlib
+import shutil
 from collections.abc import Hashable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from probe_kit._system.bounded_files import read_regular, read_regular_text
 from probe_kit._system.drafts import draft_of, full_disk_in_words, move_draft
 from probe_kit._system.markdown_text import markdown_safe
 from probe_kit._system.optional_dependencies import require
@@ -73,8 +75,8 @@ def _write(study: LoadedStudy, folder: Path, partial: bool, licence: str | None)
     assert source is not None, "it was just written"
     (folder / TABLES).mkdir()
     for file in files_of(source / TABLES):
-        (folder / TABLES / file.name).write_bytes(file.read_bytes())
-    (folder / PACK_FILE).write_bytes((source / PACK_FILE).read_bytes())
+        shutil.copyfile(file, folder / TABLES / file.name)
+    shutil.copyfile(source / PACK_FILE, folder / PACK_FILE)
     (folder / CARD).write_text(_card(packed, pack, table, licence), encoding="utf-8")
     write_sums(folder)
     return pack
@@ -144,7 +146,7 @@ def _words(study: LoadedStudy, pack: Pack, episodes: int) -> Iterator[str]:
     for name in study.study.tables:
         if (record := study.archive and study.archive / TABLES / f"{name}.md") and record.is_file():
             yield ""
-            yield record.read_text(encoding="utf-8").rstrip()
+            yield read_regular_text(record).rstrip()
 
 
 def _dtype(kind: Any) -> str:
@@ -153,4 +155,4 @@ def _dtype(kind: Any) -> str:
 
 def data_set_version(folder: Path) -> str:
     """What names the content of a data set: the beginning of the hash of its sums."""
-    return hashlib.sha256((folder / SUMS_FILE).read_bytes()).hexdigest()[:12]
+    return hashlib.sha256(read_regular(folder / SUMS_FILE)).hexdigest()[:12]

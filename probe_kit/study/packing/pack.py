@@ -1,6 +1,7 @@
 """Packing of a study: its runs without activations, its tables, and their sums."""
 
 import json
+import shutil
 from collections.abc import Collection
 from pathlib import Path
 from typing import Literal, get_args
@@ -88,7 +89,7 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Ex
         missing=missing,
         left_out=["activations", *(extra for extra in EXTRAS if extra not in extras)],
     )
-    (folder / STUDY_FILE).write_bytes(study.file.read_bytes())
+    shutil.copyfile(study.file, folder / STUDY_FILE)
     (folder / PACK_FILE).write_text(pack.to_json(), encoding="utf-8")
     write_sums(folder)
     return pack

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.drafts import write_whole
 from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.retention.columns.text_table import TextTable
@@ -69,7 +70,7 @@ def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
         skipped=plan.skipped(),
         tables=pages,
         figures=drawn,
-        file=study.file.read_text(encoding="utf-8-sig"),
+        file=read_regular(study.file).decode("utf-8-sig"),
         provenance=[provenance(labels[one.place], one.run, None) for one in runs.found],
         words=words_of([state, *pages.values()]),
         sentence=sentence,

@@ -7,7 +7,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.extract.store.provenance import differences
 from probe_kit.retention import retention_table
@@ -98,12 +98,12 @@ def _packed(archive: Path, pack: Pack | None, name: str) -> NamedTable:
     """A table as it was packed, because it is made of activations."""
     file = archive / TABLES / f"{name}.json"
     try:
-        return table_of_record(parse_json(file.read_bytes()))
-    except (ValueError, KeyError, TypeError) as error:
-        raise RunDamagedError(f"{file} is no record of a table ({error!r}). Fetch the archive again") from error
+        return table_of_record(load_json(file))
     except FileNotFoundError:
         why = ({} if pack is None else pack.missing).get(f"table {name}", "it was not made")
         raise UsageError(f"the archive holds no table {name!r}: {why}") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunDamagedError(f"{file} is no record of a table ({error!r}). Fetch the archive again") from error
 
 
 def _versions(runs: StoredRuns) -> list[str]:

@@ -7,6 +7,8 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+from probe_kit._system.bounded_files import MOST_BYTES, read_regular_text
+from probe_kit._system.bounded_json import parse_json
 from probe_kit._system.drafts import write_whole
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import sha256_json, sha256_text
@@ -38,7 +40,7 @@ def propose_wording(candidate: Candidate, options: ConvertOptions) -> Wording | 
     if not kept.is_file():
         reply = _ask(options.llm_base, options.llm_model, json.dumps(asked, ensure_ascii=False))
         write_whole(kept, reply)
-    return _usable(kept.read_text(encoding="utf-8"), options.llm_model)
+    return _usable(read_regular_text(kept), options.llm_model)
 
 
 def _ask(base: str, model: str, question: str) -> str:
@@ -58,7 +60,7 @@ def _ask(base: str, model: str, question: str) -> str:
     )
     try:
         with urllib.request.urlopen(request, timeout=_TIMEOUT_SECONDS) as response:
-            content = json.load(response)["choices"][0]["message"]["content"]
+            content = parse_json(response.read(MOST_BYTES))["choices"][0]["message"]["content"]
     except (urllib.error.URLError, TimeoutError, ValueError, KeyError, IndexError, TypeError) as problem:
         raise SuiteError(
             f"{base} gave no usable reply ({problem!r}). Check llm_base, or leave it out."
@@ -68,7 +70,7 @@ def _ask(base: str, model: str, question: str) -> str:
 
 def _usable(reply: str, model: str) -> Wording | None:
     try:
-        proposal: Any = json.loads(reply)
+        proposal: Any = parse_json(reply)
     except ValueError:
         return None
     if not isinstance(proposal, dict) or proposal.get("keep") is not True:

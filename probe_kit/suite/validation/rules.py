@@ -136,7 +136,7 @@ def groups_closed(suite: Suite) -> Iterator[Finding]:
 
 
 def card_agrees(suite: Suite) -> Iterator[Finding]:
-    """E13: the counts and the content hash of the items are those of `suite.json`."""
+    """E13: counts, and the hash of name, version and items, are those of `suite.json`."""
     said = suite.card["counts"], suite.card["content_sha256"]
     found = count_by_category(suite.items), suite.content_sha256
     for what, expected, given in zip(("count per category", "content hash"), said, found, strict=True):

@@ -24,6 +24,14 @@ def check_several_wordings(episodes: "pd.DataFrame") -> None:
         )
 
 
+def seed_text_of(run: DescribedRun) -> str:
+    """Return the text that random draws over a run's items are seeded with: its `seed_text`, else its `suite`.
+
+    A reader of one's own need not have a `seed_text`; its suite then sets its draws apart.
+    """
+    return str(getattr(run, "seed_text", run.suite))
+
+
 class Tokens(Protocol):
     """Tokens `start` up to `start + T` of all episodes."""
 

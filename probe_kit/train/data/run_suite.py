@@ -100,11 +100,9 @@ def _holds(suite: "Suite", run: RunReader) -> bool:
 
 
 def _hash_of_part(suite: "Suite", run: RunReader) -> str:
-    """Hex sha256 of the items of `suite` that the run has."""
-    from probe_kit.suite.suite import content_sha256
-
+    """Hex sha256 that `suite` had with only those items that the run has."""
     wanted = _items(run)
-    return content_sha256(item for item in suite.items if item.item_id in wanted)
+    return suite.content_sha256_of(item for item in suite.items if item.item_id in wanted)
 
 
 def _items(run: RunReader) -> Mapping[str, str]:

@@ -10,7 +10,7 @@ from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.train.data.run_reader import RunReader, check_several_wordings
+from probe_kit.train.data.run_reader import RunReader, check_several_wordings, seed_text_of
 from probe_kit.train.data.samples import Samples, is_token_view, sites_of
 from probe_kit.train.execution.dispatch import probe_columns
 from probe_kit.train.execution.executor import Columns, ExecutionSettings, Problems
@@ -113,6 +113,7 @@ def _settings(
         random_weights=run.random_weights,
         weights=run.weights_sha256,
         suite=run.suite,
+        seed_text=seed_text_of(run),
         run_settings=run.settings_sha256,
         episodes=episodes_sha256(run),
         categories=() if categories is None or EVERYWHERE in categories else tuple(sorted(categories)),

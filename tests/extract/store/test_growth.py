@@ -27,6 +27,7 @@ from probe_kit.suite import Suite
 from probe_kit.suite.ladder import Wording
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.results.inventory import inventory
+from tests.support.changed_suites import without_twins
 from tests.support.little_run import STREAMS, certify, episode, little_settings, still
 from tests.support.rehashing import write_record
 
@@ -212,8 +213,9 @@ def test_fewer_items_play_nothing_and_the_run_stays_as_it_is(small_suite: Suite,
             ),
             r"its item_content_sha256 is stored",
         ),
+        (lambda suite: plan_of(without_twins(suite), COLOR[2]), r"its item_content_sha256 is stored"),
     ],
-    ids=["another category", "fewer of one, more of another", "wordings", "another seed", "other content"],
+    ids=["another category", "fewer of one, more of another", "wordings", "another seed", "content", "twins"],
 )
 def test_a_plan_that_does_not_hold_the_stored_one_is_refused_by_name(
     change: Callable[[Suite], Plan], why: str, small_suite: Suite, tmp_path: Path

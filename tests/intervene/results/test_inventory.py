@@ -26,7 +26,7 @@ def run(little_runs: Path, tmp_path: Path) -> Run:
 
 def store(run: Run, intervention: ImageSwap | ConceptErasure) -> str:
     outcomes, settings = outcomes_of({"color": follower(24)}), settings_of(intervention, run)
-    return store_outcomes(run.location, run.suite, settings, outcomes)
+    return store_outcomes(run.location, run.seed_text, settings, outcomes)
 
 
 def shown(run: Run, *options: str) -> str:

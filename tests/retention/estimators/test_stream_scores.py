@@ -34,7 +34,7 @@ def scored(curve_of: CurveOf, outcome_table: Outcomes) -> Callable[..., StreamSc
         mixed = np.random.default_rng(seed).permutation(60)
         pairs = curve.decisions.reshape(len(curve.sites), 60, 2) * np.where(curve.labels, 1, -1).reshape(60, 2)
         right = pairs[:, mixed].reshape(len(curve.sites), 120)
-        found = curve_scores(replace(curve, decisions=right * np.where(curve.labels, 1, -1)), suite=SUITE)
+        found = curve_scores(replace(curve, decisions=right * np.where(curve.labels, 1, -1)), seed_text=SUITE)
         assert found is not None
         return found
 
@@ -163,7 +163,7 @@ def test_the_best_of_sites_that_guess_scores_one_half_where_its_peak_does_not(
     draw = np.random.default_rng(3)
     for _ in range(30):
         curve = curve_of(outcome_table(120, 0, 0), [0.5] * 20, [])
-        found = curve_scores(replace(curve, decisions=draw.normal(size=curve.decisions.shape)), suite=SUITE)
+        found = curve_scores(replace(curve, decisions=draw.normal(size=curve.decisions.shape)), seed_text=SUITE)
         assert found is not None
         above.append(found.accuracy("backbone") - 0.5)
         peaks.append(found.peak("backbone"))
@@ -228,7 +228,7 @@ def test_only_streams_that_all_runs_have_are_pooled(
     scored: Callable[..., StreamScores], curve_of: CurveOf, outcome_table: Outcomes
 ) -> None:
     both = scored([0.5, 0.9], [[0.6, 0.75]])
-    bare = curve_scores(curve_of(outcome_table(120, 0, 0), [0.5, 0.7], []), suite=SUITE)
+    bare = curve_scores(curve_of(outcome_table(120, 0, 0), [0.5, 0.7], []), seed_text=SUITE)
     assert bare is not None
     found = pooled(both, bare)
     assert found.names == ("backbone",)

@@ -89,7 +89,7 @@ def test_with_chance_one_half_it_is_retention_of_sides(
     results = label_results(dict.fromkeys(curve.sites, (0.5, 0.5)), 100, 2, suite="")
     scores = curve.correct.astype(float)
     own = replace(results.curves["mean"], scores=scores, null=np.full((len(curve.sites), 59), 0.5))
-    settings = replace(results.settings, suite="")
+    settings = replace(results.settings, seed_text="")
     found = measure_label_retention(
         replace(results, curves={"mean": own}, groups=np.asarray(curve.groups, str), settings=settings)
     )

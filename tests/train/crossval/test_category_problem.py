@@ -14,7 +14,7 @@ PlantedRun = Callable[..., ArrayRun]
 
 def settings(target: Target = "correct") -> ProbeSettings:
     return ProbeSettings(
-        "m", False, None, "s@1#0", "0", "0", ("color",), ("mean",), target, permutations=30, seed=0
+        "m", False, None, "s@1#0", "s@1#0", "0", "0", ("color",), ("mean",), target, permutations=30, seed=0
     )
 
 

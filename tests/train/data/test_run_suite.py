@@ -25,7 +25,8 @@ from probe_kit.suite.ladder import Wording
 from probe_kit.train import ArrayRun, train_probes
 from probe_kit.train.data.captured_call import restrict_to_call
 from probe_kit.train.data.run_suite import suite_of
-from tests.support.little_run import STREAMS, certify, episode, little_settings
+from tests.support.changed_suites import CHANGES, other_name, save_changed
+from tests.support.little_run import STREAMS, certify, episode, little_settings, suite_record
 
 SHORT = SceneSpec(max_steps=2)
 CONTROL_LEFT_OUT = "the control random-features is on by default and was NOT run"
@@ -69,7 +70,7 @@ def run_on(
 ) -> Run:
     """A run without a model, of which the first `episodes` are there, each with one of `calls` inferences."""
     plan = make_plan(suite, list(STREAMS), 0, calls, True, wordings)
-    settings = {**little_settings(), "suite": {"identity": suite.identity}, "captured_calls": calls}
+    settings = {**little_settings(), "suite": suite_record(suite), "captured_calls": calls}
     if wordings is not None:
         settings["wordings"] = plan.wordings
     writer = RunWriter(locate(where), plan, settings)
@@ -160,7 +161,8 @@ def test_a_default_control_without_its_pictures_is_said_aloud_and_one_that_was_a
     drawing: dict[str, int], name: str | None, reason: str, tmp_path: Path
 ) -> None:
     built = build_suite(tmp_path / "suite", ["color"], 12, **drawing)
-    run = run_on(replace(built, name=name or built.name), tmp_path / "run")
+    suite = built if name is None else save_changed(other_name(built), tmp_path / name)
+    run = run_on(suite, tmp_path / "run")
     with pytest.warns(UserWarning, match=f"{CONTROL_LEFT_OUT}.*{reason}.*--suite, suite=.*controls=\\(\\)"):
         assert train_probes(run, permutations=1).scores["exceeds_random_features"].isna().all()
     for asked in ("random-features", "pixels"):
@@ -169,7 +171,7 @@ def test_a_default_control_without_its_pictures_is_said_aloud_and_one_that_was_a
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         train_probes(run, permutations=1, controls=())
-        found = train_probes(run, permutations=1, suite=tmp_path / "suite")
+        found = train_probes(run, permutations=1, suite=suite.folder)
     assert found.scores["exceeds_random_features"].notna().all()
 
 
@@ -198,6 +200,19 @@ def test_a_control_that_is_stored_needs_no_pictures_again(tmp_path: Path) -> Non
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert train_probes(run, permutations=1).controls == first.controls
+
+
+@pytest.mark.usefixtures("cache")
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_the_same_questions_with_other_twins_or_another_version_are_another_suite(
+    change: Callable[[Suite], Suite], tmp_path: Path
+) -> None:
+    suite = build_suite(tmp_path / "suite", ["color"], 4)
+    run = run_on(suite.select(None, 2), tmp_path / "run", episodes=1)
+    changed = save_changed(change(suite), tmp_path / "changed")
+    assert suite_of(run, suite.folder) == suite
+    with pytest.raises(SuiteError, match="Give that suite's folder"):
+        suite_of(run, changed.folder)
 
 
 @pytest.mark.usefixtures("filled")

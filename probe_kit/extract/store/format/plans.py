@@ -136,7 +136,7 @@ def _check_selection(record: Mapping[str, Any], name: str) -> None:
             expect(selection[source], {"name": str, "episodes": list}, where, RESTORE)
             return
     expect(selection, _SELECTION, where, RESTORE)
-    expect(selection["suite"], {"identity": str, "content_sha256": str}, where, RESTORE)
+    expect(selection["suite"], {"identity": str, "content_sha256": str, "seed_text": str}, where, RESTORE)
     if "wordings" in selection:
         expect(selection, {"wordings": dict}, where, RESTORE)
         expect(selection["wordings"], {"names": list}, where, RESTORE)

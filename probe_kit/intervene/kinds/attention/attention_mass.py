@@ -108,7 +108,7 @@ class AttentionShares:
         columns = [own.name for own in fields(AttentionRow)]
         return pd.DataFrame([asdict(row) for row in self.rows(by)], columns=columns).drop(columns=unused)
 
-    def correct_minus_other(self, suite: str) -> "dict[int, tuple[float, tuple[float, float]]]":
+    def correct_minus_other(self, seed_text: str) -> "dict[int, tuple[float, tuple[float, float]]]":
         """By block, the share on the correct picture's tile minus the other's, with its 95 % interval by groups.
 
         Of one category; a mean over iterations, heads and calls. Empty without tiles.
@@ -125,7 +125,7 @@ class AttentionShares:
             every = _mean(_per_episode(apart, episodes), (1, 2, 3))
             seen = ~np.isnan(every)
             values, units = every[seen], groups[seen]
-            limits = student_interval(values, units, units_seed(units, suite), GAINS)
+            limits = student_interval(values, units, units_seed(units, seed_text), GAINS)
             found[block] = float(values.mean()), limits
         return found
 

@@ -27,7 +27,7 @@ def attention_table(_: Sequence[AttentionRow], context: TableContext) -> "Respon
     rows = attention.rows(("block",))
     roles = [role for role in dict.fromkeys(row.role for row in rows) if role not in (CORRECT, OTHER)]
     for category, own in attention.by_category():
-        apart = own.correct_minus_other(context.measurement.suite)
+        apart = own.correct_minus_other(context.measurement.seed_text)
         blocks = dict.fromkeys(row.block for row in rows if row.category == category)
         for block in blocks:
             found = {row.role: row.share for row in rows if (row.category, row.block) == (category, block)}

@@ -74,7 +74,7 @@ def measured_attribution(measurement: Measurement) -> list[AttributionEffect]:
     return [
         row
         for category, own in measurement.outcomes.by_category()
-        for row in Anchored(own, category, measurement.suite, frozenset(drawn), measurement.key).rows()
+        for row in Anchored(own, category, measurement.seed_text, frozenset(drawn), measurement.key).rows()
     ]
 
 
@@ -86,7 +86,7 @@ class Anchored:
 
     outcomes: ConditionOutcomes
     category: str
-    suite: str
+    seed_text: str
     drawn: frozenset[str]
     key: str
 
@@ -96,7 +96,7 @@ class Anchored:
         exact = [name for name in self.outcomes.conditions if name.startswith(f"{EXACT}|")]
         leads = -swap_sign(self.outcomes) * self.outcomes.correct_sign
         toward = np.array([leads * self._moved(name) for name in exact])
-        seed = derive_seed("sign flips", self.suite, self.category)
+        seed = derive_seed("sign flips", self.seed_text, self.category)
         p_fwe = dict(zip(exact, max_t(toward, self.outcomes.items, self.outcomes.groups, seed)[2], strict=True))
         return order_cells([self._row(name, p_fwe) for name in names])
 
@@ -125,7 +125,7 @@ class Anchored:
         return self.outcomes.of(condition) - self.outcomes.of(CLEAN)
 
     def _share(self, condition: str) -> SwapShare | None:
-        return share_of_swap(self.outcomes, self._moved(condition), self.suite)
+        return share_of_swap(self.outcomes, self._moved(condition), self.seed_text)
 
 
 def share_fields(name: str, share: SwapShare | None) -> dict[str, Any]:

@@ -78,12 +78,12 @@ class ClosedLoopEffect(EffectRow):
 
 def measured_closed_loop(measurement: Measurement) -> list[ClosedLoopEffect]:
     """The effects of a stored closed loop."""
-    return closed_loop_effects(measurement.outcomes, measurement.suite, measurement.key)
+    return closed_loop_effects(measurement.outcomes, measurement.seed_text, measurement.key)
 
 
-def closed_loop_effects(outcomes: ConditionOutcomes, suite: str, key: str = "") -> list[ClosedLoopEffect]:
-    """One per category and condition, the identity patch first. suite: its identity, which seeds intervals."""
-    return [row for category, own in outcomes.by_category() for row in _of_category(own, category, suite, key)]
+def closed_loop_effects(outcomes: ConditionOutcomes, seed_text: str, key: str = "") -> list[ClosedLoopEffect]:
+    """One per category and condition, the identity patch first. seed_text: of the run, for intervals."""
+    return [row for category, own in outcomes.by_category() for row in _of_category(own, category, seed_text, key)]
 
 
 def disruption_notes(rows: Sequence[ClosedLoopEffect], _: Measurement) -> list[str]:
@@ -96,7 +96,7 @@ def disruption_notes(rows: Sequence[ClosedLoopEffect], _: Measurement) -> list[s
     ]
 
 
-def _of_category(outcomes: ConditionOutcomes, category: str, suite: str, key: str) -> list[ClosedLoopEffect]:
+def _of_category(outcomes: ConditionOutcomes, category: str, seed_text: str, key: str) -> list[ClosedLoopEffect]:
     assert outcomes.episode_outcomes is not None
     names = [ConditionName.parse(condition) for condition in outcomes.conditions]
     wrong = (outcomes.episode_outcomes == WRONG).astype(float)
@@ -105,7 +105,7 @@ def _of_category(outcomes: ConditionOutcomes, category: str, suite: str, key: st
     net = wrong - wrong[0]
     left_out = set(np.flatnonzero(disrupted).tolist())
     clean = {at for at, name in enumerate(names) if name.place == CLEAN}
-    tests = test_against_controls(net, names, outcomes, suite, left_out | clean, left_out)
+    tests = test_against_controls(net, names, outcomes, seed_text, left_out | clean, left_out)
     rows = []
     for at, (name, test) in enumerate(zip(names, tests, strict=True)):
         gained, lost = int((net[at] > 0).sum()), int((net[at] < 0).sum())
@@ -119,7 +119,7 @@ def _of_category(outcomes: ConditionOutcomes, category: str, suite: str, key: st
                 in_zone=float(in_zone[at]),
                 wrong_in_zone=float(wrong[at].mean() / in_zone[at]) if in_zone[at] else None,
                 net=float(net[at].mean()),
-                net_ci=net_interval(net[at], outcomes, suite),
+                net_ci=net_interval(net[at], outcomes, seed_text),
                 net_left=_mean(net[at][outcomes.sides == "right"]),
                 net_right=_mean(net[at][outcomes.sides == "left"]),
                 control_net=float(net[test.controls].mean()) if test.controls else None,

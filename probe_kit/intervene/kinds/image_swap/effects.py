@@ -16,7 +16,7 @@ from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_signs import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.student import unbounded_student_interval
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
 
 NAME = "image-swap"
 FOLLOWS, REVERSES = 1, -1
@@ -69,31 +69,31 @@ class ImageSwapEffect:
 def measured_image_swap(measurement: Measurement) -> list[ImageSwapEffect]:
     """The effects of a stored image swap."""
     return image_swap_effects(
-        measurement.outcomes, measurement.suite, measurement.key, measurement.readout, measurement.tiles_apart
+        measurement.outcomes, measurement.seed_text, measurement.key, measurement.readout, measurement.tiles_apart
     )
 
 
 def image_swap_effects(
     outcomes: ConditionOutcomes,
-    suite: str,
+    seed_text: str,
     key: str = "",
     readout: str = FIRST_CHUNK,
     tiles_apart: float = TILES_APART,
 ) -> list[ImageSwapEffect]:
     """One per category, in the order of the episodes.
 
-    suite: its identity, of which intervals are drawn. readout: of the intervention. tiles_apart: metres, for
+    seed_text: of the run, by which intervals are drawn. readout: of the intervention. tiles_apart: metres, for
     policies without a reach of their own.
     """
     reach = Reach.of(outcomes.of(CLEAN), tiles_apart)
     return [
-        ImageSwapEffect(**swap_columns(own, category, IMAGE_SWAP, suite, reach), readout=readout, key=key)
+        ImageSwapEffect(**swap_columns(own, category, IMAGE_SWAP, seed_text, reach), readout=readout, key=key)
         for category, own in outcomes.by_category()
     ]
 
 
 def swap_columns(
-    outcomes: ConditionOutcomes, category: str, swapped: str, suite: str, reach: Reach
+    outcomes: ConditionOutcomes, category: str, swapped: str, seed_text: str, reach: Reach
 ) -> dict[str, Any]:
     """The columns of `ImageSwapEffect` of one category. swapped: compared with the clean condition."""
     clean, other = (outcomes.correct_sign * outcomes.of(name) for name in (CLEAN, swapped))
@@ -110,7 +110,7 @@ def swap_columns(
         "follow_rate": float((responses == FOLLOWS).mean()),
         "reversal_rate": float((responses == REVERSES).mean()),
         "net_follow_rate": float(net.mean()),
-        "net_follow_rate_ci": net_interval(net, outcomes, suite),
+        "net_follow_rate_ci": net_interval(net, outcomes, seed_text),
         "follow_p": follow_p,
         "reversal_p": reversal_p,
         "median_displacement": float(np.median(np.abs(displacement))),
@@ -168,9 +168,9 @@ def _reached(
     return float(near.mean() - far.mean())
 
 
-def net_interval(net: NDArray[np.float64], outcomes: ConditionOutcomes, suite: str) -> tuple[float, float]:
+def net_interval(net: NDArray[np.float64], outcomes: ConditionOutcomes, seed_text: str) -> tuple[float, float]:
     """95 % interval by groups of the mean over episodes of (E,) gains."""
-    drawn = units_seed(outcomes.groups, suite)
+    drawn = units_seed(outcomes.groups, seed_text)
     low, high = group_bootstrap(net[:, None], outcomes.groups, drawn, bounds=GAINS)
     return float(low[0]), float(high[0])
 
@@ -185,7 +185,7 @@ def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, 
     apart, rows = tiles_apart(run), dict[str, dict[str, ImageSwapEffect]]()
     for stored in {result.stored.key: result.stored for result in preferred.values()}.values():
         own = str(stored.settings.get("readout", FIRST_CHUNK))
-        found = image_swap_effects(stored.outcomes(), run.suite, stored.key, own, apart)
+        found = image_swap_effects(stored.outcomes(), seed_text_of(run), stored.key, own, apart)
         rows[stored.key] = {row.category: row for row in found}
     return {category: rows[result.stored.key][category] for category, result in preferred.items()}
 

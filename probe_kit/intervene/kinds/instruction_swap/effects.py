@@ -49,7 +49,7 @@ def instruction_swap_effects(measurement: Measurement) -> list[InstructionSwapEf
     reach = Reach.of(measurement.outcomes.of(CLEAN), measurement.tiles_apart)
     return [
         InstructionSwapEffect(
-            **swap_columns(own, category, INSTRUCTION_SWAP, measurement.suite, reach),
+            **swap_columns(own, category, INSTRUCTION_SWAP, measurement.seed_text, reach),
             readout=measurement.readout,
             key=measurement.key,
             sensitivity=input_sensitivity(own),

@@ -19,7 +19,7 @@ from probe_kit.intervene.store.selection import StoredResult, stored_results
 from probe_kit.statistics.paired_signs import paired_greater_p
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
 
 NAME = "joint"
 SITES, ROLES = ("kv.*",), ("image", "language", "state")
@@ -68,7 +68,7 @@ def measured_joint_places(measurement: Measurement) -> list[JointEffect]:
     return [
         row
         for category, own in measurement.outcomes.by_category()
-        for row in _Category(own, category, measurement.suite, measurement.settings, measurement.key).rows(
+        for row in _Category(own, category, measurement.seed_text, measurement.settings, measurement.key).rows(
             searched.get(category, {})
         )
     ]
@@ -80,9 +80,9 @@ def stored_joint_places(run: RunReader) -> dict[str, list[JointEffect]]:
     Raises RunDamagedError.
     """
     return {
-        category: _Category(result.outcomes, category, run.suite, result.stored.settings, result.stored.key).rows(
-            result.stored.certificate().get("joint", {}).get(category, {})
-        )
+        category: _Category(
+            result.outcomes, category, seed_text_of(run), result.stored.settings, result.stored.key
+        ).rows(result.stored.certificate().get("joint", {}).get(category, {}))
         for category, result in _preferred(run).items()
     }
 
@@ -155,14 +155,14 @@ def describe_remainder(rows: Sequence[JointEffect]) -> str:
 class _Category:
     outcomes: ConditionOutcomes
     category: str
-    suite: str
+    seed_text: str
     settings: Mapping[str, Any]
     key: str
 
     def rows(self, searched: Mapping[str, Any]) -> list[JointEffect]:
         names = [name.partition("|")[2] for name in self.outcomes.conditions if name.startswith(f"{ALONE}|")]
         toward = np.array([self._toward(f"{ALONE}|{name}") for name in names])
-        seed = derive_seed("sign flips", self.suite, self.category)
+        seed = derive_seed("sign flips", self.seed_text, self.category)
         _, p, p_fwe = max_t(toward, self.outcomes.items, self.outcomes.groups, seed)
         every = self._share(self.outcomes, self._moved(EVERY))
         rows = []
@@ -229,7 +229,7 @@ class _Category:
         return -swap_sign(self.outcomes) * self.outcomes.correct_sign * self._moved(condition)
 
     def _share(self, outcomes: ConditionOutcomes, moved: NDArray[np.float64]) -> SwapShare | None:
-        return share_of_swap(outcomes, moved, self.suite)
+        return share_of_swap(outcomes, moved, self.seed_text)
 
 
 def carries_nothing(low: float, high: float) -> bool:
