@@ -11,16 +11,21 @@ from typing import Any
 from probe_kit._system.bounded_files import MOST_BYTES, open_regular, read_regular
 from probe_kit.errors import ProbeKitError
 
+MOST_VALUES = 1 << 25
+"""Values of one text; in Python each takes 8 to 80 bytes, however short it is written."""
 _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 def parse_json(content: bytes | str, **further: Any) -> Any:
     """The value. further: hooks of `json.loads`.
 
-    Raises ValueError for text that is not UTF-8 or JSON, nests too deeply, has half characters, or repeats a key.
+    Raises ValueError for text that is not UTF-8 or JSON, nests too deeply, has half characters, repeats a key, or
+    may hold more than `MOST_VALUES` values.
     """
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
+        if len(text) > MOST_VALUES and (most := sum(map(text.count, ",[{"))) > MOST_VALUES:
+            raise ValueError(f"it may hold {most:,} values; expected at most {MOST_VALUES:,}")
         value = json.loads(text, object_pairs_hook=_distinct, **further)
         (json.dumps(value, ensure_ascii=False) if _HALF.search(text) else text).encode()
     except RecursionError:

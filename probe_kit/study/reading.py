@@ -1,5 +1,6 @@
 """Reading of study files, your own and those of the package."""
 
+import re
 import tomllib
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
@@ -20,6 +21,9 @@ from probe_kit.study.mistakes import Mistake, Place, StudyFileError, part_in_fil
 from probe_kit.study.planned_suite import PlannedSuite, planned_suite
 from probe_kit.study.references import reference_mistakes
 
+_MOST_BYTES = 1 << 20
+_DEEP_KEY = re.compile(r"""(?:[\w"'-]+\s*\.\s*){64}""")
+"""A dotted key of 64 tables; tomllib takes minutes for one of some ten thousands."""
 _NAME_PATTERN = "'^[a-z0-9][a-z0-9._-]{0,59}$'"
 
 
@@ -99,7 +103,10 @@ def _packed_suite(pack: Pack) -> PlannedSuite:
 def _parsed(file: Path) -> dict[str, Any]:
     """The content of a file. Raises UsageError for a text that is no TOML."""
     try:
-        return tomllib.loads(read_regular(file).decode("utf-8-sig"))
+        text = read_regular(file, _MOST_BYTES).decode("utf-8-sig")
+        if _DEEP_KEY.search(text):
+            raise UsageError(f"{file}: its lists or tables nest too deeply")
+        return tomllib.loads(text)
     except OSError as error:
         raise UsageError(f"{file} cannot be read: {error.strerror}. Give a study file in TOML") from error
     except UnicodeDecodeError as error:

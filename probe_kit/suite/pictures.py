@@ -136,10 +136,12 @@ def decode_bytes(
 def rgb_of(image: Image.Image, name: str, remedy: str) -> Image.Image:
     """The RGB pixels of a picture that another library opened: transparency becomes white.
 
-    Raises SuiteError for a format outside `FORMATS`, more than 8 bits per channel, and damaged bytes.
+    Raises SuiteError for a format outside `FORMATS`, a picture that is too large or has several frames, more than
+    8 bits per channel, and damaged bytes.
     """
     if image.format not in (None, *FORMATS):
         raise SuiteError(f"{name} is {image.format}; expected one of {', '.join(FORMATS)}. {remedy}")
+    _check_still(image, name, SuiteError, LARGEST_PICTURE)
     _check_deep(image, b"", name, SuiteError)
     try:
         return on_white(image)
@@ -183,9 +185,9 @@ def _check_still(image: Image.Image, name: str, error: type[ProbeKitError], larg
     if max(image.size) > largest:
         width, height = image.size
         raise error(f"{name} claims to be {width}×{height} pixels; at most {largest} are read. Make it smaller.")
-    frames = getattr(image, "n_frames", 1)
-    if frames > 1 and image.format in FORMATS:
-        raise error(f"{name} has {frames} frames; expected a still picture. Give the frame that is meant.")
+    # Not `n_frames`, for which Pillow walks through all frames of a GIF.
+    if getattr(image, "is_animated", False) and image.format in FORMATS:
+        raise error(f"{name} has several frames; expected a still picture. Give the frame that is meant.")
 
 
 def _check_deep(image: Image.Image, encoded: bytes, name: str, error: type[ProbeKitError]) -> None:

@@ -40,6 +40,7 @@ _GZIP_FROM = 2000
 _MOST_HEADER_BYTES = 1 << 20
 """Of a request: a browser sends the cookies of every other server of 127.0.0.1 too, at most 180 of 4 KB."""
 _LEADING_TO = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url={address}">\n'
+_ICON = "/favicon.ico"
 _PICTURE = re.compile(r"([A-Za-z0-9._-]+)/f/([0-9]{5,8})\.webp")
 _KINDS = {"css": "text/css", "html": "text/html", "js": "text/javascript", "svg": "image/svg+xml"}
 _POLICY = (
@@ -90,6 +91,8 @@ class _Guard:
             return response
         if request.headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
             return PlainTextResponse("refused", 403)
+        if request.url.path == _ICON:  # a browser asks for it before the page has its cookie
+            return None
         if not any(_are_equal(value, self._pass) for value in _cookies(request, self._cookie)):
             return PlainTextResponse("Open the address that `probe-kit view` printed.", 403)
         return None
@@ -125,6 +128,11 @@ class _Pages:
             return _missing()
         kind = _KINDS.get((name or INDEX).rpartition(".")[2], "text/plain")
         return _tagged(request, content, hashlib.sha256(content).hexdigest(), kind)
+
+    def icon(self, request: Request) -> Response:
+        """The picture in the tab of the page that leads to this one, which names none."""
+        content = self._files["app/icon.svg"]
+        return _tagged(request, content, hashlib.sha256(content).hexdigest(), _KINDS["svg"])
 
     def data(self, request: Request) -> Response:
         """A payload or a picture."""
@@ -204,6 +212,7 @@ def _application(pages: _Pages, port: int, token: str) -> Starlette:
         routes=[
             Route("/", pages.file),
             Route("/app/{name}", pages.file),
+            Route(_ICON, pages.icon),
             Route("/data/{name:path}", pages.data),
             Route("/follow", pages.follow),
         ],

@@ -57,7 +57,7 @@ def test_whatever_changes_the_question_changes_the_hash(small_suite: Suite, fiel
 
 @pytest.mark.parametrize("field", ["pair_id", "schema_version"])
 def test_other_twins_or_another_format_change_the_hash_and_no_seed(small_suite: Suite, field: str) -> None:
-    """Intervals and p values are drawn by the questions; suites are told apart by all that a run depends on."""
+    """Intervals and p values are drawn by the questions; suites are compared by all that a run depends on."""
     first, *others = small_suite.items
     changed = replace(small_suite, items=(replace(first, **{field: getattr(first, field) + "!"}), *others))
     assert changed.content_sha256 != small_suite.content_sha256

@@ -77,6 +77,16 @@ def server(little_runs: Path) -> Iterator[Client]:
         yield found
 
 
+def test_the_icon_needs_no_cookie_because_the_page_that_leads_in_has_none_yet(server: Client) -> None:
+    newcomer = Client(server.port, server.token)
+    status, headers, content = newcomer.ask("/favicon.ico", Sec_Fetch_Site="same-origin")
+    assert (status, headers["content-type"].partition(";")[0]) == (200, "image/svg+xml")
+    assert content == server.ask("/app/icon.svg")[2]
+    assert newcomer.ask("/app/icon.svg", Sec_Fetch_Site="same-origin")[0] == 403
+    assert newcomer.ask("/favicon.ico", Sec_Fetch_Site="cross-site")[0] == 403
+    assert newcomer.ask("/favicon.ico", Host="example.org")[0] == 400
+
+
 def test_the_page_and_the_payloads_are_those_of_an_export(server: Client, exported: Path) -> None:
     folder = exported.parent
     files = ["app/page.js", "app/page.css", "data/run/episodes.js", "data/run/e/00003.js", "data/run/f/00001.webp"]

@@ -16,7 +16,7 @@ from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
 from probe_kit.extract.recordings.lerobot_folder import LeRobotFolder
 from probe_kit.extract.recordings.lerobot_meta import EXTRA, HALF, EpisodeMeta
-from probe_kit.suite.pictures import decode_bytes
+from probe_kit.suite.pictures import LARGEST_PICTURE, decode_bytes
 
 OFF_GRID_S = 1e-4
 """Seconds by which a timestamp may differ from frame / fps, and a picture of a video from its timestamp."""
@@ -233,6 +233,11 @@ class LeRobotFrames:
                     stream = container.streams.video[0]
                     base = float(stream.time_base or 0)
                     lasts = stream.duration * base if stream.duration else (container.duration or 0) / 1e6
+                    if max(stream.width, stream.height) > LARGEST_PICTURE:
+                        raise RecordingError(
+                            f"{self._where(path)} claims to be {stream.width}×{stream.height} pixels; at most "
+                            f"{LARGEST_PICTURE} are read. Make it smaller"
+                        )
                     self._lengths[path] = lasts, float(stream.average_rate or 0)
             except (av.error.FFmpegError, IndexError, OSError) as error:
                 raise RecordingError(

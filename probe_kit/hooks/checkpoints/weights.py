@@ -8,6 +8,7 @@ from itertools import accumulate, takewhile
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
+from zipfile import ZIP_STORED, BadZipFile, ZipFile
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -173,12 +174,26 @@ def check_kinds(tensors: Mapping[str, Tensor], path: Path) -> None:
 
 def unpickled(path: Path) -> Any:
     """The content of a `.pt` file, read with `weights_only=True`: it cannot run code. Raises WeightsError."""
+    _check_not_compressed(path)
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except (UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
         raise WeightsError(
             f"{path} cannot be read as plain tensors ({error}); it may be damaged or unsafe"
         ) from error
+
+
+def _check_not_compressed(path: Path) -> None:
+    """Raise WeightsError for a zip file with compressed members: a small one can stand for all memory."""
+    try:
+        with ZipFile(path) as packed:
+            compressed = [entry.filename for entry in packed.infolist() if entry.compress_type != ZIP_STORED]
+    except (BadZipFile, OSError, ValueError, NotImplementedError):
+        return  # the older format of torch, or damage, which torch names
+    if compressed:
+        raise WeightsError(
+            f"{path} holds {compressed[0]!r} compressed; torch.save compresses nothing. Save the tensors again"
+        )
 
 
 def read_pickle(path: Path) -> Weights:

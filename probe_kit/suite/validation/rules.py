@@ -5,7 +5,7 @@ opened; they are fast, because pictures are hashed but not decoded. `DECODING_RU
 """
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import PurePosixPath
 
 from probe_kit._system.bounded_files import read_regular
@@ -20,21 +20,30 @@ from probe_kit.suite.wording import MOST_CHARACTERS, MOST_WORDS, VERBATIM, side_
 SMALLEST_PICTURE = 64
 MOST_PICTURE_BYTES = 64 << 20
 """Of a picture's file; a photograph of the largest size has a tenth of it."""
+MOST_PIXELS = 1 << 37
+"""Of all pictures of a suite: 2,048 of the largest size, or 200,000 of 800 × 800. Half a day to decode."""
 SIGN_CATEGORIES = ("traffic", "public-info")  # a sign may be named after a side
 SIDES: tuple[Side, Side] = ("left", "right")
 
 
 def pictures_unchanged(suite: Suite) -> Iterator[Finding]:
-    """E05 to E07: every picture is a file inside the suite, has the recorded bytes, and is large enough."""
+    """E05 to E07: every picture is a file inside the suite, has the recorded bytes, and is large enough.
+
+    All pictures together have at most `MOST_PIXELS`.
+    """
     users: dict[tuple[str, str], tuple[Item, Side]] = {}
     for item in suite.items:
         for side in SIDES:
             users.setdefault((item.file_name(side), item.file_sha256(side)), (item, side))
+    pixels = 0
     for item, side in users.values():
-        yield from _check_file(item, side)
+        pixels += yield from _check_file(item, side)
+    if pixels > MOST_PIXELS:
+        yield error("E07", "the pictures", f"have {pixels:,} pixels together; at most {MOST_PIXELS:,} are read")
 
 
-def _check_file(item: Item, side: Side) -> Iterator[Finding]:
+def _check_file(item: Item, side: Side) -> Generator[Finding, None, int]:
+    """Yield what is wrong with a picture's file, and return the pixels that its header states."""
     where, name, path = f"item {item.item_id}", item.file_name(side), item.picture(side)
     if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
         yield error("E05", where, f"the path {name!r} leaves the suite folder")
@@ -48,7 +57,8 @@ def _check_file(item: Item, side: Side) -> Iterator[Finding]:
     else:
         encoded = read_regular(path)
         yield from _check_bytes(encoded, item, side)
-        yield from _check_size(encoded, item, side)
+        return (yield from _check_size(encoded, item, side))
+    return 0
 
 
 def _check_bytes(encoded: bytes, item: Item, side: Side) -> Iterator[Finding]:
@@ -58,16 +68,18 @@ def _check_bytes(encoded: bytes, item: Item, side: Side) -> Iterator[Finding]:
         yield error("E06", f"item {item.item_id}", message)
 
 
-def _check_size(encoded: bytes, item: Item, side: Side) -> Iterator[Finding]:
+def _check_size(encoded: bytes, item: Item, side: Side) -> Generator[Finding, None, int]:
     size = picture_size(encoded)
     if size is None:
         yield error("E07", f"item {item.item_id}", f"{side} picture cannot be decoded")
-    elif min(size) < SMALLEST_PICTURE:
+        return 0
+    if min(size) < SMALLEST_PICTURE:
         message = f"{side} picture is {size[0]}×{size[1]}; needs at least {SMALLEST_PICTURE}"
         yield error("E07", f"item {item.item_id}", message)
     elif max(size) > LARGEST_PICTURE:
         message = f"{side} picture is {size[0]}×{size[1]}; at most {LARGEST_PICTURE} are read"
         yield error("E07", f"item {item.item_id}", message)
+    return size[0] * size[1]
 
 
 def sides_differ(suite: Suite) -> Iterator[Finding]:

@@ -2,6 +2,7 @@ import json
 import struct
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,10 @@ from typing import Any
 import pytest
 
 from probe_kit.errors import SuiteError
-from probe_kit.suite import load_suite
+from probe_kit.suite import Suite, load_suite
 from probe_kit.suite.pictures import decode_picture
 from probe_kit.suite.validation.findings import Finding, listing
+from tests.support.changed_suites import save_changed
 
 Record = dict[str, Any]
 EditRecords = Callable[[Callable[[list[Record]], None]], Any]
@@ -92,11 +94,29 @@ def test_an_untouched_copy_passes_all_rules(edit_records: EditRecords) -> None:
     assert len(load_suite(folder).items) == 24
 
 
-def test_fields_of_a_later_minor_schema_are_left_out(edit_records: EditRecords) -> None:
-    def from_the_future(records: list[Record]) -> None:
-        records[0] |= {"schema_version": "1.7", "mood": "sunny"}
+def test_fields_of_a_later_minor_schema_are_left_out(small_suite: Suite, tmp_path: Path) -> None:
+    first, *others = small_suite.items
+    later = replace(small_suite, items=(replace(first, schema_version="1.7"), *others))
+    folder = save_changed(later, tmp_path / "later").folder
+    lines = (folder / "items" / "metadata.jsonl").read_text(encoding="utf-8").splitlines()
+    lines[0] = json.dumps(json.loads(lines[0]) | {"mood": "sunny"})
+    (folder / "items" / "metadata.jsonl").write_text("\n".join(lines), encoding="utf-8")
+    assert load_suite(folder).items[0].schema_version == "1.7"
 
-    assert load_suite(edit_records(from_the_future)).items[0].schema_version == "1.7"
+
+@pytest.mark.parametrize("field", ["schema_version", "pair_id"])
+def test_what_stands_in_the_hash_cannot_be_changed_unseen(field: str, edit_records: EditRecords) -> None:
+    with pytest.raises(SuiteError, match=r"E13 suite\.json: content hash differs"):
+        load_suite(edit_records(set_field(field, "1.7")))
+
+
+@pytest.mark.parametrize(("field", "value"), [("name", "mine"), ("version", "9.9.9"), ("schema_version", "1.7")])
+def test_what_the_card_names_cannot_be_changed_unseen(field: str, value: str, edit_records: EditRecords) -> None:
+    folder = edit_records(lambda _: None)
+    card = json.loads((folder / "suite.json").read_text(encoding="utf-8"))
+    (folder / "suite.json").write_text(json.dumps(card | {field: value}), encoding="utf-8")
+    with pytest.raises(SuiteError, match=r"E13 suite\.json: content hash differs"):
+        load_suite(folder)
 
 
 def test_all_findings_are_reported_at_once(edit_records: EditRecords) -> None:

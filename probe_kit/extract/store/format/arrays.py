@@ -4,6 +4,9 @@ Arrays of tokens and of later inferences hold the bits of bfloat16 as uint16, be
 """
 
 import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -11,13 +14,22 @@ import zarr
 from numpy.typing import NDArray
 from zarr.abc.codec import BytesBytesCodec
 from zarr.abc.store import Store
-from zarr.codecs import BloscCodec, Crc32cCodec
+from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, ShardingCodec
+from zarr.core.array_spec import ArraySpec
+from zarr.core.buffer import Buffer
+from zarr.registry import register_codec
 
+from probe_kit.errors import RunDamagedError
 from probe_kit.extract.run_layout import LATER, MEAN_VIEW, LaterViews, StoredStream
+from probe_kit.extract.store.locations.location import MOST_OBJECT_BYTES
 
 ENTRY, CHECKSUM = 16, 4
 """Bytes: offset and length of a chunk as two uint64, and the crc32c after all entries, in the
 index that Zarr writes at the end of every shard."""
+_RESTORE = "Restore the run from a copy, or extract it again"
+_MOST_CHUNKS = 10_000_000
+_BLOSC_SIZE = slice(4, 8)
+"""Place of the size, unpacked, in the header of a chunk that blosc wrote."""
 _ABSENT = (1 << 64) - 1
 NOT_A_NUMBER = 0x7FC0
 """Bits of bfloat16 where nothing was captured."""
@@ -116,8 +128,54 @@ def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
 
 
 def open_array(store: Store, name: str) -> zarr.Array[Any]:
-    """Open one array for reading; a missing chunk is an error, never a fill value."""
-    return zarr.open_array(store, path=name, mode="r", zarr_format=3, config={"read_missing_chunks": False})
+    """Open one array for reading; a missing chunk is an error, never a fill value.
+
+    Raises RunDamagedError for codecs, and for sizes, that probe_kit never writes.
+    """
+    with bounded_codecs():
+        array = zarr.open_array(store, path=name, mode="r", zarr_format=3, config={"read_missing_chunks": False})
+    check_bounds(array)
+    return array
+
+
+class BoundedBloscCodec(BloscCodec):
+    """Blosc that unpacks a chunk of the array's own size alone, whatever size the chunk declares."""
+
+    def _decode_sync(self, chunk_bytes: Buffer, chunk_spec: ArraySpec) -> Buffer:
+        expected = math.prod(chunk_spec.shape) * chunk_spec.dtype.to_native_dtype().itemsize
+        declared = int.from_bytes(chunk_bytes.to_bytes()[_BLOSC_SIZE], "little")
+        if declared != expected:
+            raise ValueError(f"a chunk of {expected:,} bytes unpacks to {declared:,}")
+        return super()._decode_sync(chunk_bytes, chunk_spec)
+
+
+register_codec("blosc", BoundedBloscCodec)  # chosen where `bounded_codecs` says so
+
+
+@contextmanager
+def bounded_codecs() -> Iterator[None]:
+    """Give arrays that are opened inside codecs that unpack no more bytes than a chunk has."""
+    with zarr.config.set({"codecs.blosc": f"{BoundedBloscCodec.__module__}.{BoundedBloscCodec.__qualname__}"}):
+        yield
+
+
+def check_bounds(array: zarr.Array[Any]) -> None:
+    """Raise RunDamagedError for an array that no run has: metadata of others may claim any shape and codec."""
+    codecs = list(array.metadata.codecs)
+    while codecs:
+        codec = codecs.pop()
+        if isinstance(codec, ShardingCodec):
+            codecs += [*codec.codecs, *codec.index_codecs]
+        elif not isinstance(codec, BytesCodec | BoundedBloscCodec | Crc32cCodec):
+            raise RunDamagedError(f"{array.path} is stored by {type(codec).__name__}, which no run is. {_RESTORE}")
+    grid = array.shards or array.chunks
+    size = math.prod(array.chunks) * array.dtype.itemsize
+    chunks = math.prod(-(-length // step) for length, step in zip(array.shape, grid, strict=True))
+    if size > MOST_OBJECT_BYTES or chunks > _MOST_CHUNKS:
+        raise RunDamagedError(
+            f"{array.path} claims {chunks:,} chunks of {size:,} bytes; expected at most {_MOST_CHUNKS:,} of "
+            f"{MOST_OBJECT_BYTES:,}. {_RESTORE}"
+        )
 
 
 def decode_bfloat16(bits: NDArray[np.uint16]) -> NDArray[np.float32]:

@@ -6,7 +6,7 @@ from typing import Any
 
 from zarr.abc.store import ByteRequest, RangeByteRequest, Store, SuffixByteRequest
 from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
-from zarr.storage import WrapperStore
+from zarr.storage import LocalStore, WrapperStore
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.store.format.arrays import chunk_slices, index_bytes
@@ -58,6 +58,7 @@ class CheckedStore(WrapperStore[Store]):
         number = next(self._numbers)
         self._underway[number] = key
         try:
+            self._check_size(key)
             value = await super().get(key, prototype, byte_range)
             if isinstance(byte_range, RangeByteRequest) and key not in self._indexes:
                 await self._read_index(key, prototype)
@@ -89,6 +90,7 @@ class CheckedStore(WrapperStore[Store]):
         prototype = prototype or default_buffer_prototype()
         if key in self._held and byte_range is None:
             return prototype.buffer.from_bytes(self._held[key])
+        self._check_size(key)
         value = super().get_sync(key, prototype=prototype, byte_range=byte_range)
         return self._checked(key, value, byte_range)
 
@@ -130,6 +132,14 @@ class CheckedStore(WrapperStore[Store]):
     ) -> AsyncGenerator[tuple[str, Buffer | None], None]:
         for key, prototype, byte_range in requests:
             yield key, await self.get(key, prototype, byte_range)
+
+    def _check_size(self, key: str) -> None:
+        """Raise RunDamagedError for a file that was made larger: a sparse one stands for all memory."""
+        if not isinstance(self._store, LocalStore):
+            return
+        file, length = self._store.root / key, self._sums[key].length
+        if file.is_file() and (size := file.stat().st_size) > length:
+            raise self._damaged(key, f"has {size} bytes; {length} were written")
 
     def _checked(self, key: str, value: Buffer | None, byte_range: ByteRequest | None) -> Buffer:
         if value is None:

@@ -23,7 +23,7 @@ from zarr.errors import ChunkNotFoundError
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.run_layout import COLUMNS, LATER, SEALED, StoredStream
-from probe_kit.extract.store.format.arrays import decode_bfloat16, open_array
+from probe_kit.extract.store.format.arrays import bounded_codecs, decode_bfloat16, open_array
 from probe_kit.extract.store.format.checking import CheckedStore
 from probe_kit.extract.store.format.commits import Commit, commit_key, stamp_of
 from probe_kit.extract.store.format.hashes import Sum, as_record, check_sums, expect, read_record, read_sums
@@ -90,9 +90,11 @@ class Columns:
         import xarray as xr
 
         others = ("role", LATER)  # which may have other numbers of calls
-        dataset: xr.Dataset = xr.open_zarr(
-            self.store, group=stream, consolidated=False, chunks=None, drop_variables=others
-        )
+        self.array(f"{stream}/pooled")  # checks its metadata
+        with bounded_codecs():
+            dataset: xr.Dataset = xr.open_zarr(
+                self.store, group=stream, consolidated=False, chunks=None, drop_variables=others
+            )
         return dataset["pooled"].drop_attrs()
 
     def problems(self) -> Iterator[str]:

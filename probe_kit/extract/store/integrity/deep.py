@@ -15,11 +15,13 @@ import numpy as np
 
 from probe_kit.errors import MissingExtraError, ProbeKitError, RunDamagedError
 from probe_kit.extract.run_layout import DATA, INTERVENTIONS, PROBES
+from probe_kit.extract.store.format.arrays import open_array
 from probe_kit.extract.store.format.columns import Columns
 from probe_kit.extract.store.format.commits import Commit, pictures_of, redo, redo_picture
 from probe_kit.extract.store.format.hashes import digest_of
 from probe_kit.extract.store.format.plans import RESTORE
 from probe_kit.extract.store.format.root import Root
+from probe_kit.extract.store.format.rows import Rows
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run
 from probe_kit.extract.store.sealing import columns_of_rows
@@ -58,6 +60,10 @@ def reading_problems(root: Root) -> Iterator[str]:
     yield from _complaints(lambda: (run.episodes, run.items, run.failed))
     if not run.commits():
         return
+    for name in root.arrays:
+        if name not in root.left_out:
+            # Metadata of others may claim what no run has. One row shows that; the others have their hashes.
+            yield from _complaints(partial(_read_first, run, name))
     if run.has_trajectories:
         for row in range(len(run.episodes)):
             yield from _complaints(partial(run.trajectory, row))
@@ -71,6 +77,10 @@ def reading_problems(root: Root) -> Iterator[str]:
             continue
         for reader in readers:
             yield from _complaints(reader)
+
+
+def _read_first(run: Run, name: str) -> None:
+    Rows(open_array(run.data, name), [min(run.commits())])[0]
 
 
 def _complaints(reader: Callable[[], object]) -> Iterator[str]:
@@ -114,7 +124,7 @@ def _wrong(location: Location, jobs: list[Job]) -> Iterator[str]:
 def _problem(location: Location, key: str, length: int, checksum: str) -> str | None:
     """None also for what has another size or is not there, which was said before."""
     try:
-        seen, found = digest_of(location.pieces(key))
+        seen, found = digest_of(location.pieces(key), length)
     except FileNotFoundError:
         return None
     if seen != length or found == checksum:

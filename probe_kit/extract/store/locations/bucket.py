@@ -21,14 +21,14 @@ from datetime import timedelta
 from functools import cached_property
 from io import SEEK_SET, BufferedReader, RawIOBase
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 from urllib.parse import urlsplit
 
 from zarr.abc.store import Store
 
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
-from probe_kit.extract.store.locations.location import Location
+from probe_kit.extract.store.locations.location import Location, check_size
 from probe_kit.extract.store.locations.object_stores import LONGEST_PAUSE, BlankStore, PatientStore, pauses_between
 
 if TYPE_CHECKING:
@@ -184,8 +184,13 @@ class Bucket(Location):
         """One request."""
         import obstore
 
+        def whole(objects: Any) -> bytes:
+            answer = obstore.get(objects, key)
+            check_size(key, answer.meta["size"], self)
+            return bytes(answer.bytes())
+
         with self.in_words():
-            return self._asked(lambda objects: bytes(obstore.get(objects, key).bytes()))
+            return self._asked(whole)
 
     def open(self, key: str) -> BinaryIO:
         """Reads ranges when they are asked for."""

@@ -29,7 +29,7 @@ from probe_kit.extract.run_layout import (
     TIMES,
     VIDEOS,
 )
-from probe_kit.extract.store.locations.location import Location
+from probe_kit.extract.store.locations.location import Location, check_size
 
 # What a killed process leaves: objects and columns that never got their final name.
 _WRITTEN_ASIDE = (PLANS, COMMITS, TIMES, FAILED, CERTIFICATES, PROVENANCE, SEALED, FRAMES, VIDEOS)
@@ -92,7 +92,9 @@ class Folder(Location):
 
     def read(self, key: str) -> bytes:
         """The file."""
-        return self._object(key).read_bytes()
+        path = self._object(key)
+        check_size(key, path.stat().st_size, self)
+        return path.read_bytes()
 
     def pieces(self, key: str) -> Iterator[memoryview]:
         """Into the same memory again and again, which stays in the processor's cache."""

@@ -13,7 +13,20 @@ from typing import BinaryIO
 
 from zarr.abc.store import Store
 
-from probe_kit.errors import StoreError
+from probe_kit.errors import RunDamagedError, StoreError
+
+MOST_RECORD_BYTES, MOST_OBJECT_BYTES = 256 << 20, 4 << 30
+"""The largest record, and the largest other object, that is read whole."""
+
+
+def check_size(key: str, size: int, where: object) -> None:
+    """Raise RunDamagedError for an object that is larger than any that probe_kit writes, before it is read."""
+    most = MOST_RECORD_BYTES if key.endswith(".json") else MOST_OBJECT_BYTES
+    if size > most:
+        raise RunDamagedError(
+            f"{where}/{key} has {size / 1e6:,.0f} MB; expected at most {most / 1e6:,.0f} MB. Restore it from a "
+            "copy, or extract the run again"
+        )
 
 
 class Location(ABC):

@@ -20,6 +20,7 @@ from lerobot.policies.groot.processor_groot import (
     make_groot_pre_post_processors,
 )
 from numpy.typing import NDArray
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 from transformers import AutoTokenizer, Qwen2VLImageProcessor, Qwen3VLProcessor, Qwen3VLVideoProcessor
@@ -120,7 +121,10 @@ def _saved(folder: Path, path: Path, entry: Mapping[str, Any]) -> Any:
         file = folder / shard_name(state)
         if not file.is_file():
             raise CheckpointError(f"{file} is missing: it holds the statistics of {name}")
-        step.load_state_dict(load_file(file))
+        try:
+            step.load_state_dict(load_file(file))
+        except (SafetensorError, OSError, RuntimeError) as error:
+            raise CheckpointError(f"{file} cannot be read ({error}); download the checkpoint again") from error
     return step
 
 
