@@ -71,11 +71,15 @@ class Commands(typer.core.TyperGroup):
         return sorted(super().list_commands(ctx), key=lambda name: (order.get(name, len(order)), name))
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Read the options in front of the command."""
+        """Read the options in front of the command; `--help` and `--version` print here."""
         try:
             return super().parse_args(ctx, args)
         except PARSE_ERROR as error:
             raise self._told_where(error, ctx) from None
+        except BrokenPipeError:
+            raise
+        except OSError as error:  # standard output lies on a full disk
+            raise typer.Exit(report_error(error)) from error
 
     def invoke(self, ctx: Any) -> Any:
         """Run the chosen command."""

@@ -44,7 +44,8 @@ def _check_header(packed: ZipFile, entry: ZipInfo) -> None:
     with packed.open(entry) as file:
         if file.read(len(npy.MAGIC_PREFIX)) != npy.MAGIC_PREFIX:
             return  # numpy gives its bytes
-        read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(tuple(file.read(2)))
+        headers: dict[bytes, Any] = {b"\1\0": npy.read_array_header_1_0, b"\2\0": npy.read_array_header_2_0}
+        read = headers.get(file.read(2))
         if read is None:
             raise ValueError(f"its array {entry.filename!r} has a format that probe_kit never wrote")
         try:

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import NoTrajectoryError, RunDamagedError, UsageError
-from probe_kit.extract import open_run, verify_run
+from probe_kit.extract import copy_run, open_run, verify_run
 from probe_kit.retention import retention_table
 from probe_kit.study import LoadedStudy, load_study, make_table, pack_study, plan_study
 from probe_kit.study.tables.formats import table_of_record, table_record
@@ -117,3 +117,19 @@ def test_a_table_is_the_same_after_its_record(played: LoadedStudy) -> None:
     again = table_of_record(json.loads(json.dumps(table_record(made))))
     assert again.text == made.text
     assert json.dumps(again.numbers) == json.dumps(made.numbers)
+
+
+def test_a_run_is_whole_without_what_an_archive_leaves_out(little_runs: Path, tmp_path: Path) -> None:
+    """With probes, whose directions stay behind as activations do."""
+    copy = tmp_path / "copy"
+    copy_run(little_runs / "run", copy, directions=False)
+    names = {path.name for path in copy.rglob("*") if "probes" in path.parts}
+    assert any("settings" in name for name in names)
+    assert not any("directions" in name for name in names)
+    audit = verify_run(copy, deep=True)
+    assert (audit.problems, audit.committed) == ((), audit.planned)
+    answer = CliRunner().invoke(app, ["run", "verify", str(copy), "--deep"])
+    assert (answer.exit_code, answer.exception) == (0, None), answer.stderr
+    (probed,) = [path for path in copy.rglob("*") if "scores" in path.name and "probes" in path.parts][:1]
+    probed.write_bytes(b"")
+    assert verify_run(copy, deep=True).problems

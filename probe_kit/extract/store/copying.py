@@ -42,6 +42,7 @@ def copy_run(
     """
     run, target = open_run(path, allow_partial), locate(out)
     arrays = {*run.root.arrays, *(() if trajectories else (TRAJECTORY,))}
+    left_out = {*arrays, *(() if directions else (PROBE_DIRECTIONS,))}
     keys = [key for key in _copied_keys(run, arrays, pictures, directions) if run.location.exists(key)]
     strange = set(target.keys("")) - {*keys, LEFT_OUT_FILE}
     if target.exists(RUN_FILE) or strange or (isinstance(target, Folder) and target.keys("")):
@@ -50,11 +51,11 @@ def copy_run(
         folder = Path(target.address)
         with full_disk_in_words(target.path), draft_of(folder) as draft:
             draft.mkdir()
-            _write_copy(run, Folder(draft), keys, arrays)
+            _write_copy(run, Folder(draft), keys, left_out)
             move_draft(draft, folder)
     else:  # a killed copy leaves objects and no root, and the next one writes them again
         with target.in_words():
-            _write_copy(run, target, keys, arrays)
+            _write_copy(run, target, keys, left_out)
     return open_run(target, allow_partial)
 
 
@@ -71,8 +72,8 @@ def _copied_keys(run: Run, arrays: Collection[str], pictures: bool, directions: 
         yield key
 
 
-def _write_copy(run: Run, target: Location, keys: Sequence[str], arrays: Collection[str]) -> None:
+def _write_copy(run: Run, target: Location, keys: Sequence[str], left_out: Collection[str]) -> None:
     for key in keys:
         target.write_record(key, run.location.read(key))
-    target.write_record(LEFT_OUT_FILE, left_out_record(run.root.identity, arrays))
+    target.write_record(LEFT_OUT_FILE, left_out_record(run.root.identity, left_out))
     target.write_record(RUN_FILE, run.location.read(RUN_FILE))  # last: without it there is no run

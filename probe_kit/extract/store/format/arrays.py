@@ -17,6 +17,7 @@ from zarr.abc.store import Store
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, ShardingCodec
 from zarr.core.array_spec import ArraySpec
 from zarr.core.buffer import Buffer
+from zarr.core.metadata import ArrayV3Metadata
 from zarr.registry import register_codec
 
 from probe_kit.errors import RunDamagedError
@@ -161,6 +162,7 @@ def bounded_codecs() -> Iterator[None]:
 
 def check_bounds(array: zarr.Array[Any]) -> None:
     """Raise RunDamagedError for an array that no run has: metadata of others may claim any shape and codec."""
+    assert isinstance(array.metadata, ArrayV3Metadata), "it was opened as one"
     codecs = list(array.metadata.codecs)
     while codecs:
         codec = codecs.pop()

@@ -80,12 +80,17 @@ class Bundle:
         if digest != self.files[name][1].digest:
             raise self.damaged(name, "has other bytes than were written")
 
-    def problems(self, deep: bool) -> Iterator[str]:
-        """What is missing or has another size; with `deep` whose bytes are others."""
+    def problems(self, deep: bool, left_out: Collection[str] = ()) -> Iterator[str]:
+        """What is missing or has another size; with `deep` whose bytes are others.
+
+        left_out: files that a copy of the run was made without.
+        """
         names = {actual: name for name, (actual, _) in self.files.items()}
         sizes = self.location.sizes(self.folder, names)
         for actual, name in names.items():
             known = self.files[name][1]
+            if name in left_out and actual not in sizes:
+                continue
             try:
                 if sizes.get(actual) != known.length:
                     seen = f"{sizes[actual]} bytes; {known.length} were written" if actual in sizes else None
@@ -251,8 +256,8 @@ def read_bundles(location: Location, home: str) -> dict[str, Bundle]:
     return {key: read_bundle(location, home, key) for key in bundle_keys(location, home)}
 
 
-def bundle_problems(location: Location, deep: bool) -> Iterator[str]:
-    """What is wrong with the bundles of a run; with `deep` every byte of them is read."""
+def bundle_problems(location: Location, deep: bool, left_out: Collection[str] = ()) -> Iterator[str]:
+    """What is wrong with the bundles of a run; with `deep` every byte of them is read. left_out: of a copy."""
     for home in BUNDLES:
         for key in bundle_keys(location, home):
             try:
@@ -260,7 +265,7 @@ def bundle_problems(location: Location, deep: bool) -> Iterator[str]:
             except RunDamagedError as error:
                 yield str(error)
             else:
-                yield from bundle.problems(deep)
+                yield from bundle.problems(deep, left_out)
 
 
 def _identity(location: Location) -> str | None:

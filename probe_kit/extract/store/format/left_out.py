@@ -1,6 +1,7 @@
 """Copies of runs without their activations: what they left out, and that it is missing on purpose.
 
-left-out.json    a record of its own: the run, and the arrays of `data.zarr` whose objects were not copied
+left-out.json    a record of its own: the run, and the arrays of `data.zarr` whose objects were not copied; also
+                 `directions.npz` where the weights of probes were not
 
 Commits still hold the hash of every object that was left out.
 """

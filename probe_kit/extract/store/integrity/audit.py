@@ -107,7 +107,7 @@ def _audit(location: Location, deep: bool) -> Audit:
     columns = _columns(root, commits, problems)
     if columns is not None:
         problems += columns.problems()
-    problems += bundle_problems(location, deep)
+    problems += bundle_problems(location, deep, root.left_out)
     if deep:
         problems += content_problems(root, commits, columns, sound=not problems)
         problems += [] if problems else reading_problems(root)

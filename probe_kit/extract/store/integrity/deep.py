@@ -80,7 +80,7 @@ def reading_problems(root: Root) -> Iterator[str]:
 
 
 def _read_first(run: Run, name: str) -> None:
-    Rows(open_array(run.data, name), [min(run.commits())])[0]
+    Rows(open_array(run.data, name), [min(commit["episode"] for commit in run.commits())])[0]
 
 
 def _complaints(reader: Callable[[], object]) -> Iterator[str]:
