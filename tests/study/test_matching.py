@@ -1,0 +1,52 @@
+"""Runs of suites that ask the same and are not the same are never joined."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from probe_kit.errors import SettingsMismatchError
+from probe_kit.extract import Run, open_run
+from probe_kit.extract.store.locations.locate import locate
+from probe_kit.retention.compare.common_items import common_items
+from probe_kit.study.matching import check_same_items
+from probe_kit.study.planned_suite import planned_suite
+from probe_kit.study.schema import SuiteTable
+from probe_kit.suite import Suite
+from tests.support.changed_suites import other_version, save_changed, without_twins
+from tests.support.little_run import episode, little_plan, little_writer
+
+
+def run_of(suite: Suite, where: Path) -> Run:
+    plan = little_plan(suite.select(["color"], 2))
+    writer = little_writer(locate(where), plan)
+    for number in writer.remaining():
+        writer.write(episode(plan, number))
+    return open_run(where)
+
+
+def test_runs_whose_items_have_other_twins_share_no_item(small_suite: Suite, tmp_path: Path) -> None:
+    runs = [run_of(small_suite, tmp_path / "one"), run_of(without_twins(small_suite), tmp_path / "other")]
+    assert runs[0].suite != runs[1].suite
+    assert runs[0].seed_text == runs[1].seed_text
+    assert [category.n_items for category in common_items(runs).values()] == [0]
+    with pytest.raises(SettingsMismatchError, match="hold different items as"):
+        check_same_items(runs)
+
+
+def test_runs_of_two_versions_share_the_items_that_stayed(small_suite: Suite, tmp_path: Path) -> None:
+    """The version stands in the hash of the suite, and not in that of an item, by which runs are paired."""
+    runs = [run_of(small_suite, tmp_path / "one"), run_of(other_version(small_suite), tmp_path / "other")]
+    assert runs[0].suite.partition("#")[2] != runs[1].suite.partition("#")[2]
+    assert [category.n_items for category in common_items(runs).values()] == [2]
+    check_same_items(runs)
+
+
+@pytest.mark.parametrize(("change", "items_differ"), [(without_twins, True), (other_version, False)])
+def test_a_study_sees_that_the_suite_in_its_folder_was_changed(
+    change: Callable[[Suite], Suite], items_differ: bool, small_suite: Suite, tmp_path: Path
+) -> None:
+    changed = save_changed(change(small_suite), tmp_path / "changed")
+    before, after = (planned_suite(SuiteTable(path=str(suite.folder)))[0] for suite in (small_suite, changed))
+    assert (before.contents != after.contents) is items_differ
+    assert (before.identity != after.identity) is not items_differ
