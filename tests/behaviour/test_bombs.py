@@ -8,6 +8,7 @@ import tracemalloc
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ import google_crc32c
 import numpy as np
 import pytest
 import torch
+import zarr
 from numcodecs import Blosc
 from PIL import Image
 from safetensors.torch import save_file
@@ -25,6 +27,7 @@ from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit._system.bounded_json import load_gzipped_json, parse_json
 from probe_kit.errors import RunDamagedError, SuiteError, UsageError, WeightsError
 from probe_kit.extract import Run, open_run, verify_run
+from probe_kit.extract.store.format.arrays import open_array
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hooks.checkpoints.weights import read_pickle, read_weights
 from probe_kit.study import load_study
@@ -340,6 +343,14 @@ def test_a_sparse_file_in_a_run_is_refused_by_its_size(name: str, run: Path) -> 
         column(run)
     with suppress(RunDamagedError):
         assert verify_run(run, deep=True).problems
+
+
+def test_threads_that_open_arrays_at_once_do_not_take_each_others_codecs(run: Path) -> None:
+    opened = open_run(run)
+    with ThreadPoolExecutor(8) as threads:
+        arrays = list(threads.map(lambda _: open_array(opened.data, "backbone/pooled"), range(200)))
+    assert len(arrays) == 200
+    assert zarr.config.get("codecs.blosc") == "zarr.codecs.blosc.BloscCodec"
 
 
 def test_the_same_run_unchanged_is_read(run: Path) -> None:

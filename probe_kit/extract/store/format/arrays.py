@@ -7,6 +7,7 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ ENTRY, CHECKSUM = 16, 4
 index that Zarr writes at the end of every shard."""
 _RESTORE = "Restore the run from a copy, or extract it again"
 _MOST_CHUNKS = 10_000_000
+_ONE_AT_A_TIME = Lock()
 _BLOSC_SIZE = slice(4, 8)
 """Place of the size, unpacked, in the header of a chunk that blosc wrote."""
 _ABSENT = (1 << 64) - 1
@@ -144,7 +146,7 @@ class BoundedBloscCodec(BloscCodec):
 
     def _decode_sync(self, chunk_bytes: Buffer, chunk_spec: ArraySpec) -> Buffer:
         expected = math.prod(chunk_spec.shape) * chunk_spec.dtype.to_native_dtype().itemsize
-        declared = int.from_bytes(chunk_bytes.to_bytes()[_BLOSC_SIZE], "little")
+        declared = int.from_bytes(chunk_bytes.as_numpy_array()[_BLOSC_SIZE].tobytes(), "little")
         if declared != expected:
             raise ValueError(f"a chunk of {expected:,} bytes unpacks to {declared:,}")
         return super()._decode_sync(chunk_bytes, chunk_spec)
@@ -156,7 +158,9 @@ register_codec("blosc", BoundedBloscCodec)  # chosen where `bounded_codecs` says
 @contextmanager
 def bounded_codecs() -> Iterator[None]:
     """Give arrays that are opened inside codecs that unpack no more bytes than a chunk has."""
-    with zarr.config.set({"codecs.blosc": f"{BoundedBloscCodec.__module__}.{BoundedBloscCodec.__qualname__}"}):
+    # The configuration of zarr is one for all threads; another thread's end would set it back too early.
+    name = f"{BoundedBloscCodec.__module__}.{BoundedBloscCodec.__qualname__}"
+    with _ONE_AT_A_TIME, zarr.config.set({"codecs.blosc": name}):
         yield
 
 
