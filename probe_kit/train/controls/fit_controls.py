@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.estimates.balanced import CHANCE
-from probe_kit.statistics.estimates.shares import Share
+from probe_kit.statistics.estimates.shares import Accuracy
 from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_best
 from probe_kit.train.choices import Baseline
@@ -217,5 +217,5 @@ def _gain_limits(
     here: NDArray[np.float64], there: NDArray[np.float64], groups: NDArray[np.str_]
 ) -> tuple[float, float]:
     """95 % interval of the difference of two accuracies on the same episodes."""
-    gap = Share.of(here, groups).difference(Share.of(there, groups))
+    gap = Accuracy.of(here, groups).difference(Accuracy.of(there, groups))
     return gap.low, gap.high

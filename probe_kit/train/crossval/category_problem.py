@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.estimates.balanced import balanced_sums
-from probe_kit.statistics.estimates.shares import Share
+from probe_kit.statistics.estimates.shares import Accuracy
 from probe_kit.statistics.folds import fold_units
 from probe_kit.statistics.label_permutations import exchange_groups, flip_groups, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -57,13 +57,13 @@ class CategoryProblem:
         """Probe the samples of this category's episodes, and again for every column of (E, P) permuted labels."""
         return probe_site(samples, self.labels, permuted_labels, self.folds)
 
-    def accuracy(self, probe: SiteProbe) -> Share:
+    def accuracy(self, probe: SiteProbe) -> Accuracy:
         """Held-out accuracy of a probe, balanced between the sides, groups of items as the unit."""
         fold_of = np.empty(self.labels.size, np.int64)
         for number, fold in enumerate(self.folds):
             fold_of[fold.outer.test] = number
         sums = balanced_sums(probe.decisions[None, :], self.labels, fold_of, self.groups)
-        return Share(np.unique(self.groups), sums.sums[0], sums.sizes)
+        return Accuracy(np.unique(self.groups), sums.sums[0], sums.sizes)
 
 
 def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSettings) -> CategoryProblem:

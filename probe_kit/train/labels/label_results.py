@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.statistics.estimates.shares import Accuracy
 from probe_kit.statistics.folds import Fold, split_by_fold
 from probe_kit.statistics.label_permutations import max_statistic_p, pointwise_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.statistics.student import student_interval, unbounded_student_interval
+from probe_kit.statistics.student import unbounded_student_interval
 from probe_kit.train.choices import Task
 from probe_kit.train.labels.label_settings import LabelSettings
-from probe_kit.train.labels.task_scores import balanced_scores, fold_spearman
+from probe_kit.train.labels.task_scores import balanced_scores, class_weights, fold_spearman
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -271,7 +271,7 @@ class LabelResults:
         last = {site.stream: max(o.layer for o in curve.sites if o.stream == site.stream) for site in curve.sites}
         rows = []
         for row, (site, part) in enumerate(zip(curve.sites, curve.parts, strict=True)):
-            low, high = score_interval(curve.scores[row], self.groups, own.task, own.seed)
+            low, high = score_interval(curve.scores[row], self.labels, self.groups, own.task)
             exceeded = self.controls.exceeded(view, site)
             rows.append(
                 {
@@ -310,11 +310,13 @@ class LabelResults:
         return rows
 
 
-def score_interval(scores: Matrix, groups: NDArray[np.str_], task: Task, seed: int) -> tuple[float, float]:
-    """95 % interval of the mean of (n,) scores, by Student's t with groups as the unit, in the metric's range."""
+def score_interval(scores: Matrix, labels: Matrix, groups: NDArray[np.str_], task: Task) -> tuple[float, float]:
+    """Return the 95 % interval of the mean of (n,) scores, groups as the unit.
+
+    labels: (n,) coded. Balanced accuracy has Wilson's interval (`Accuracy`), R² Student's, which is approximate.
+    """
     if task == "continuous":
         low, high = unbounded_student_interval(scores, groups)
         return low, min(high, 1.0)
-    largest = max(1.0, float(scores.max()))
-    low, high = student_interval(scores, groups, derive_seed("label interval", seed), (0.0, largest))
-    return low, min(high, 1.0)
+    interval = Accuracy.of(scores > 0, groups, class_weights(labels)).interval()
+    return interval.low, interval.high

@@ -22,6 +22,13 @@ def balanced_scores(predicted: Matrix, truth: Matrix) -> Matrix:
     return scores
 
 
+def class_weights(labels: NDArray[np.floating]) -> Matrix:
+    """Return the (n,) weights 1 / (K π) of coded labels (n,), with K classes and the label's share π."""
+    classes, class_of, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    weights: Matrix = (1 / (classes.size * (counts / labels.size)))[class_of]
+    return weights
+
+
 def explained_scores(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> Matrix:
     """(n, K) scores of predicted quantities (n, K)."""
     deviations = np.empty_like(truth)

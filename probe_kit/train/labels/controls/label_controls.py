@@ -258,7 +258,7 @@ def _scored(name: Name, probe: LabelProbe, results: LabelResults, stream: str = 
     return LabelControl(
         name,
         probe.metric,
-        score_interval(probe.scores, results.groups, own.task, own.seed),
+        score_interval(probe.scores, results.labels, results.groups, own.task),
         float(probe.null.mean()) if probe.null.size else None,
         None if np.isnan(p) else p,
         stream,

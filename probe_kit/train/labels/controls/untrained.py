@@ -117,7 +117,7 @@ def add_untrained_control(
 
 def _score(best: LabelProbe, results: LabelResults, stream: str, view: str) -> LabelControl:
     own = results.settings
-    interval = score_interval(best.scores, results.groups, own.task, own.seed)
+    interval = score_interval(best.scores, results.labels, results.groups, own.task)
     by_step = tuple(results.by_step(best.scores).tolist())
     return LabelControl(UNTRAINED, best.metric, interval, None, None, stream, view, by_step)
 
