@@ -70,9 +70,11 @@ def prepare_baselines(
 
 
 def _warn_of_no_control(left_out: Sequence[Baseline], reason: SuiteNotFoundError) -> None:
+    names = f"control {left_out[0]} is" if len(left_out) == 1 else f"controls {' and '.join(left_out)} are"
+    judged = ", so that a signal is judged against chance only" if RANDOM_FEATURES in left_out else ""
     warnings.warn(
-        f"the control {', '.join(left_out)} is on by default and was NOT run, so that a signal is judged against "
-        f"chance only: {reason}; or say that you want none (--controls none, controls=())",
+        f"the {names} on by default and NOT run{judged}: {reason}; or say that you want none (--controls none, "
+        "controls=())",
         stacklevel=4,
     )
 
