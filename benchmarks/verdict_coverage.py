@@ -3,7 +3,8 @@
     python benchmarks/verdict_coverage.py [--draws 600] [--only rates;absent] [--seed 0] [--workers 1]
 
 rates: coverage of success rates in seven kinds of worlds with 6 to 150 groups, of their means over twelve
-categories, and of differences of two runs. absent: how often it is said where the best site has exactly the bound,
+categories, and of differences of two runs. unequal: of success rates in 96 worlds of groups of very unequal size.
+absent: how often it is said where the best site has exactly the bound,
 and where nothing is there. models: exchange p and Welch's interval of groups of models that do not differ.
 missing: retention of real nested probes with up to 60 % of one side missing; it uses a sixtieth of the draws.
 """
@@ -13,6 +14,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import numpy as np
 from coverage_worlds import World, draw_right
@@ -83,6 +85,7 @@ KINDS = (
     Rates("one group with 29 %, SR .7", 0.7, 0.3, _dominant),
 )
 GROUPS = (6, 12, 24, 75, 150)
+UNEQUAL_RATES = (0.5, 0.7, 0.9, 0.97)
 
 
 def rates(draws: int, seed: int) -> Table:
@@ -108,6 +111,32 @@ def _rates(kind: Rates, groups: int, draws: int, seed: int) -> str:
         gap = difference_interval(shares[a].value, limits[a], shares[b].value, limits[b])
         gaps.append(gap.low <= 0 <= gap.high)
     return f"{held:.1%} {width:.2f}, {np.mean(means):.1%}, {np.mean(gaps):.1%}"
+
+
+def _steep(groups: int) -> Sizes:
+    """A few groups have most of the episodes: 40 of the largest, 2 of the smallest."""
+    return 2 * np.ceil(20 * np.exp(-3 * np.linspace(0, 1, groups))).astype(np.int64)
+
+
+def unequal(draws: int, seed: int) -> Table:
+    """Least and mean coverage, and median width, by rate and sizes; over 6 to 75 groups and two correlations."""
+    sizes = {"2 to 16 episodes": _unequal, "one group with 29 %": _dominant, "2 to 40, few large": _steep}
+    table = Table(
+        "groups of", *(f"SR {rate:g}" for rate in UNEQUAL_RATES), title="SR of unequal groups: 96 worlds"
+    )
+    for name, size in sizes.items():
+        cells = []
+        for rate in UNEQUAL_RATES:
+            shares, widths = [], []
+            for alike, groups in product((0.1, 0.5), (6, 12, 24, 75)):
+                generator = np.random.default_rng(derive_seed("unequal", seed, name, rate, alike, groups))
+                kind = Rates(name, rate, alike, size)
+                limits = [Share.of(*kind.draw(groups, generator)).interval() for _ in range(draws)]
+                shares.append(np.mean([one.low <= rate <= one.high for one in limits]))
+                widths.append(np.median([one.high - one.low for one in limits]))
+            cells.append(f"{min(shares):.1%}, {np.mean(shares):.1%}, {np.mean(widths):.2f}")
+        table.add_row(name, *cells)
+    return table
 
 
 SITES = (1, 4, 19, 180)
@@ -207,6 +236,7 @@ def _features(labels: NDArray[np.bool_], strength: float, generator: np.random.G
 
 SECTIONS: dict[str, Callable[[int, int], Table]] = {
     "rates": rates,
+    "unequal": unequal,
     "absent": absent,
     "models": models,
     "missing": missing,

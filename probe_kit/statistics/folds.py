@@ -49,6 +49,15 @@ def grouped_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int)
     return folds
 
 
+def stratified_folds(strata: ArrayLike, groups: ArrayLike, n_folds: int, seed: int) -> list[Fold]:
+    """Return `n_folds` folds of whole groups, balanced by stratum and size.
+
+    strata, groups: (E,). Folds that do not depend on labels keep p-values exact where groups exchange labels. A
+    training side may hold a single class. Raises TooFewGroupsError if there are fewer groups than folds.
+    """
+    return split_by_fold(assign_folds(strata, groups, n_folds, seed), range(n_folds))
+
+
 def split_by_fold(fold_of: NDArray[np.integer], numbers: Iterable[int]) -> list[Fold]:
     """The splits of (E,) fold numbers, one for each of `numbers`."""
     return [Fold(np.flatnonzero(fold_of != number), np.flatnonzero(fold_of == number)) for number in numbers]

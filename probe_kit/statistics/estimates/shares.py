@@ -120,7 +120,7 @@ class Share:
         """95 % interval by `share_interval`; 0 to 1 with a single group."""
         if self.groups.size == 1:
             return Interval(0.0, 1.0)
-        low, high = share_interval(self.value, self.variance, self.n_groups, self.sizes.sum(), self.df)
+        low, high = share_interval(self.value, self.variance, self.groups.size, self.sizes.sum(), self.df)
         return Interval(float(low), float(high))
 
 
@@ -168,8 +168,9 @@ def share_interval(
     share, variance: the estimates and their variances with groups as the unit. n_episodes: E of them. df: degrees
     of freedom of the variance. tail: chance of either side. With
     n = min(s (1 − s) / v, E) · (t(1 − tail, E − 1) / t(1 − tail, df))² the limits are
-    Beta⁻¹(tail; s n, n − s n + 1) and Beta⁻¹(1 − tail; s n + 1, n − s n). Where nothing varies,
-    n is `n_groups`.
+    Beta⁻¹(tail; s n, n − s n + 1) and Beta⁻¹(1 − tail; s n + 1, n − s n). Where nothing varies, n is `n_groups`,
+    whatever their sizes: G groups that are alike with chance p all agree with chance p^G. No share is better known
+    than there. Without this rule a share near 1 of unequal groups with few errors is covered in 88 %.
     """
     from scipy.special import betaincinv, stdtrit  # type: ignore[import-untyped]
 
@@ -182,7 +183,8 @@ def share_interval(
     none, all_ = right <= 1e-9, wrong <= 1e-9
     low = betaincinv(np.where(none, 1.0, right), wrong + 1, tail)
     high = betaincinv(right + 1, np.where(all_, 1.0, wrong), 1 - tail)
-    return np.where(none, 0.0, low), np.where(all_, 1.0, high)
+    perfect = tail ** (1 / n_groups)
+    return np.where(none, 0.0, np.minimum(low, perfect)), np.where(all_, 1.0, np.maximum(high, 1 - perfect))
 
 
 def wilson_interval(

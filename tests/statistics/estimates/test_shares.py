@@ -158,3 +158,23 @@ def test_intervals_of_accuracies_cover_their_share(truth: float, sizes: NDArray[
         interval = Accuracy.of(generator.random(groups.size) < chance[groups], groups).interval()
         covered.append(interval.low <= truth <= interval.high)
     assert np.mean(covered) > 0.92
+
+
+@pytest.mark.parametrize("rate", [0.9, 0.97])
+def test_success_rates_of_very_unequal_groups_are_covered(rate: float) -> None:
+    generator = np.random.default_rng(0)
+    sizes = 2 * np.ceil(20 * np.exp(-3 * np.linspace(0, 1, 24))).astype(int)
+    groups = np.repeat(np.arange(24), sizes)
+    covered = []
+    for _ in range(400):
+        chance = generator.beta(rate, 1 - rate, 24)  # correlation 1/2
+        interval = Share.of(generator.random(groups.size) < chance[groups], groups).interval()
+        covered.append(interval.low <= rate <= interval.high)
+    assert np.mean(covered) > 0.92
+
+
+def test_one_group_that_fails_makes_a_success_rate_no_better_known() -> None:
+    sizes = np.array([40, 30, 20, 10, 4, 2, 2, 2])
+    groups = np.repeat(np.arange(8), sizes)
+    lows = [Share.of(values, groups).interval().low for values in (np.ones(groups.size), groups < 7)]
+    assert lows[0] >= lows[1]
