@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from math import sqrt
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -14,6 +15,13 @@ if TYPE_CHECKING:
 
 OUTER_FOLDS, INNER_FOLDS = 5, 4
 """Folds that score probes, and folds of a training side that choose C. A fold needs a group of its own."""
+
+SHARED_TRAINING = sqrt(1 + OUTER_FOLDS / (OUTER_FOLDS - 1))
+"""Factor, 1.5, by which folds that share training groups widen the standard error of a held-out mean.
+
+Nadeau and Bengio, “Inference for the generalization error”, Machine Learning 52 (2003): with K folds the variance
+is 1/K + n_test/n_train in place of 1/K, which is 1 + K / (K − 1) times as much.
+"""
 
 FoldUnit = Literal["groups", "concepts"]
 FOLD_UNITS: dict[str, str] = {

@@ -199,7 +199,7 @@ def wilson_interval(
     (s + t²/2n ± t √(s (1 − s)/n + t²/4n²)) / (1 + t²/n). Where all groups agree the variance knows nothing of
     other groups: n is G, and t is the normal quantile. No accuracy is better known than there.
     """
-    from scipy.special import stdtrit  # type: ignore[import-untyped]
+    from scipy.special import stdtrit
 
     s, v = np.broadcast_arrays(np.asarray(share, np.float64).clip(0, 1), variance)
     agree = (v <= NEGLIGIBLE_VARIANCE) | (s <= 0) | (s >= 1)

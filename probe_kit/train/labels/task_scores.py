@@ -31,11 +31,16 @@ def class_weights(labels: NDArray[np.floating]) -> Matrix:
 
 def explained_scores(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> Matrix:
     """(n, K) scores of predicted quantities (n, K)."""
+    scores: Matrix = 1 - (truth - predicted) ** 2 / squared_deviations(truth, folds).mean(axis=0)
+    return scores
+
+
+def squared_deviations(truth: Matrix, folds: list[Fold]) -> Matrix:
+    """Return (n, K) squared deviations of quantities from the mean of their fold's training labels."""
     deviations = np.empty_like(truth)
     for fold in folds:
         deviations[fold.test] = (truth[fold.test] - truth[fold.train].mean(axis=0)) ** 2
-    scores: Matrix = 1 - (truth - predicted) ** 2 / deviations.mean(axis=0)
-    return scores
+    return deviations
 
 
 def fold_spearman(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> float:

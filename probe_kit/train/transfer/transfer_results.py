@@ -80,7 +80,9 @@ class TransferResults:
         rows = []
         for row, (site, part) in enumerate(zip(fitted.sites, fitted.parts, strict=True)):
             low, high = score_interval(fitted.scores[row], self.labels, self.groups, self.task)
-            own_low, own_high = score_interval(curve.own[row], self.labels, self.groups, self.task)
+            own_low, own_high = score_interval(
+                curve.own[row], self.labels, self.groups, self.task, (self.labels - self.labels.mean()) ** 2
+            )
             rows.append(
                 {
                     "model": self.model,
