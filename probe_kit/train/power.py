@@ -23,6 +23,8 @@ FEWEST_ITEMS, MOST_ITEMS = OUTER_FOLDS * ITEMS_PER_GROUP, 1000
 """Between these the number of items is searched."""
 SEEDS = 5
 """Parts of a simulation, each with a limit of chance of its own; their spread is the error of the whole."""
+LAYERS = 5
+"""Random layers, whose mean is the reference of `random-features`."""
 NULL_DRAWS, POOL = 4000, 40_000
 """Experiments without signal per seed, and the groups that they are made of."""
 _NUMBERS = 200_000
@@ -168,8 +170,7 @@ def _part(items: int, signal: NDArray[np.float64], draws: int, seed: int) -> tup
     seen = []
     for draw in range(draws):
         here, untrained = _right(generator, signal, groups), _right(generator, nothing, groups)
-        layers = _right(generator, np.zeros(5), groups)
-        reference = layers[layers.sum(axis=1).argmax()].astype(float)
+        reference = _right(generator, np.zeros(LAYERS), groups).mean(axis=0)
         seen.append(
             (
                 here.mean(axis=1).max() > limit,
