@@ -3,10 +3,11 @@
     python benchmarks/verdict_coverage.py [--draws 600] [--only rates;absent] [--seed 0] [--workers 1]
 
 rates: coverage of success rates in seven kinds of worlds with 6 to 150 groups, of their means over twelve
-categories, and of differences of two runs. unequal: of success rates in 96 worlds of groups of very unequal size.
-absent: how often it is said where the best site has exactly the bound,
-and where nothing is there. models: exchange p and Welch's interval of groups of models that do not differ.
-missing: retention of real nested probes with up to 60 % of one side missing; it uses a sixtieth of the draws.
+categories, and of differences of two runs. unequal: of success rates in 96 worlds of groups of very unequal
+size. absent: how often it is said where the best site has exactly the bound, and where nothing is there. models:
+exchange p and Welch's interval of groups of models that do not differ; spreads: of unequal sizes and spreads;
+sisters: of several checkpoints of each training. missing: retention of real nested probes with up to 60 % of one
+side missing; it uses a sixtieth of the draws.
 """
 
 import argparse
@@ -30,7 +31,7 @@ from probe_kit.statistics.estimates.crossfit import Stream, crossfit
 from probe_kit.statistics.estimates.mover import difference_interval, mean_interval
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most
-from probe_kit.statistics.model_groups import exchange_p, welch_interval
+from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site
 from probe_kit.train.data.samples import Samples
@@ -184,6 +185,38 @@ def models(draws: int, seed: int) -> Table:
     return table
 
 
+SPREADS = ((3, 9, 1), (3, 9, 3), (4, 8, 3), (3, 6, 5), (2, 8, 3))
+
+
+def spreads(draws: int, seed: int) -> Table:
+    """Two groups of equal means: the first has fewer models, and a spread so many times as large."""
+    columns = ("models", "spread", "p ≤ .05 if shown always", "p ≤ .05 as shown", "Welch without 0")
+    table = Table(*columns, title="groups of models of unequal size and spread")
+    for few, many, spread in SPREADS:
+        generator = np.random.default_rng(derive_seed("spreads", seed, few, many, spread))
+        pairs = [(generator.normal(0, 0.08 * spread, few), generator.normal(0, 0.08, many)) for _ in range(draws)]
+        small = np.array([exchange_p(*pair).p <= SIGNIFICANCE for pair in pairs])
+        shown = np.array([is_exchangeable(*pair) for pair in pairs])
+        out = [not interval.low <= 0 <= interval.high for interval in (welch_interval(*pair) for pair in pairs)]
+        shares = (f"{share:.1%}" for share in (small.mean(), (small & shown).mean(), np.mean(out)))
+        table.add_row(f"{few} + {many}", f"× {spread}", *shares)
+    return table
+
+
+def sisters(draws: int, seed: int) -> Table:
+    """Two groups of trainings with three checkpoints each: false alarms of every checkpoint, and of their means."""
+    table = Table("trainings", "p ≤ .05, each checkpoint", "p ≤ .05, means", title="sister checkpoints")
+    for count in (2, 4, 6):
+        generator = np.random.default_rng(derive_seed("sisters", seed, count))
+        alarms = []
+        for _ in range(draws):
+            models = generator.normal(0, 0.08, (2, count, 1)) + generator.normal(0, 0.03, (2, count, 3))
+            each, mean = models.reshape(2, -1), models.mean(axis=2)
+            alarms.append([exchange_p(*values).p <= SIGNIFICANCE for values in (each, mean)])
+        table.add_row(f"{count} + {count}", *(f"{share:.1%}" for share in np.mean(alarms, axis=0)))
+    return table
+
+
 MISSING = (0.0, 0.1, 0.25, 0.4, 0.6)
 WIDTH, PAIRS = 16, 150
 
@@ -239,6 +272,8 @@ SECTIONS: dict[str, Callable[[int, int], Table]] = {
     "unequal": unequal,
     "absent": absent,
     "models": models,
+    "spreads": spreads,
+    "sisters": sisters,
     "missing": missing,
 }
 
