@@ -204,7 +204,7 @@ def spreads(draws: int, seed: int) -> Table:
 
 
 def sisters(draws: int, seed: int) -> Table:
-    """Two groups of trainings with three checkpoints each: false alarms of every checkpoint, and of their means."""
+    """Two groups of trainings with three checkpoints each: false alarms of each checkpoint, and of their means."""
     table = Table("trainings", "p ≤ .05, each checkpoint", "p ≤ .05, means", title="sister checkpoints")
     for count in (2, 4, 6):
         generator = np.random.default_rng(derive_seed("sisters", seed, count))
