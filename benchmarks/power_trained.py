@@ -21,16 +21,17 @@ from threadpoolctl import threadpool_limits
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.controls.random_features import LAYERS
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.power import LAYERS, simulate
+from probe_kit.train.power import ALIKE, NEIGHBOURS, simulate
 
-SITES, CARRIERS, WIDTH = 7, 2, 16
+SITES, CARRIERS, WIDTH = 7, (3, 4), 16
 Right = NDArray[np.bool_]
 
 
 class Experiment:
-    """The items of one draw. Every site has features of its own, and a part of the signal is common to a group."""
+    """The items of one draw. A part of the signal is common to a group, neighbouring sites are correlated."""
 
     def __init__(self, items: int, seed: int) -> None:
         self.generator, self.seed = np.random.default_rng(seed), seed
@@ -38,11 +39,21 @@ class Experiment:
         self.folds = nested_folds(self.labels, self.groups, seed)
         self.side = np.where(self.labels, 1.0, -1.0)
 
-    def site(self, strength: float) -> Right:
-        """(E,) whether each held-out decision of a site's probe is right."""
+    def sites(self, strengths: list[float]) -> Right:
+        """(S, E) whether each held-out decision of the probe of each site is right."""
+        noise = np.stack([self._noise() for _ in strengths])
+        for at in range(1, len(strengths)):
+            noise[at] = NEIGHBOURS * noise[at - 1] + np.sqrt(1 - NEIGHBOURS**2) * noise[at]
+        noise[:, :, 0] += np.array(strengths)[:, None] * self.side
+        return np.stack([self._right(features) for features in noise])
+
+    def _noise(self) -> NDArray[np.float64]:
         features = self.generator.standard_normal((self.labels.size, WIDTH))
         of_group = self.generator.standard_normal(self.groups[-1] + 1)[self.groups]
-        features[:, 0] = np.sqrt(0.7) * features[:, 0] + self.side * (np.sqrt(0.3) * of_group + strength)
+        features[:, 0] = np.sqrt(1 - ALIKE) * features[:, 0] + np.sqrt(ALIKE) * self.side * of_group
+        return features
+
+    def _right(self, features: NDArray[np.float64]) -> Right:
         nothing = np.empty((self.labels.size, 0), np.bool_)
         decisions = probe_site(Samples.pooled(features), self.labels, nothing, self.folds).decisions
         right: Right = (decisions > 0) == self.labels
@@ -52,11 +63,11 @@ class Experiment:
 def draw(items: int, strength: float, seed: int) -> tuple[float, float, float, float]:
     """Held-out accuracy of the signal, and p against the mean layer, the best layer and the untrained network."""
     experiment = Experiment(items, seed)
-    here = np.stack([experiment.site(strength if at < CARRIERS else 0.0) for at in range(SITES)])
-    untrained, layers = (np.stack([experiment.site(0.0) for _ in range(count)]) for count in (SITES, LAYERS))
+    here = experiment.sites([strength if at in CARRIERS else 0.0 for at in range(SITES)])
+    untrained, layers = (experiment.sites([0.0] * count) for count in (SITES, LAYERS))
     groups, best = experiment.groups, layers[layers.sum(axis=1).argmax()].astype(float)
     return (
-        float(here[:CARRIERS].mean()),
+        float(here[list(CARRIERS)].mean()),
         float(better_than_reference(here, layers.mean(axis=0), groups, seed).min()),
         float(better_than_reference(here, best, groups, seed).min()),
         float(better_than_best(here, untrained, groups, seed).min()),
@@ -69,7 +80,7 @@ def strength_for(items: int, accuracy: float, seed: int, draws: int = 12) -> flo
     for step in range(7):
         middle = (low + high) / 2
         seeds = [derive_seed("strength", seed, items, accuracy, step, number) for number in range(draws)]
-        reached = np.mean([Experiment(items, own).site(middle).mean() for own in seeds])
+        reached = np.mean([Experiment(items, own).sites([middle]).mean() for own in seeds])
         low, high = (middle, high) if reached < accuracy else (low, middle)
     return (low + high) / 2
 

@@ -15,6 +15,7 @@ from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most
 from probe_kit.statistics.folds import OUTER_FOLDS
 from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.controls.random_features import LAYERS
 
 NEIGHBOURS, ALIKE = 0.9, 0.3
 """Assumed correlation of neighbouring sites, and of the episodes of one group."""
@@ -23,8 +24,6 @@ FEWEST_ITEMS, MOST_ITEMS = OUTER_FOLDS * ITEMS_PER_GROUP, 1000
 """Between these the number of items is searched."""
 SEEDS = 5
 """Parts of a simulation, each with a limit of chance of its own; their spread is the error of the whole."""
-LAYERS = 5
-"""Random layers, whose mean is the reference of `random-features`."""
 NULL_DRAWS, POOL = 4000, 40_000
 """Experiments without signal per seed, and the groups that they are made of."""
 _NUMBERS = 200_000
