@@ -338,5 +338,6 @@ def score_interval(
         if deviations is None:
             return explained_interval(scores, (labels - labels.mean()) ** 2, groups)
         return explained_interval(scores, deviations, groups, SHARED_TRAINING)
-    interval = Accuracy.of(scores > 0, groups, class_weights(labels)).interval()
+    weights = class_weights(labels)
+    interval = Accuracy.of((scores / weights).clip(0, 1), groups, weights).interval()
     return interval.low, interval.high
