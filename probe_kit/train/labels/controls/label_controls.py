@@ -258,7 +258,7 @@ def _scored(name: Name, probe: LabelProbe, results: LabelResults, stream: str = 
     return LabelControl(
         name,
         probe.metric,
-        score_interval(probe.scores, results.groups, own.task, own.seed),
+        score_interval(probe.scores, results.labels, results.groups, own.task, results.deviations),
         float(probe.null.mean()) if probe.null.size else None,
         None if np.isnan(p) else p,
         stream,
@@ -271,6 +271,6 @@ def _compared(name: Name, references: dict[str, LabelProbe], results: LabelResul
         for stream in dict.fromkeys(site.stream for site in curve.sites):
             rows, reference = curve.stream(stream), references[stream]
             seed = derive_seed("label control", results.settings.seed, name, view, stream)
-            p = better_than_reference(curve.scores[rows], reference.scores, results.groups, seed)
+            p = better_than_reference(curve.scores[rows], reference.scores, results.groups, seed, results.widening)
             for row, of_site in zip(rows, p, strict=True):
                 yield LabelComparison(name, view, str(curve.sites[row]), reference.metric, float(of_site))
