@@ -19,7 +19,8 @@ def mover(mine: pd.DataFrame, theirs: pd.DataFrame) -> tuple[float, float]:
         df = E**2 / (by_group["size"] ** 2).sum() - 1
         n = min(s * (1 - s) / variance, E) * (stats.t.ppf(0.975, E - 1) / stats.t.ppf(0.975, df)) ** 2
         limits = stats.beta.ppf([0.025, 0.975], [s * n, s * n + 1], [n - s * n + 1, n - s * n])
-        found.append((s, *limits))
+        perfect = 0.025 ** (1 / G)  # no share is better known than where all groups agree
+        found.append((s, min(limits[0], perfect), max(limits[1], 1 - perfect)))
         rests.append(rest / E)
         variances.append(variance)
     (a, a_low, a_high), (b, b_low, b_high) = found

@@ -148,12 +148,10 @@ def test_a_stream_whose_best_site_never_changes_is_scored_by_that_site(
     assert low is not None
     assert high is not None
     V = found.scores.covariance[1, 1]
-    count = min(0.9 * 0.1 / V, 120) * (stats.t.ppf(0.975, 119) / stats.t.ppf(0.975, 50)) ** 2
-    wanted = (
-        stats.beta.ppf(0.025, 0.9 * count, 0.1 * count + 1),
-        stats.beta.ppf(0.975, 0.9 * count + 1, 0.1 * count),
-    )
-    assert (low, high) == pytest.approx(wanted)
+    # Wilson's limits are the roots of (0.9 − x)² = t² · x (1 − x) / n.
+    cut = stats.t.ppf(0.975, found.fit.df) ** 2 / min(0.9 * 0.1 / V, 120)
+    wanted = sorted(np.roots([1 + cut, -(1.8 + cut), 0.81]).real)
+    assert (low, high) == pytest.approx(tuple(wanted))
 
 
 def test_the_best_of_sites_that_guess_scores_one_half_where_its_peak_does_not(
