@@ -3,9 +3,11 @@
     python benchmarks/verdict_coverage.py [--draws 600] [--only rates;absent] [--seed 0] [--workers 1]
 
 rates: coverage of success rates in seven kinds of worlds with 6 to 150 groups, of their means over twelve
-categories, and of differences of two runs. absent: how often it is said where the best site has exactly the bound,
-and where nothing is there. models: exchange p and Welch's interval of groups of models that do not differ.
-missing: retention of real nested probes with up to 60 % of one side missing; it uses a sixtieth of the draws.
+categories, and of differences of two runs. unequal: of success rates in 96 worlds of groups of very unequal
+size. absent: how often it is said where the best site has exactly the bound, and where nothing is there. models:
+exchange p and Welch's interval of groups of models that do not differ; spreads: of unequal sizes and spreads;
+sisters: of several checkpoints of each training. missing: retention of real nested probes with up to 60 % of one
+side missing; it uses a sixtieth of the draws.
 """
 
 import argparse
@@ -13,6 +15,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +32,7 @@ from probe_kit.statistics.estimates.mover import difference_interval, mean_inter
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most, findable, is_absent
 from probe_kit.statistics.folds import fold_of_groups, sums_by_group
-from probe_kit.statistics.model_groups import exchange_p, welch_interval
+from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site
 from probe_kit.train.data.samples import Samples
@@ -84,6 +87,7 @@ KINDS = (
     Rates("one group with 29 %, SR .7", 0.7, 0.3, _dominant),
 )
 GROUPS = (6, 12, 24, 75, 150)
+UNEQUAL_RATES = (0.5, 0.7, 0.9, 0.97)
 
 
 def rates(draws: int, seed: int) -> Table:
@@ -109,6 +113,32 @@ def _rates(kind: Rates, groups: int, draws: int, seed: int) -> str:
         gap = difference_interval(shares[a].value, limits[a], shares[b].value, limits[b])
         gaps.append(gap.low <= 0 <= gap.high)
     return f"{held:.1%} {width:.2f}, {np.mean(means):.1%}, {np.mean(gaps):.1%}"
+
+
+def _steep(groups: int) -> Sizes:
+    """A few groups have most of the episodes: 40 of the largest, 2 of the smallest."""
+    return 2 * np.ceil(20 * np.exp(-3 * np.linspace(0, 1, groups))).astype(np.int64)
+
+
+def unequal(draws: int, seed: int) -> Table:
+    """Least and mean coverage, and median width, by rate and sizes; over 6 to 75 groups and two correlations."""
+    sizes = {"2 to 16 episodes": _unequal, "one group with 29 %": _dominant, "2 to 40, few large": _steep}
+    table = Table(
+        "groups of", *(f"SR {rate:g}" for rate in UNEQUAL_RATES), title="SR of unequal groups: 96 worlds"
+    )
+    for name, size in sizes.items():
+        cells = []
+        for rate in UNEQUAL_RATES:
+            shares, widths = [], []
+            for alike, groups in product((0.1, 0.5), (6, 12, 24, 75)):
+                generator = np.random.default_rng(derive_seed("unequal", seed, name, rate, alike, groups))
+                kind = Rates(name, rate, alike, size)
+                limits = [Share.of(*kind.draw(groups, generator)).interval() for _ in range(draws)]
+                shares.append(np.mean([one.low <= rate <= one.high for one in limits]))
+                widths.append(np.median([one.high - one.low for one in limits]))
+            cells.append(f"{min(shares):.1%}, {np.mean(shares):.1%}, {np.mean(widths):.2f}")
+        table.add_row(name, *cells)
+    return table
 
 
 SITES = (1, 4, 19, 180)
@@ -181,6 +211,38 @@ def models(draws: int, seed: int) -> Table:
     return table
 
 
+SPREADS = ((3, 9, 1), (3, 9, 3), (4, 8, 3), (3, 6, 5), (2, 8, 3))
+
+
+def spreads(draws: int, seed: int) -> Table:
+    """Two groups of equal means: the first has fewer models, and a spread so many times as large."""
+    columns = ("models", "spread", "p ≤ .05 if shown always", "p ≤ .05 as shown", "Welch without 0")
+    table = Table(*columns, title="groups of models of unequal size and spread")
+    for few, many, spread in SPREADS:
+        generator = np.random.default_rng(derive_seed("spreads", seed, few, many, spread))
+        pairs = [(generator.normal(0, 0.08 * spread, few), generator.normal(0, 0.08, many)) for _ in range(draws)]
+        small = np.array([exchange_p(*pair).p <= SIGNIFICANCE for pair in pairs])
+        shown = np.array([is_exchangeable(*pair) for pair in pairs])
+        out = [not interval.low <= 0 <= interval.high for interval in (welch_interval(*pair) for pair in pairs)]
+        shares = (f"{share:.1%}" for share in (small.mean(), (small & shown).mean(), np.mean(out)))
+        table.add_row(f"{few} + {many}", f"× {spread}", *shares)
+    return table
+
+
+def sisters(draws: int, seed: int) -> Table:
+    """Two groups of trainings with three checkpoints each: false alarms of each checkpoint, and of their means."""
+    table = Table("trainings", "p ≤ .05, each checkpoint", "p ≤ .05, means", title="sister checkpoints")
+    for count in (2, 4, 6):
+        generator = np.random.default_rng(derive_seed("sisters", seed, count))
+        alarms = []
+        for _ in range(draws):
+            models = generator.normal(0, 0.08, (2, count, 1)) + generator.normal(0, 0.03, (2, count, 3))
+            each, mean = models.reshape(2, -1), models.mean(axis=2)
+            alarms.append([exchange_p(*values).p <= SIGNIFICANCE for values in (each, mean)])
+        table.add_row(f"{count} + {count}", *(f"{share:.1%}" for share in np.mean(alarms, axis=0)))
+    return table
+
+
 MISSING = (0.0, 0.1, 0.25, 0.4, 0.6)
 WIDTH, PAIRS = 16, 150
 
@@ -235,8 +297,11 @@ def _features(labels: NDArray[np.bool_], strength: float, generator: np.random.G
 
 SECTIONS: dict[str, Callable[[int, int], Table]] = {
     "rates": rates,
+    "unequal": unequal,
     "absent": absent,
     "models": models,
+    "spreads": spreads,
+    "sisters": sisters,
     "missing": missing,
 }
 

@@ -62,7 +62,7 @@ def is_text(call: ast.Call) -> bool:
     values = [*call.args, keywords.get("mode")]
     modes = [value.value for value in values if isinstance(value, ast.Constant) and isinstance(value.value, str)]
     owner = getattr(getattr(call.func, "value", None), "id", "")
-    if name in ("open", "fdopen", "NamedTemporaryFile") and owner not in ("zarr", "tarfile", "av"):
+    if name in ("open", "fdopen", "NamedTemporaryFile") and owner not in ("zarr", "tarfile", "av", "archive"):
         return any(mode and set(mode) <= set("rwax+t") for mode in modes)
     return False
 

@@ -233,6 +233,7 @@ def retention_table(
     against: str | None = None,
     labels: Mapping[str, str] | None = None,
     pairs: Sequence[tuple[str, str]] | None = None,
+    origins: Mapping[str, str] | None = None,
     categories: Sequence[str] | None = None,
     with_behaviour: bool = True,
 ) -> RetentionTable:
@@ -250,12 +251,13 @@ def retention_table(
     `order-balanced`; they stand first. with_side_words: count their items in whose name a side stands. vlm_vla:
     compare every VLM run with every acting one, see `vlm_vla_differences`. labels: names of runs in tables and
     figures by their location, instead of their own. pairs: by location, the runs that are compared, each the first
-    minus the second, instead of every other with the first; all of them are one family of tests.
-    categories: rows of these alone, and means over them; probes are those of the whole runs. with_behaviour: False
-    leaves empty what the rule `disc` does not need (other rules and behaviour), so that no trajectory is read.
-    Raises UnknownSiteError for a view that was not probed, UsageError for an unknown key or a number of keys that
-    is not that of the runs, for a run that is given twice, or for `against` or `pairs` where they are none of the
-    runs; SceneError for overlapping zones.
+    minus the second, instead of every other with the first; all of them are one family of tests. origins: of
+    groups, what the models grew from by the location of their runs; models of one origin count as one. By default
+    checkpoints of one training do. categories: rows of these alone, and means over them; probes are those of the
+    whole runs. with_behaviour: False leaves empty what the rule `disc` does not need (other rules and behaviour),
+    so that no trajectory is read. Raises UnknownSiteError for a view that was not probed, UsageError for an
+    unknown key or a number of keys that is not that of the runs, for a run that is given twice, or for `against`
+    or `pairs` where they are none of the runs; SceneError for overlapping zones.
     """
     check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
@@ -286,7 +288,7 @@ def retention_table(
     compared = PairedRuns([], ())
     if isinstance(runs, Mapping):
         by_group = {name: [run for group, run in listed if group == name] for name in runs}
-        compared = compare_groups(by_group, drawn, against)
+        compared = compare_groups(by_group, drawn, against, origins)
     elif len(listed) > 1 or against is not None:
         compared = compare_runs([run for _, run in listed], drawn, names, against, vlm_vla, pairs)
     notes += [

@@ -1,6 +1,5 @@
 """Retention, success and drift of several checkpoints of one training, against the training step."""
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,6 +7,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.columns.text import difference_interval, number, percent, with_limits
 from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.compare.origins import checkpoint_of, split_checkpoint
 from probe_kit.retention.formats.numbers_table import NumbersTable
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
@@ -15,10 +15,6 @@ from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
 
 STEP = "step"
-_STEP = re.compile(r"(?:^|.*(?:step|checkpoint|ckpt|iter|iteration)s?[-_=]?)0*(\d+)$", re.IGNORECASE)
-"""A folder of a training: `020000`, `checkpoint-500`, `step_20000`, `ckpt-3`."""
-_INNER = ("pretrained_model", "model", "params", "weights")
-"""Folders that trainers put below that of a step. Others are not skipped: a folder above may be a date."""
 _NOTE = (
     "step: of the training; success: the cube ends on the correct picture; drift: the backbone's accuracy minus "
     "that of the first step, paired by items where both ran the same; each with its 95 % interval"
@@ -30,13 +26,9 @@ def training_step(run: RunReader) -> int:
 
     Raises UsageError for a run whose checkpoint is unknown or names no step.
     """
-    certificate: Mapping[str, Any] = getattr(run, "certificate", {})
-    checkpoint = str(certificate.get("policy", {}).get("checkpoint", ""))
-    folders = [name for name in re.split(r"[/\\]", checkpoint) if name]
-    while folders and folders[-1] in _INNER:
-        folders.pop()
-    if folders and (match := _STEP.match(folders[-1])):
-        return int(match[1])
+    checkpoint = checkpoint_of(run)
+    if (found := split_checkpoint(checkpoint)) is not None:
+        return found[1]
     raise UsageError(
         f"the training step of {run.location} is unknown: its checkpoint is {checkpoint or 'not stored'!r}; "
         "expected a folder such as checkpoints/020000 or checkpoint-500. Give the steps in the order of the runs, "

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from math import sqrt
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -14,6 +15,13 @@ if TYPE_CHECKING:
 
 OUTER_FOLDS, INNER_FOLDS = 5, 4
 """Folds that score probes, and folds of a training side that choose C. A fold needs a group of its own."""
+
+SHARED_TRAINING = sqrt(1 + OUTER_FOLDS / (OUTER_FOLDS - 1))
+"""Factor, 1.5, by which folds that share training groups widen the standard error of a held-out mean.
+
+Nadeau and Bengio, “Inference for the generalization error”, Machine Learning 52 (2003): with K folds the variance
+is 1/K + n_test/n_train in place of 1/K, which is 1 + K / (K − 1) times as much.
+"""
 
 FoldUnit = Literal["groups", "concepts"]
 FOLD_UNITS: dict[str, str] = {
@@ -47,6 +55,15 @@ def grouped_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int)
             "Extract more items of this category."
         )
     return folds
+
+
+def stratified_folds(strata: ArrayLike, groups: ArrayLike, n_folds: int, seed: int) -> list[Fold]:
+    """Return `n_folds` folds of whole groups, balanced by stratum and size.
+
+    strata, groups: (E,). Folds that do not depend on labels keep p-values exact where groups exchange labels. A
+    training side may hold a single class. Raises TooFewGroupsError if there are fewer groups than folds.
+    """
+    return split_by_fold(assign_folds(strata, groups, n_folds, seed), range(n_folds))
 
 
 def split_by_fold(fold_of: NDArray[np.integer], numbers: Iterable[int]) -> list[Fold]:

@@ -27,10 +27,12 @@ class ModelsP(NamedTuple):
 
 
 def exchange_p(first: Sequence[float], second: Sequence[float], seed: int = 0) -> ModelsP:
-    """p of two groups of models having equal means, their labels exchanged in all ways.
+    """p of two groups of models having equal distributions, their labels exchanged in all ways.
 
-    first, second: one value per model. 3 + 3 models cannot be below 0.1. seed: of the draws where there are more
-    ways than `MOST_EXACT`. Raises UsageError for an empty group or a value that is not finite.
+    The statistic is the difference of the means. A small p may also come from unequal spreads, where the sizes
+    differ too; see `is_exchangeable`. first, second: one value per model. 3 + 3 models cannot be below 0.1. seed:
+    of the draws where there are more ways than `MOST_EXACT`. Raises UsageError for an empty group or a value that
+    is not finite.
     """
     values, size = _values(first, second), len(first)
     ways = comb(values.size, size)
@@ -44,6 +46,19 @@ def exchange_p(first: Sequence[float], second: Sequence[float], seed: int = 0) -
     gaps, observed = _gaps(values, sums, size), _gaps(values, values[:size].sum(keepdims=True), size)[0]
     hits = int((gaps >= observed - _slack(values)).sum())
     return ModelsP((hits + 1) / (DRAWS + 1), 1 / (DRAWS + 1), False)
+
+
+def is_exchangeable(first: Sequence[float], second: Sequence[float]) -> bool:
+    """Return whether `exchange_p` holds its level for the difference of the means of two groups.
+
+    It does with equal sizes, and where the smaller group has no larger spread. Otherwise a spread five times as
+    large gives p ≤ 0.05 in 22 to 36 % of groups of equal means. A group of one model has no spread of its own, and
+    passes.
+    """
+    few, many = sorted((first, second), key=len)
+    if len(few) == len(many) or len(few) < 2:
+        return True
+    return float(np.std(few, ddof=1)) <= float(np.std(many, ddof=1))
 
 
 def welch_interval(first: Sequence[float], second: Sequence[float], largest: float = inf) -> Interval:

@@ -131,8 +131,9 @@ Controls = Annotated[
         "--controls",
         parser=some_of({**BASELINES, **LABEL_CONTROLS}, none="none"),
         metavar=f"{choices({**BASELINES, **LABEL_CONTROLS})},…",
-        help="Baselines that never see the model, comma-separated, or none. Default: random-features, if the "
-        "pictures of the suite are available. Labels of your own have step and state, not position. Default: all.",
+        help="Baselines that never see the model, comma-separated, or none. Default: random-features and "
+        "pixels, if the pictures of the suite are available. Labels of your own have step and state, not "
+        "position; default: all but action. pixels takes as long as one or two sites.",
     ),
 ]
 Untrained = Annotated[

@@ -113,13 +113,13 @@ def train_probes(
     out. folds: `concepts` also keeps items about the same two concepts together. incomplete: `drop` leaves out
     items of which an episode is missing. controls: baselines that never see the model, of `position`,
     `instruction`, and `pixels` and `random-features`, which need pictures; () for none. By default
-    `random-features`; where the pictures cannot be found a warning says that it was left out. suite: folder of
-    the run's suite; the embedded one is found or drawn again without it. untrained: a run of the same episodes,
-    usually by random weights, to subtract. What is no better than `random-features` and the untrained network is
-    no signal, whatever its p-value. jobs: processes that probe, this one alone by default; with more than one, a
-    script needs `if __name__ == "__main__":`. device: where torch solves the probes, such as `cuda`; numpy
-    without one. ray: address of a Ray cluster that probes, `auto` for the one this process belongs to or a new
-    one on this machine; `jobs` is then how many sites at once, by default as many as it has cores.
+    `random-features` and `pixels`; where the pictures cannot be found a warning says that they were left out.
+    suite: folder of the run's suite; the embedded one is found or drawn again without it. untrained: a run of the
+    same episodes, usually by random weights, to subtract. What is no better than `random-features` and the
+    untrained network is no signal, whatever its p-value. jobs: processes that probe, this one alone by default;
+    with more than one, a script needs `if __name__ == "__main__":`. device: where torch solves the probes, such as
+    `cuda`; numpy without one. ray: address of a Ray cluster that probes, `auto` for the one this process belongs
+    to or a new one on this machine; `jobs` is then how many sites at once, by default as many as it has cores.
 
     labels: a label of one's own, see `Labels`, instead of `target`. Its categories are probed together, as
     `window`, `align_to`, `controls`, `untrained` and pooled views of `train_label_probes` have it, and the results

@@ -50,7 +50,7 @@ def intervene(session: WiredSession, run: ArrayRun, asked: Intervention) -> None
         "categories": names, "readout": asked.readout, **asked.parameters(),
     }  # fmt: skip
     check = {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}
-    store_outcomes(run.location, run.seed_text, settings, outcomes, {"replay": check, **entries})
+    store_outcomes(run.location, run.suite, settings, outcomes, {"replay": check, **entries})
 
 
 def concluded(

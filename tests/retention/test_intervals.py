@@ -146,7 +146,7 @@ def test_one_number_has_one_interval_in_rows_curves_and_scores(table: RetentionT
         assert (row.retention.value, row.retention.ci) == (value, limits(again.interval))
 
 
-def test_the_interval_of_a_site_is_korn_and_graubards_in_scores_and_figures(table: RetentionTable) -> None:
+def test_the_interval_of_a_site_is_wilsons_in_scores_and_figures(table: RetentionTable) -> None:
     for results in table.results.values():
         for (category, view), curve in results.curves.items():
             own = results.scores[(results.scores["category"] == category) & (results.scores["view"] == view)]
@@ -158,26 +158,27 @@ def test_the_interval_of_a_site_is_korn_and_graubards_in_scores_and_figures(tabl
                 for at, layer in enumerate(line.layers)
             }
             for row, (_, score) in enumerate(own.iterrows()):
-                wanted = korn_graubard(curve.correct[row].reshape(-1, 2).sum(axis=1))
+                wanted = wilson(curve.correct[row].reshape(-1, 2).sum(axis=1))
                 assert (score["ci_low"], score["ci_high"]) == pytest.approx(wanted)
                 site = curve.sites[row]
                 assert drawn[site.stream, site.layer, site.iteration] == pytest.approx(wanted)
 
 
-def korn_graubard(right: np.ndarray[Any, np.dtype[np.int64]]) -> tuple[float, float]:
-    """Clopper and Pearson's, of (G,) hits in groups of two, with as many episodes as count."""
+def wilson(right: np.ndarray[Any, np.dtype[np.int64]]) -> tuple[float, float]:
+    """Wilson's interval of (G,) hits in groups of two, with as many episodes as count."""
     groups, episodes = right.size, 2 * right.size
     share = right.sum() / episodes
     variance = np.sum((right - 2 * share) ** 2) * groups / (groups - 1) / episodes**2
     if variance == 0:
-        count = float(groups)
+        count, quantile = float(groups), stats.norm.ppf(0.975)
     else:
-        lost = stats.t.ppf(0.975, episodes - 1) / stats.t.ppf(0.975, groups - 1)
-        count = min(share * (1 - share) / variance, episodes) * lost**2
-    hits, misses = share * count, (1 - share) * count
-    low = stats.beta.ppf(0.025, hits, misses + 1) if hits else 0.0
-    high = stats.beta.ppf(0.975, hits + 1, misses) if misses else 1.0
-    return float(low), float(high)
+        count = max(min(share * (1 - share) / variance, episodes), groups)
+        quantile = stats.t.ppf(0.975, groups - 1)
+    # The limits are the roots of (share − x)² = quantile² · x (1 − x) / count.
+    cut = quantile**2 / count
+    low, high = sorted(np.roots([1 + cut, -(2 * share + cut), share**2]).real)
+    least = stats.binomtest(groups, groups).proportion_ci(method="wilson").low
+    return max(0.0, min(low, least)), min(1.0, max(high, 1 - least))
 
 
 # -- means ---------------------------------------------------------------------------------------------------

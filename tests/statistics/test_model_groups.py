@@ -10,7 +10,7 @@ from probe_kit.errors import UsageError
 from probe_kit.statistics import model_groups
 from probe_kit.statistics.estimates.mover import NO_LIMITS
 from probe_kit.statistics.fieller import Interval
-from probe_kit.statistics.model_groups import exchange_p, welch_interval
+from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
 from probe_kit.statistics.paired_tests import flip_gains_p
 
 
@@ -126,3 +126,21 @@ def test_empty_groups_and_missing_values_are_refused() -> None:
             compare([], [0.1, 0.2])
         with pytest.raises(UsageError, match="expected finite numbers"):
             compare([0.1, float("nan")], [0.2])
+
+
+@pytest.mark.parametrize(("few", "many"), [(3, 6), (4, 8), (3, 9)])
+def test_p_that_is_shown_holds_its_level_whatever_the_spreads(few: int, many: int) -> None:
+    generator = np.random.default_rng(0)
+    for spread in (1, 3):
+        alarms = []
+        for _ in range(400):
+            pair = generator.normal(0, spread, few), generator.normal(0, 1, many)
+            alarms.append(is_exchangeable(*pair) and exchange_p(*pair).p <= 0.05)
+        assert np.mean(alarms) < 0.08
+
+
+def test_groups_of_equal_size_or_of_one_model_are_exchangeable() -> None:
+    assert is_exchangeable([0.1, 0.9], [0.5, 0.5])
+    assert is_exchangeable([0.1], [0.5, 0.5, 0.6])
+    assert not is_exchangeable([0.1, 0.9], [0.5, 0.5, 0.6])
+    assert is_exchangeable([0.5, 0.5], [0.5, 0.1, 0.9])

@@ -11,8 +11,8 @@ from probe_kit.retention.columns.text import (
     difference_test,
     is_vlm,
     model_name,
+    models_p,
     number,
-    p_text,
     percent,
     ratio_difference,
     with_limits,
@@ -172,7 +172,7 @@ def _difference_cells(row: Difference, intervals: bool) -> tuple[str, ...]:
     answered, acted = (sr, "") if row.mode == "answers" else ("", sr)
     ratio = ratio_difference(row.retention, row.retention_ci if intervals else None)
     models = row.sr_models
-    over_models = "" if models is None else f"{p_text(models.p)} ({p_text(models.smallest_p)})"
+    over_models = "" if models is None else models_p(models)
     return answered, backbone, action, acted, ratio, "", "" if over_models else difference_test(row), over_models
 
 

@@ -176,7 +176,7 @@ def difference_test(row: Difference) -> str:
 
 
 def models_test(test: ModelTest | None, scale: float, digits: int) -> str:
-    """p over models, the least possible one, and Welch's interval, a dash where it has no limits.
+    """p over models, the least possible one, and Welch's interval; a dash for no p, and for no limits.
 
     Empty without groups of models.
     """
@@ -185,7 +185,12 @@ def models_test(test: ModelTest | None, scale: float, digits: int) -> str:
     limits = "–"
     if None not in test.ci:
         limits = with_limits("", test.ci, lambda value: f"{scale * (value or 0):+.{digits}f}").strip()
-    return f"{p_text(test.p)} ({p_text(test.smallest_p)}) {limits}"
+    return f"{models_p(test)} {limits}"
+
+
+def models_p(test: ModelTest) -> str:
+    """p over models and the least possible one; a dash where spreads allow none."""
+    return p_text(None) if test.p is None else f"{p_text(test.p)} ({p_text(test.smallest_p)})"
 
 
 def p_text(value: float | None) -> str:

@@ -26,7 +26,7 @@ from probe_kit.retention.rows.parts import Mode
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.statistics.estimates.retention import Ratio, retention, retention_difference
 from probe_kit.statistics.estimates.scores import Scores
-from probe_kit.statistics.model_groups import exchange_p, welch_interval
+from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
 from probe_kit.statistics.multiple_testing import corrected
 
 if TYPE_CHECKING:
@@ -37,17 +37,18 @@ if TYPE_CHECKING:
 class ModelTest:
     """Two groups of models compared with the model as the unit.
 
-    n, n_minus: models of either group; runs of equal weights are of one. difference: of the groups' means, with
-    Welch's 95 % interval. p: exact and two-sided, of exchanging the models' labels; smallest_p: the least that so
-    few models allow.
+    n, n_minus: models of either group; runs of one origin are of one. difference: of the groups' means, with
+    Welch's 95 % interval. p: exact and two-sided, of exchanging the models' labels, which tests equal
+    distributions and not only equal means; smallest_p: the least that so few models allow. Both are None where the
+    smaller group has the larger spread, see `is_exchangeable`.
     """
 
     n: int
     n_minus: int
     difference: float
     ci: Limits
-    p: float
-    smallest_p: float
+    p: float | None
+    smallest_p: float | None
 
     @classmethod
     def of(cls, first: Sequence[float], second: Sequence[float], largest: float = inf) -> "ModelTest | None":
@@ -57,11 +58,11 @@ class ModelTest:
         """
         if len(first) + len(second) < 3 or not (first and second and all(map(isfinite, (*first, *second)))):
             return None
+        gap, interval = float(np.mean(first) - np.mean(second)), limits(welch_interval(first, second, largest))
+        if not is_exchangeable(first, second):
+            return cls(len(first), len(second), gap, interval, None, None)
         test = exchange_p(first, second)
-        gap = float(np.mean(first) - np.mean(second))
-        return cls(
-            len(first), len(second), gap, limits(welch_interval(first, second, largest)), test.p, test.smallest
-        )
+        return cls(len(first), len(second), gap, interval, test.p, test.smallest)
 
 
 @dataclass(frozen=True)
@@ -119,11 +120,16 @@ class Side:
 
 @dataclass(frozen=True)
 class ComparedSides:
-    """The first side minus the second. items: by category, what both have in common, as far as that is known."""
+    """The first side minus the second.
+
+    items: by category, what both have in common, as far as that is known. origins: what the model of each run grew
+    from, by location; by default its weights.
+    """
 
     here: Side
     there: Side
     items: Mapping[str, CommonItems] = field(default_factory=dict)
+    origins: Mapping[str, str] = field(default_factory=dict)
 
     def counts(self, row: Difference) -> tuple[int | None, int | None]:
         """`n_items` and `of_items` of a row."""
@@ -160,7 +166,11 @@ def _compare_sides(pair: ComparedSides) -> list[Difference]:
     if not shared:  # one was not probed, or in other views: behaviour can still be compared
         mine, theirs, shared = _behaviour(mine), _behaviour(theirs), [None]
     outcomes = _outcomes(here.drawn), _outcomes(there.drawn)
-    found = [row for view in shared for row in _compare((here, there), view, mine[view], theirs[view], outcomes)]
+    found = [
+        row
+        for view in shared
+        for row in _compare((here, there), view, mine[view], theirs[view], outcomes, pair.origins)
+    ]
     mode = here.drawn[0].row.run.mode
     found = [replace(row, call=call, run=here.run, minus_run=there.run, mode=mode) for row in found]
     counts = [pair.counts(row) for row in found]
@@ -243,17 +253,22 @@ def _pooled(rows: Sequence[RowWithEstimates]) -> PooledScores | None:
 
 
 def _compare(
-    sides: tuple[Side, Side], view: str | None, here: Drawn, there: Drawn, outcomes: tuple[Outcomes, Outcomes]
+    sides: tuple[Side, Side],
+    view: str | None,
+    here: Drawn,
+    there: Drawn,
+    outcomes: tuple[Outcomes, Outcomes],
+    origins: Mapping[str, str],
 ) -> list[Difference]:
     gaps = {category: _Gap.of(here[category], there[category]) for category in here if category in there}
     gaps = {category: gap for category, gap in gaps.items() if gap.sr is not None or gap.accuracies}
     rows = [
-        _row(sides, [category], view, [gap], (here, there), _p(outcomes, [category], [gap]))
+        _row(sides, [category], view, [gap], (here, there), _p(outcomes, [category], [gap]), origins)
         for category, gap in gaps.items()
     ]
     if rows:
         common, found = list(gaps), list(gaps.values())
-        mean = _row(sides, common, view, found, (here, there), _p(outcomes, common, found))
+        mean = _row(sides, common, view, found, (here, there), _p(outcomes, common, found), origins)
         rows.append(replace(mean, category=MEAN, categories=tuple(common)))
     return rows
 
@@ -276,6 +291,7 @@ def _row(
     gaps: Sequence[_Gap],
     drawn: tuple[Drawn, Drawn],
     tested: tuple[float | None, int | None],
+    origins: Mapping[str, str],
 ) -> Difference:
     """Of one category, or of the mean of several."""
     rows = [[of_side[category] for category in categories] for of_side in drawn]
@@ -300,8 +316,8 @@ def _row(
         view,
         all(gap.paired for gap in gaps),
         **numbers,  # type: ignore[arg-type]
-        sr_models=_models(rows, _sr_of_model, largest=1.0),
-        retention_models=None if ratio is None else _models(rows, _retention_of_model),
+        sr_models=_models(rows, _sr_of_model, origins, largest=1.0),
+        retention_models=None if ratio is None else _models(rows, _retention_of_model, origins),
         p=tested[0],
         n_groups=tested[1],
     )
@@ -328,22 +344,24 @@ def _retention(gaps: Sequence[_Gap]) -> Ratio | None:
 def _models(
     sides: Sequence[Sequence[Sequence[RowWithEstimates]]],
     value: Callable[[Sequence[RowWithEstimates]], float | None],
+    origins: Mapping[str, str],
     largest: float = inf,
 ) -> ModelTest | None:
-    """sides: per category, the row of each run. A value per model. largest: see `ModelTest`.
+    """Return the test of two sides with a value per origin of models.
 
-    None where a model has no value, or is on both sides: its labels cannot be exchanged.
+    sides: per category, the row of each run. origins: by location. largest: see `ModelTest`. None where a model
+    has no value, or is on both sides: its labels cannot be exchanged.
     """
     first, second = (_by_model(side, value) for side in sides)
     if first is None or second is None or first.keys() & second.keys():
         return None
-    return ModelTest.of(list(first.values()), list(second.values()), largest)
+    return ModelTest.of(_by_origin(first, sides[0], origins), _by_origin(second, sides[1], origins), largest)
 
 
 def _by_model(
     side: Sequence[Sequence[RowWithEstimates]], value: Callable[[Sequence[RowWithEstimates]], float | None]
 ) -> dict[str, float] | None:
-    """The value of each model over its categories, by the hash of its weights, or by run where that is unknown.
+    """Return the value of each model over its categories, see `_model`.
 
     Runs of one model, such as of several seeds, are averaged: they are no further models.
     """
@@ -351,11 +369,29 @@ def _by_model(
         return None
     values: dict[str, list[float]] = {}
     for of_run in zip(*side, strict=True):
-        found, run = value(of_run), of_run[0].row.run
+        found = value(of_run)
         if found is None:
             return None
-        values.setdefault(run.weights_sha256 or run.location, []).append(found)
+        values.setdefault(_model(of_run[0]), []).append(found)
     return {model: float(np.mean(own)) for model, own in values.items()} or None
+
+
+def _by_origin(
+    values: Mapping[str, float], side: Sequence[Sequence[RowWithEstimates]], origins: Mapping[str, str]
+) -> list[float]:
+    """Return a value per origin: the mean of its models, which resemble each other."""
+    origin_of: dict[str, str] = {}
+    for one in side[0]:
+        origin_of.setdefault(_model(one), origins.get(one.row.run.location, _model(one)))
+    grouped: dict[str, list[float]] = {}
+    for model, origin in origin_of.items():
+        grouped.setdefault(origin, []).append(values[model])
+    return [float(np.mean(models)) for models in grouped.values()]
+
+
+def _model(one: RowWithEstimates) -> str:
+    """Return the hash of a run's weights, or its location where that is unknown."""
+    return one.row.run.weights_sha256 or one.row.run.location
 
 
 def _sr_of_model(rows: Sequence[RowWithEstimates]) -> float | None:

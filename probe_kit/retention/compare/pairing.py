@@ -21,6 +21,7 @@ from probe_kit.retention.compare.differences import (
     group_pairs,
     pair_differences,
 )
+from probe_kit.retention.compare.origins import origins_of
 from probe_kit.retention.estimators.stream_scores import RowEstimates
 from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
@@ -79,20 +80,23 @@ def compare_groups(
     groups: Mapping[str, Sequence[RunReader]],
     drawn: Sequence[RowWithEstimates],
     against: str | None = None,
+    origins: Mapping[str, str] | None = None,
 ) -> PairedRuns:
     """Return every group of runs minus every earlier one, or minus the group `against`; see `compare_runs`.
 
     Two groups count as pairs in categories in which all of their runs have at least 80 % of the items in common,
-    and then on these items alone. In other categories each group has its own items.
-    Raises UsageError for a group that is none of them.
+    and then on these items alone. In other categories each group has its own items. origins: see `origins_of`.
+    Raises UsageError for a group that is none of them, and a declared origin of no run.
     """
     pairs, notes = [], []
+    grown = origins_of([run for of_group in groups.values() for run in of_group], origins)
     for names in group_pairs(list(groups), against):
         runs = [run for name in names for run in groups[name]]
         items = {name: one for name, one in common_items(runs).items() if one.is_many}
         sides = [Side(name, [one for one in drawn if one.row.group == name]) for name in names]
         notes += _left_out(" and ".join(names), items)
-        pairs.append(_on_common_items((sides[0], sides[1]), items, runs, others_too=True))
+        pair = _on_common_items((sides[0], sides[1]), items, runs, others_too=True)
+        pairs.append(replace(pair, origins=grown))
     return PairedRuns(pair_differences(pairs), tuple(notes))
 
 

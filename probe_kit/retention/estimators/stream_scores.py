@@ -49,7 +49,7 @@ class StreamScores:
         return CHANCE + float(self.fit.above[self.names.index(name)])
 
     def interval(self, name: str) -> Interval:
-        """Its 95 % interval (Korn and Graubard)."""
+        """Its 95 % interval (Wilson)."""
         return accuracy_interval(self.fit, self.names.index(name))
 
     def peak(self, name: str) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from probe_kit.errors import UsageError
 from probe_kit.statistics.estimates.balanced import CHANCE, Matrix
 from probe_kit.statistics.estimates.crossfit import CrossFit
-from probe_kit.statistics.estimates.shares import TAIL, share_interval
+from probe_kit.statistics.estimates.shares import TAIL, wilson_interval
 from probe_kit.statistics.fieller import Interval
 
 
@@ -46,17 +46,9 @@ class Scores:
 
 
 def accuracy_interval(fit: CrossFit, row: int) -> Interval:
-    """95 % interval of the held-out accuracy ½ + c of one category's chosen site, by `share_interval`.
-
-    Where the best site is right in every episode there are as many trials as groups.
-    """
-    low, high = share_interval(
-        CHANCE + fit.above[row],
-        fit.covariance[row, row],
-        fit.n_groups,
-        fit.n_episodes,
-        fit.df,
-        never_wrong=bool(fit.peaks[row] >= 1 - 1e-9),
+    """The 95 % interval of the held-out accuracy ½ + c of one category's chosen site, by `wilson_interval`."""
+    low, high = wilson_interval(
+        CHANCE + fit.above[row], fit.covariance[row, row], fit.n_groups, fit.n_episodes, fit.df
     )
     return Interval(float(low), float(high))
 

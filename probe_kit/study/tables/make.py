@@ -143,7 +143,9 @@ def _made(study: LoadedStudy, table: TableTable, runs: StoredRuns, name: str, pa
         groups = _groups(study, comparison.groups, runs)
         keys = probe_keys(study, [(one, one.run) for own in groups.values() for one in own], partial)
         grouped = {group: [one.run for one in own] for group, own in groups.items()}
-        return group_table(retention_table(grouped, labels=labels, keys=keys), f"Groups of models: {name}")
+        origins = {str(one.run.location): _origin(study, one.cell.model) for own in groups.values() for one in own}
+        found = retention_table(grouped, labels=labels, keys=keys, origins=origins)
+        return group_table(found, f"Groups of models: {name}")
     pairs, what = _pairs(comparison, runs.found), "Ablation" if comparison.chain is None else "Chain"
     keys = probe_keys(study, [(one, one.run) for one in runs.found], partial)
     return difference_table(retention_table(opened, labels=labels, pairs=pairs, keys=keys), f"{what}: {name}")
@@ -259,6 +261,13 @@ def _joins(study: LoadedStudy, runs: StoredRuns, labels: Mapping[str, str], part
         for vlm, policy in _sources(study, runs.found)
     ]
     return correct_joins(joins)
+
+
+def _origin(study: LoadedStudy, model: str) -> str:
+    """Return the model that a model was trained from, or itself: the first of the chain of `finetuned_from`."""
+    while (earlier := study.study.models[model].finetuned_from) is not None:
+        model = earlier
+    return model
 
 
 def _groups(study: LoadedStudy, names: list[str], runs: StoredRuns) -> dict[str, list[StoredRun]]:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from probe_kit._system.drafts import write_whole
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.bootstrap import group_bootstrap
+from probe_kit.statistics.estimates.shares import Accuracy
 from probe_kit.statistics.folds import assign_folds
 from probe_kit.statistics.significance import chance_margin
 from probe_kit.suite.items import Episode, Side
@@ -28,7 +28,6 @@ FILE_NAME = "baselines.json"
 FOLDS = 5
 
 _THUMBNAIL = 32
-_RESAMPLES = 1000
 _TREES = 60
 _WORD_BUCKETS = 256
 _INK_STEP = 60
@@ -123,7 +122,7 @@ def _category_baselines(suite: Suite, category: str, seed: int) -> Iterator[Base
             category=category,
             name=name,
             accuracy=round(float(hits.mean()), 4),
-            interval=_interval(hits, groups, seed),
+            interval=_interval(hits, groups),
             limit=round(limit_for(len(suite.items)), 4),
             items=len(suite.items),
             groups=len(names),
@@ -139,10 +138,10 @@ def _groups(episodes: Sequence[Episode]) -> tuple[npt.NDArray[np.str_], str]:
     return np.array([episode.item.pair_id for episode in episodes]), "pair_id"
 
 
-def _interval(hits: Array, groups: npt.NDArray[np.str_], seed: int) -> tuple[float, float]:
-    """95 % of the accuracies when whole groups are drawn with replacement."""
-    low, high = group_bootstrap(hits[:, None], groups, derive_seed("bootstrap", seed), _RESAMPLES)
-    return round(float(low[0]), 4), round(float(high[0]), 4)
+def _interval(hits: Array, groups: npt.NDArray[np.str_]) -> tuple[float, float]:
+    """95 % interval of an accuracy, groups as the unit."""
+    interval = Accuracy.of(hits, groups).interval()
+    return round(interval.low, 4), round(interval.high, 4)
 
 
 # -- features ----------------------------------------------------------------------------------------

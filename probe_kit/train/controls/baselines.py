@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 PICTURED: frozenset[Baseline] = frozenset({"pixels", "random-features"})
 """Those that need the pictures of the run's suite."""
-DEFAULT: tuple[Baseline, ...] = ("random-features",)
-"""Those that are run unless others, or none, are asked for."""
+DEFAULT: tuple[Baseline, ...] = ("random-features", "pixels")
+"""Those that are run where the suite's pictures are, unless others, or none, are requested."""
 THUMBNAIL = 32
 
 Features = NDArray[np.float32]

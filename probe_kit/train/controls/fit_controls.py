@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.estimates.balanced import CHANCE
-from probe_kit.statistics.estimates.shares import Share
+from probe_kit.statistics.estimates.shares import Accuracy
 from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_best
 from probe_kit.train.choices import Baseline
@@ -70,9 +70,11 @@ def prepare_baselines(
 
 
 def _warn_of_no_control(left_out: Sequence[Baseline], reason: SuiteNotFoundError) -> None:
+    names = f"control {left_out[0]} is" if len(left_out) == 1 else f"controls {' and '.join(left_out)} are"
+    judged = ", so that a signal is judged against chance only" if RANDOM_FEATURES in left_out else ""
     warnings.warn(
-        f"the control {', '.join(left_out)} is on by default and was NOT run, so that a signal is judged against "
-        f"chance only: {reason}; or say that you want none (--controls none, controls=())",
+        f"the {names} on by default and NOT run{judged}: {reason}; or say that you want none (--controls none, "
+        "controls=())",
         stacklevel=4,
     )
 
@@ -217,5 +219,5 @@ def _gain_limits(
     here: NDArray[np.float64], there: NDArray[np.float64], groups: NDArray[np.str_]
 ) -> tuple[float, float]:
     """95 % interval of the difference of two accuracies on the same episodes."""
-    gap = Share.of(here, groups).difference(Share.of(there, groups))
+    gap = Accuracy.of(here, groups).difference(Accuracy.of(there, groups))
     return gap.low, gap.high

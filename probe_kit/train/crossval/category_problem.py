@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.estimates.balanced import balanced_sums
-from probe_kit.statistics.estimates.shares import Share
-from probe_kit.statistics.folds import fold_units
+from probe_kit.statistics.estimates.shares import Accuracy
+from probe_kit.statistics.folds import fold_units, stratified_folds
 from probe_kit.statistics.label_permutations import exchange_groups, flip_groups, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.metrics import chance_level
@@ -57,7 +57,7 @@ class CategoryProblem:
         """Probe the samples of this category's episodes, and again for every column of (E, P) permuted labels."""
         return probe_site(samples, self.labels, permuted_labels, self.folds)
 
-    def accuracy(self, decisions: NDArray[np.float64]) -> Share:
+    def accuracy(self, decisions: NDArray[np.float64]) -> Accuracy:
         """Held-out accuracy of probes, balanced between the sides, groups of items as the unit.
 
         decisions: (E,) of one probe, or (K, E) of several, whose mean accuracy it is.
@@ -66,7 +66,7 @@ class CategoryProblem:
         for number, fold in enumerate(self.folds):
             fold_of[fold.outer.test] = number
         sums = balanced_sums(np.atleast_2d(decisions), self.labels, fold_of, self.groups)
-        return Share(np.unique(self.groups), sums.sums.mean(axis=0), sums.sizes)
+        return Accuracy(np.unique(self.groups), sums.sums.mean(axis=0), sums.sizes)
 
 
 def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSettings) -> CategoryProblem:
@@ -86,7 +86,7 @@ def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSet
     if settings.target != "chosen":
         _check_balance(labels, category, settings.call)
     try:
-        folds = nested_folds(labels, groups, derive_seed("folds", settings.seed, category))
+        folds = _folds(table, labels, groups, derive_seed("folds", settings.seed, category), settings)
     except TooFewGroupsError as error:
         if settings.call > 0:
             seen = f"{_reached(labels.size, settings.call)}: {np.unique(groups).size} independent groups of items"
@@ -104,6 +104,26 @@ def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSet
         permuted_labels=permuted_labels,
         token_permutations=settings.token_permutations,
     )
+
+
+def _folds(
+    table: "pd.DataFrame", labels: NDArray[np.bool_], groups: NDArray[np.str_], seed: int, settings: ProbeSettings
+) -> list[NestedFold]:
+    """Return folds that are balanced by side, for `chosen` by layout.
+
+    Groups exchange their chosen sides, so folds that knew the real ones would make them easier than any exchange.
+    Raises TooFewGroupsError as `nested_folds` does, and for a training side with a single class.
+    """
+    if settings.target != "chosen":
+        return nested_folds(labels, groups, seed)
+    folds = nested_folds(table["layout"].to_numpy(dtype=str), groups, seed, stratified_folds)
+    shares = [labels[inner.train].mean() for fold in folds for inner in fold.inner]
+    if min(shares) == 0 or max(shares) == 1:
+        raise TooFewGroupsError(
+            f"{labels.sum()} of {labels.size} episodes chose the left side, and a training fold holds one side "
+            "only; expected both in several groups. Extract more items of this category"
+        )
+    return folds
 
 
 def _complete(episodes: "pd.DataFrame") -> NDArray[np.bool_]:

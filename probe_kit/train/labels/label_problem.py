@@ -7,11 +7,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.folds import OUTER_FOLDS, Fold, assign_folds, split_by_fold
+from probe_kit.statistics.folds import OUTER_FOLDS, stratified_folds
 from probe_kit.statistics.label_permutations import exchange_blocks, movable_share, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import Task
@@ -71,7 +71,7 @@ def label_problem(
     trained on one value.
     """
     _check_groups(labels, samples)
-    folds = nested_folds(samples.strata, samples.groups, derive_seed("label folds", seed), _split)
+    folds = nested_folds(samples.strata, samples.groups, derive_seed("label folds", seed), stratified_folds)
     blocks, kinds = _blocks(run, samples)
     share = movable_share(blocks, kinds)
     if permutations and share < LEAST_MOVABLE:
@@ -126,11 +126,6 @@ def _check_groups(labels: Labels, samples: LabelledSamples) -> None:
                 f"expected at least {OUTER_FOLDS}. Label more episodes of it, merge it "
                 "with another class, or leave its cells empty"
             )
-
-
-def _split(strata: NDArray[np.str_], groups: ArrayLike, count: int, seed: int) -> list[Fold]:
-    """Folds of whole groups, balanced by stratum and size."""
-    return split_by_fold(assign_folds(strata, groups, count, seed), range(count))
 
 
 def _blocks(

@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.statistics.folds import Fold, split_by_fold
+from probe_kit.statistics.estimates.shares import Accuracy
+from probe_kit.statistics.folds import SHARED_TRAINING, Fold, split_by_fold
 from probe_kit.statistics.label_permutations import max_statistic_p, pointwise_p
+from probe_kit.statistics.paired_bootstrap import SHARED_PROBE
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.statistics.student import student_interval, unbounded_student_interval
+from probe_kit.statistics.student import explained_interval
 from probe_kit.train.choices import Task
 from probe_kit.train.labels.label_settings import LabelSettings
-from probe_kit.train.labels.task_scores import balanced_scores, fold_spearman
+from probe_kit.train.labels.task_scores import balanced_scores, class_weights, fold_spearman, squared_deviations
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -245,6 +246,11 @@ class LabelResults:
             f"Probes of {self.settings.target}: the best site of each stream", names, rows, repr(self)
         )
 
+    @property
+    def widening(self) -> float:
+        """Factor of differences of scores under exchange: R² of groups that share a probe is not independent."""
+        return SHARED_PROBE if self.settings.task == "continuous" else 1.0
+
     def with_controls(self, controls: LabelControls) -> "LabelResults":
         """The same with these controls."""
         return replace(self, controls=controls)
@@ -253,6 +259,11 @@ class LabelResults:
     def folds(self) -> list[Fold]:
         """The outer folds."""
         return split_by_fold(self.fold_of, np.unique(self.fold_of))
+
+    @cached_property
+    def deviations(self) -> Matrix:
+        """(n,) squared deviations of the labels from the mean of their fold's training labels."""
+        return squared_deviations(self.labels, self.folds)
 
     @cached_property
     def scores(self) -> "pd.DataFrame":
@@ -274,7 +285,7 @@ class LabelResults:
         last = {site.stream: max(o.layer for o in curve.sites if o.stream == site.stream) for site in curve.sites}
         rows = []
         for row, (site, part) in enumerate(zip(curve.sites, curve.parts, strict=True)):
-            low, high = score_interval(curve.scores[row], self.groups, own.task, own.seed)
+            low, high = score_interval(curve.scores[row], self.labels, self.groups, own.task, self.deviations)
             exceeded = self.controls.exceeded(view, site)
             rows.append(
                 {
@@ -313,11 +324,23 @@ class LabelResults:
         return rows
 
 
-def score_interval(scores: Matrix, groups: NDArray[np.str_], task: Task, seed: int) -> tuple[float, float]:
-    """95 % interval of the mean of (n,) scores, by Student's t with groups as the unit, in the metric's range."""
+def score_interval(
+    scores: Matrix,
+    labels: Matrix,
+    groups: NDArray[np.str_],
+    task: Task,
+    deviations: Matrix | None = None,
+) -> tuple[float, float]:
+    """Return the 95 % interval of the mean of (n,) scores, groups as the unit.
+
+    labels: (n,) coded. deviations: (n,) of a quantity from the mean of its fold's training labels, squared; None
+    for a probe that was fitted elsewhere, whose R² compares with the mean of these labels. Balanced accuracy has
+    Wilson's interval (`Accuracy`), R² that of `explained_interval`, which is approximate.
+    """
     if task == "continuous":
-        low, high = unbounded_student_interval(scores, groups)
-        return low, min(high, 1.0)
-    largest = max(1.0, float(scores.max()))
-    low, high = student_interval(scores, groups, derive_seed("label interval", seed), (0.0, largest))
-    return low, min(high, 1.0)
+        if deviations is None:
+            return explained_interval(scores, (labels - labels.mean()) ** 2, groups)
+        return explained_interval(scores, deviations, groups, SHARED_TRAINING)
+    weights = class_weights(labels)
+    interval = Accuracy.of((scores / weights).clip(0, 1), groups, weights).interval()
+    return interval.low, interval.high

@@ -22,13 +22,25 @@ def balanced_scores(predicted: Matrix, truth: Matrix) -> Matrix:
     return scores
 
 
+def class_weights(labels: NDArray[np.floating]) -> Matrix:
+    """Return the (n,) weights 1 / (K π) of coded labels (n,), with K classes and the label's share π."""
+    classes, class_of, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    weights: Matrix = (1 / (classes.size * (counts / labels.size)))[class_of]
+    return weights
+
+
 def explained_scores(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> Matrix:
     """(n, K) scores of predicted quantities (n, K)."""
+    scores: Matrix = 1 - (truth - predicted) ** 2 / squared_deviations(truth, folds).mean(axis=0)
+    return scores
+
+
+def squared_deviations(truth: Matrix, folds: list[Fold]) -> Matrix:
+    """Return (n, K) squared deviations of quantities from the mean of their fold's training labels."""
     deviations = np.empty_like(truth)
     for fold in folds:
         deviations[fold.test] = (truth[fold.test] - truth[fold.train].mean(axis=0)) ** 2
-    scores: Matrix = 1 - (truth - predicted) ** 2 / deviations.mean(axis=0)
-    return scores
+    return deviations
 
 
 def fold_spearman(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> float:

@@ -51,15 +51,25 @@ def best_sites_table(
 
 
 def best_sites_sentences(results: ProbeResults) -> list[str]:
-    """One per category, of the first view: in which streams the target can be decoded."""
+    """One per category, of the first view: in which streams the target can be decoded, or from pictures alone."""
     rows = _rows(results, results.settings.views[0])
     found = []
     for category in dict.fromkeys(str(row["category"]) for row in rows):
         own = [row for row in rows if row["category"] == category]
         name, count = category_of(category).title, own[0]["n"]
         parts = "; ".join(map(_in_stream, own))
-        found.append(f"{name} ({count} episodes): {_TARGETS[results.settings.target]} is {parts}.")
+        pictures = _from_pictures(results, category)
+        found.append(f"{name} ({count} episodes): {_TARGETS[results.settings.target]} is {parts}.{pictures}")
     return found
+
+
+def _from_pictures(results: ProbeResults, category: str) -> str:
+    """A sentence where the control `pixels` decodes the target, for no model has to know it then."""
+    pixels = results.controls.of_category(category).get("pixels")
+    if pixels is None or not pixels.above_chance:
+        return ""
+    accuracy, low, high = (f"{100 * share:.0f}" for share in (pixels.accuracy, *pixels.ci))
+    return f" The pictures alone decode it too ({accuracy} %, {low} to {high})."
 
 
 def _rows(results: ProbeResults, view: str) -> "list[pd.Series]":

@@ -12,7 +12,7 @@ from probe_kit.errors import UnknownSiteError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.statistics.estimates.balanced import CHANCE
-from probe_kit.statistics.estimates.shares import group_shares, share_interval
+from probe_kit.statistics.estimates.shares import effective_groups, group_shares, wilson_interval
 from probe_kit.statistics.label_permutations import pointwise_p, smallest_p
 from probe_kit.train.crossval.metrics import fold_auc, log_loss
 from probe_kit.train.data.run_reader import RunReader
@@ -101,7 +101,8 @@ def _score_rows(results: ProbeResults, category: str, view: str, curve: ProbeCur
     settings, folds, correct = results.settings, curve.folds(), curve.correct
     accuracy, sums = correct.mean(axis=1), curve.sums
     shares, variances = group_shares(sums.sums, sums.sizes)
-    low, high = share_interval(shares, variances, sums.n_groups, sums.n_episodes, sums.n_groups - 1)
+    count = effective_groups(sums.sizes)
+    low, high = wilson_interval(shares, variances, count, sums.n_episodes, max(count - 1, 1.0))
     p, p_fwe, control = pointwise_p(accuracy, curve.null), curve.p_fwe(), curve.control_accuracy
     exceeds = [
         results.controls.exceeds(category, view, str(site), float(p_site))

@@ -94,7 +94,6 @@ def transfer_probes(
         smallest_p=test.smallest_p,
         trained_on={"samples": train.samples.rows.size, "groups": np.unique(train.samples.groups).size},
         left_out={**samples.left_out, **({"groups that both runs have": shared} if shared else {})},
-        seed=seed,
     )
 
 

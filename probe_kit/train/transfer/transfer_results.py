@@ -55,7 +55,6 @@ class TransferResults:
     smallest_p: float
     trained_on: Mapping[str, int]
     left_out: Mapping[str, int]
-    seed: int
 
     def __repr__(self) -> str:
         return (
@@ -80,8 +79,10 @@ class TransferResults:
         p, p_fwe, moved_p = pointwise_p(fitted.metric, fitted.null), fitted.p_fwe(), moved.p_fwe()
         rows = []
         for row, (site, part) in enumerate(zip(fitted.sites, fitted.parts, strict=True)):
-            low, high = score_interval(fitted.scores[row], self.groups, self.task, self.seed)
-            own_low, own_high = score_interval(curve.own[row], self.groups, self.task, self.seed)
+            low, high = score_interval(fitted.scores[row], self.labels, self.groups, self.task)
+            own_low, own_high = score_interval(
+                curve.own[row], self.labels, self.groups, self.task, (self.labels - self.labels.mean()) ** 2
+            )
             rows.append(
                 {
                     "model": self.model,

@@ -170,7 +170,7 @@ def settings_of(run: ArrayRun, name: str) -> dict[str, Any]:
 def store(run: ArrayRun, name: str) -> None:
     _, _, make = POOL[name]
     outcomes, further = attention_records(*SHARES[name]) if name in SHARES else (make(), {})
-    store_outcomes(run.location, run.seed_text, settings_of(run, name), outcomes, further=further)
+    store_outcomes(run.location, run.suite, settings_of(run, name), outcomes, further=further)
 
 
 def made_in(run: ArrayRun, names: list[str]) -> None:

@@ -7,6 +7,7 @@ from io import StringIO
 import pytest
 from rich.console import Console
 
+from probe_kit.errors import UsageError
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.text import models_test
 from probe_kit.retention.compare.differences import ModelTest
@@ -53,6 +54,56 @@ def test_runs_of_one_model_are_no_further_models(probed_run: ProbedRun) -> None:
     again = replace(runs[6], weights_sha256="b")
     both = retention_table({"first": runs[:6], "second": [again, *runs[7:]]}).differences
     assert [row.sr_models for row in both] == [None, None], "a model on both sides cannot change sides"
+
+
+def sisters(probed_run: ProbedRun) -> list[ArrayRun]:
+    """Six models with weights of their own."""
+    return [
+        replace(probed_run({"color": ([0.5, 0.7 + 0.02 * at], [[0.6, 0.7]])}, f"run {at}"), weights_sha256=model)
+        for at, model in enumerate("abcdef")
+    ]
+
+
+def test_models_of_one_origin_are_averaged_first(probed_run: ProbedRun) -> None:
+    runs = sisters(probed_run)
+    origins = {str(run.location): origin for run, origin in zip(runs[:3], ("base", "base", "other"), strict=True)}
+    row = retention_table({"first": runs[:3], "second": runs[3:]}, origins=origins).differences[0]
+    alone = retention_table({"first": runs[:3], "second": runs[3:]}).differences[0]
+    assert row.sr_models is not None
+    assert alone.retention_models is not None
+    assert row.retention_models is not None
+    assert (row.sr_models.n, row.sr_models.n_minus) == (3, 2)
+    assert (alone.retention_models.n, alone.retention_models.n_minus) == (3, 3)
+    assert row.retention_models.difference != alone.retention_models.difference, "two sisters weigh as one model"
+
+
+def test_checkpoints_of_one_training_are_one_model(probed_run: ProbedRun) -> None:
+    runs = sisters(probed_run)
+    for run, folder in zip(
+        runs, ("m/a/020000", "m/a/040000", "m/b/020000", "m/c/1", "m/d/1", "m/e/1"), strict=True
+    ):
+        certificate = {"policy": {"checkpoint": f"{folder}/pretrained_model"}}
+        object.__setattr__(run, "certificate", certificate)
+    row = retention_table({"first": runs[:3], "second": runs[3:]}).differences[0]
+    assert row.sr_models is not None
+    assert (row.sr_models.n, row.sr_models.n_minus) == (3, 2)
+
+
+def test_an_origin_of_no_run_is_refused(probed_run: ProbedRun) -> None:
+    runs = sisters(probed_run)
+    with pytest.raises(UsageError, match="an origin is declared of elsewhere; expected one of the runs"):
+        retention_table({"first": runs[:3], "second": runs[3:]}, origins={"elsewhere": "base"})
+
+
+def test_a_smaller_group_with_a_larger_spread_has_an_interval_and_no_p() -> None:
+    few, many = [0.2, 0.6, 0.9], [0.5, 0.51, 0.52, 0.5, 0.49, 0.5]
+    test = ModelTest.of(few, many)
+    assert test is not None
+    assert (test.p, test.smallest_p) == (None, None)
+    assert models_test(test, 1, 2).startswith("– ")
+    other = ModelTest.of(many, [*few[:2], 0.5, 0.55, 0.45, 0.5])
+    assert other is not None
+    assert other.p is not None, "groups of equal size exchange whatever their spreads"
 
 
 def test_single_runs_have_no_p_over_models(probed_run: ProbedRun) -> None:

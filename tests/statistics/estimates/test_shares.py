@@ -2,10 +2,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.stats import binomtest
 
 from probe_kit.errors import UsageError
-from probe_kit.statistics.estimates.shares import Share, effective_groups, group_shares, share_interval
+from probe_kit.statistics.estimates.shares import (
+    Accuracy,
+    Share,
+    effective_groups,
+    group_shares,
+    share_interval,
+    wilson_interval,
+)
 
 GROUPS = np.repeat(list("abcdefgh"), 4)
 
@@ -106,3 +114,67 @@ def test_values_that_are_no_shares_are_refused() -> None:
         Share.of([1, np.nan], list("ab"))
     with pytest.raises(UsageError, match=r"the first is 1\.5"):
         Share.of([1.5, 0], list("ab"))
+
+
+@pytest.mark.parametrize(("hits", "trials"), [(3, 10), (50, 100), (170, 200), (199, 200)])
+def test_an_accuracy_of_many_independent_groups_has_wilsons_interval(hits: int, trials: int) -> None:
+    share = hits / trials
+    found = wilson_interval(share, share * (1 - share) / trials, trials, trials, 1e9)
+    wilson = binomtest(hits, trials).proportion_ci(0.95, "wilson")
+    np.testing.assert_allclose(found, (wilson.low, wilson.high), atol=1e-6)
+
+
+def test_where_all_groups_agree_an_accuracy_counts_groups() -> None:
+    wilson = binomtest(12, 12).proportion_ci(0.95, "wilson")
+    assert np.ravel(wilson_interval(1.0, 0.0, 12, 96, 11)) == pytest.approx((wilson.low, 1.0))
+
+
+@pytest.mark.parametrize("groups", [6, 12, 24, 150])
+def test_limits_of_an_accuracy_never_rise_with_one_more_wrong_decision(groups: int) -> None:
+    sizes = np.full(groups, 8.0)
+    limits = []
+    for wrong in range(groups // 2 + 1):
+        accuracy = Accuracy(np.arange(groups).astype(str), sizes - (np.arange(groups) < wrong), sizes)
+        limits.append((accuracy.interval().low, accuracy.interval().high))
+    assert np.diff(limits, axis=0).max() <= 1e-12
+
+
+def test_one_wrong_decision_of_96_hardly_widens_the_interval() -> None:
+    groups = np.repeat(np.arange(12), 8)
+    perfect, nearly = np.ones(96), np.ones(96)
+    nearly[0] = 0
+    lows = [Accuracy.of(values, groups).interval().low for values in (perfect, nearly)]
+    assert lows[0] >= lows[1] > 0.75
+
+
+@pytest.mark.parametrize("truth", [0.5, 0.75, 0.97])
+@pytest.mark.parametrize("sizes", [np.full(12, 4), 2 * (1 + np.arange(24) % 8)], ids=["equal", "unequal"])
+def test_intervals_of_accuracies_cover_their_share(truth: float, sizes: NDArray[np.int64]) -> None:
+    generator = np.random.default_rng(1)
+    groups = np.repeat(np.arange(sizes.size), sizes)
+    covered = []
+    for _ in range(600):
+        chance = generator.beta(7 * truth / 3, 7 * (1 - truth) / 3, sizes.size)  # correlation 0.3
+        interval = Accuracy.of(generator.random(groups.size) < chance[groups], groups).interval()
+        covered.append(interval.low <= truth <= interval.high)
+    assert np.mean(covered) > 0.92
+
+
+@pytest.mark.parametrize("rate", [0.9, 0.97])
+def test_success_rates_of_very_unequal_groups_are_covered(rate: float) -> None:
+    generator = np.random.default_rng(0)
+    sizes = 2 * np.ceil(20 * np.exp(-3 * np.linspace(0, 1, 24))).astype(int)
+    groups = np.repeat(np.arange(24), sizes)
+    covered = []
+    for _ in range(400):
+        chance = generator.beta(rate, 1 - rate, 24)  # correlation 1/2
+        interval = Share.of(generator.random(groups.size) < chance[groups], groups).interval()
+        covered.append(interval.low <= rate <= interval.high)
+    assert np.mean(covered) > 0.92
+
+
+def test_one_group_that_fails_makes_a_success_rate_no_better_known() -> None:
+    sizes = np.array([40, 30, 20, 10, 4, 2, 2, 2])
+    groups = np.repeat(np.arange(8), sizes)
+    lows = [Share.of(values, groups).interval().low for values in (np.ones(groups.size), groups < 7)]
+    assert lows[0] >= lows[1]

@@ -108,3 +108,27 @@ def test_missing_episodes_move_chance_and_say_so(planted_run: PlantedRun) -> Non
 def test_too_few_groups_name_category_and_target(planted_run: PlantedRun) -> None:
     with pytest.raises(TooFewGroupsError, match=r"category 'color', target 'chosen': \d independent groups"):
         category_problem(planted_run(n_items=6).episodes, "color", settings("chosen"))
+
+
+def test_folds_of_the_chosen_side_do_not_know_which_side_was_chosen(planted_run: PlantedRun) -> None:
+    episodes = planted_run().episodes
+    exchanged = episodes.copy()
+    placed = {"left": "right", "right": "left", "none": "none"}
+    some = exchanged["group_id"].isin(sorted(set(exchanged["group_id"]))[:7])
+    exchanged.loc[some, "side_placed"] = exchanged.loc[some, "side_placed"].map(placed)
+    folds = [
+        category_problem(table, "color", replace(settings(), target="chosen")).folds
+        for table in (episodes, exchanged)
+    ]
+    for here, there in zip(*folds, strict=True):
+        for one, other in zip((here.outer, *here.inner), (there.outer, *there.inner), strict=True):
+            np.testing.assert_array_equal(one.test, other.test)
+
+
+def test_folds_of_the_chosen_side_are_refused_where_a_training_side_holds_one_side(
+    planted_run: PlantedRun,
+) -> None:
+    episodes = planted_run().episodes.assign(side_placed="left")
+    episodes.loc[episodes["group_id"] == episodes["group_id"].iloc[0], "side_placed"] = "right"
+    with pytest.raises(TooFewGroupsError, match="chose the left side, and a training fold holds one side"):
+        category_problem(episodes, "color", replace(settings(), target="chosen"))

@@ -29,7 +29,7 @@ from tests.support.changed_suites import CHANGES, other_name, save_changed
 from tests.support.little_run import STREAMS, certify, episode, little_settings, suite_record
 
 SHORT = SceneSpec(max_steps=2)
-CONTROL_LEFT_OUT = "the control random-features is on by default and was NOT run"
+CONTROL_LEFT_OUT = "the controls random-features and pixels are on by default and NOT run"
 
 
 @pytest.fixture

@@ -64,7 +64,13 @@ class StepScoresDisplay(LabelPanel):
         own, scores = results.settings, curve.scores[row]
         balanced = results.step_scores(scores)
         limits = [
-            score_interval(balanced[at_step], results.groups[at_step], own.task, own.seed)
+            score_interval(
+                balanced[at_step],
+                results.labels[at_step],
+                results.groups[at_step],
+                own.task,
+                results.deviations[at_step],
+            )
             for at_step in (results.places == step for step in results.steps)
         ]
         return cls(

@@ -267,7 +267,7 @@ def _scored(name: Name, probes: Sequence[LabelProbe], results: LabelResults, str
     return LabelControl(
         name,
         float(scores.mean()),
-        score_interval(scores, results.groups, own.task, own.seed),
+        score_interval(scores, results.labels, results.groups, own.task, results.deviations),
         float(null.mean()) if null.size else None,
         None if np.isnan(p) else p,
         stream,
@@ -282,6 +282,6 @@ def _compared(
         for stream in dict.fromkeys(site.stream for site in curve.sites):
             rows, reference = curve.stream(stream), _mean_scores(references[stream])
             seed = derive_seed("label control", results.settings.seed, name, view, stream)
-            p = better_than_reference(curve.scores[rows], reference, results.groups, seed)
+            p = better_than_reference(curve.scores[rows], reference, results.groups, seed, results.widening)
             for row, of_site in zip(rows, p, strict=True):
                 yield LabelComparison(name, view, str(curve.sites[row]), float(reference.mean()), float(of_site))

@@ -117,7 +117,7 @@ def add_untrained_control(
 
 def _score(best: LabelProbe, results: LabelResults, stream: str, view: str) -> LabelControl:
     own = results.settings
-    interval = score_interval(best.scores, results.groups, own.task, own.seed)
+    interval = score_interval(best.scores, results.labels, results.groups, own.task, results.deviations)
     by_step = tuple(results.by_step(best.scores).tolist())
     return LabelControl(UNTRAINED, best.metric, interval, None, None, stream, view, by_step)
 
@@ -133,6 +133,6 @@ def _compared(
     curve = results.curves[view]
     seed = derive_seed("label control", results.settings.seed, UNTRAINED, view, stream)
     others = np.stack([probe.scores for probe in probes])
-    p = better_than_best(curve.scores[rows], others, results.groups, seed)
+    p = better_than_best(curve.scores[rows], others, results.groups, seed, results.widening)
     for row, of_site in zip(rows, p, strict=True):
         yield LabelComparison(UNTRAINED, view, str(curve.sites[row]), best.metric, float(of_site))
