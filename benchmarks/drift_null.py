@@ -1,4 +1,4 @@
-"""How often drift is *kept*, *moved*, *forgotten* or *learned* where neither run holds an answer.
+"""How often drift has a verdict of its own where neither run holds an answer.
 
     python benchmarks/drift_null.py [--draws 20]
 
@@ -22,7 +22,7 @@ from probe_kit.study import measure_drift
 from probe_kit.train import ArrayRun, train_probes
 
 CATEGORIES, ITEMS, LAYERS, WIDTH, PERMUTATIONS = 12, 24, 2, 12, 39
-WRONG = ("kept", "moved", "forgotten", "learned")
+WRONG = ("kept", "transfer not shown", "forgotten", "learned")
 
 
 def episodes() -> pd.DataFrame:

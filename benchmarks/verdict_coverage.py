@@ -18,10 +18,10 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from coverage_worlds import World, draw_right
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
+from scipy.special import ndtri
 from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
@@ -30,7 +30,8 @@ from probe_kit.statistics.estimates.balanced import GroupSums, balanced_sums
 from probe_kit.statistics.estimates.crossfit import Stream, crossfit
 from probe_kit.statistics.estimates.mover import difference_interval, mean_interval
 from probe_kit.statistics.estimates.shares import Share
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most, findable, is_absent
+from probe_kit.statistics.folds import fold_of_groups, sums_by_group
 from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site
@@ -141,6 +142,26 @@ def unequal(draws: int, seed: int) -> Table:
 
 
 SITES = (1, 4, 19, 180)
+OF_GROUP, NEIGHBOURS = 0.3, 0.9
+
+
+def draw_right(
+    above: NDArray[np.float64], group_of: NDArray[np.intp], generator: np.random.Generator
+) -> NDArray[np.bool_]:
+    """(S, E) correctness of sites with (S,) accuracies above chance; neighbours and groups are alike."""
+    of_group, own = (
+        _neighbours(generator.standard_normal((above.size, count)))
+        for count in (int(group_of[-1]) + 1, group_of.size)
+    )
+    values = np.sqrt(OF_GROUP) * of_group[:, group_of] + np.sqrt(1 - OF_GROUP) * own
+    right: NDArray[np.bool_] = values < ndtri(0.5 + above)[:, None]
+    return right
+
+
+def _neighbours(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    for site in range(1, len(values)):
+        values[site] = NEIGHBOURS * values[site - 1] + np.sqrt(1 - NEIGHBOURS**2) * values[site]
+    return values
 
 
 def absent(draws: int, seed: int) -> Table:
@@ -150,12 +171,18 @@ def absent(draws: int, seed: int) -> Table:
     for sites in SITES:
         for groups in (24, 40, 75, 150):
             found = []
+            generator = np.random.default_rng(derive_seed("absent threshold", seed, sites, groups))
+            best = [
+                _sites(np.full(sites, 0.5), groups, generator).accuracies.max() for _ in range(max(draws, 200))
+            ]
+            threshold = float(np.quantile(best, 1 - SIGNIFICANCE))
             for name in ("one", "all", "nothing"):
                 above = np.zeros(sites)
                 above[slice(None) if name == "all" else slice(sites // 2, sites // 2 + 1)] = ABSENT_BELOW - 0.5
                 generator = np.random.default_rng(derive_seed("absent", seed, sites, groups, name))
                 shares = 0.5 + (np.zeros(sites) if name == "nothing" else above)
-                said = [at_most(_sites(shares, groups, generator)) < ABSENT_BELOW for _ in range(draws)]
+                drawn = (_sites(shares, groups, generator) for _ in range(draws))
+                said = [is_absent(at_most(one), findable(one, threshold)) for one in drawn]
                 found.append(f"{np.mean(said):.1%}")
             table.add_row(str(sites), str(groups), *found)
     return table
@@ -164,8 +191,7 @@ def absent(draws: int, seed: int) -> Table:
 def _sites(shares: NDArray[np.float64], groups: int, generator: np.random.Generator) -> GroupSums:
     """Groups of four episodes; neighbouring sites are correlated."""
     group_of = np.repeat(np.arange(groups), 4)
-    common = generator.standard_normal(group_of.size)
-    right = draw_right(World("sites", 0.0, 0.0), shares - 0.5, common, group_of, generator)
+    right = draw_right(shares - 0.5, group_of, generator)
     return GroupSums(right.reshape(shares.size, groups, 4).sum(axis=2).astype(float), np.full(groups, 4.0))
 
 
@@ -252,12 +278,14 @@ def _probed(seed: int) -> NDArray[np.float64]:
         for number, fold in enumerate(folds):
             fold_of[fold.outer.test] = number
         nothing = np.empty((fold_of.size, 0), np.bool_)
-        decisions = np.array([
-            probe_site(Samples.pooled(one[kept]), labels[kept], nothing, folds).decisions for one in features
-        ])  # fmt: skip
+        probes = [probe_site(Samples.pooled(one[kept]), labels[kept], nothing, folds) for one in features]
+        decisions, inner = (np.array([getattr(one, part) for one in probes]) for part in ("decisions", "inner"))
         sums = balanced_sums(decisions, labels[kept], fold_of, groups[kept])
-        streams = [Stream.of(sums.only(rows), [0, 1, 2]) for rows in ([0, 1, 2], [3, 4, 5])]
-        found.append(crossfit(streams, seed).above)
+        by_group, fold_of_group = sums_by_group(inner, groups[kept]), fold_of_groups(fold_of, groups[kept])
+        streams = [
+            Stream.of(sums.only(rows), by_group[rows], fold_of_group, [0, 1, 2]) for rows in ([0, 1, 2], [3, 4, 5])
+        ]
+        found.append(crossfit(streams, np.unique(groups[kept]).astype(str).tolist()).above)
     return np.array(found)
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING, Literal, get_args
 
 from probe_kit._system.csv_text import csv_of_frame
@@ -22,8 +21,7 @@ from probe_kit.retention.columns.text_table import TextTable, size_table, vlm_vl
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.compare.pairing import PairedRuns, compare_groups, compare_runs
 from probe_kit.retention.compare.vlm_vla import VlmVlaDifference, vlm_vla_differences
-from probe_kit.retention.estimators.retention import Iterations, curve_scores
-from probe_kit.retention.estimators.stream_scores import StreamScores
+from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.formats.dataframe import frame_of, part_frame, peak_frame
 from probe_kit.retention.formats.json import table_json
 from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
@@ -287,12 +285,12 @@ def retention_table(
         means += [mean_row([one for one in found if one.row.view == view], averaged_fields()) for view in shown]
     names = distinct_labels([run for _, run in listed], labels)
     results = {place: replace(own, label=(labels or {}).get(place, own.label)) for place, own in results.items()}
-    rescore, compared = partial(_rescored, results, iterations), PairedRuns([], ())
+    compared = PairedRuns([], ())
     if isinstance(runs, Mapping):
         by_group = {name: [run for group, run in listed if group == name] for name in runs}
-        compared = compare_groups(by_group, drawn, rescore, against, origins)
+        compared = compare_groups(by_group, drawn, against, origins)
     elif len(listed) > 1 or against is not None:
-        compared = compare_runs([run for _, run in listed], drawn, names, rescore, against, vlm_vla, pairs)
+        compared = compare_runs([run for _, run in listed], drawn, names, against, vlm_vla, pairs)
     notes += [
         f"{run.location} captured activations only and did not act: SR is n/a." for _, run in listed if _heard(run)
     ]
@@ -321,22 +319,6 @@ def retention_table(
         found_differences,
         compared.unpaired,
     )
-
-
-def _rescored(
-    results: Mapping[str, ProbeResults], iterations: Iterations, one: RowWithEstimates, seed_text: str
-) -> StreamScores | None:
-    """A row's scores on the halvings of its groups in another suite, which items in common may come from.
-
-    The scores stay those of the row; only what is measured on halvings, the covariance, is that of `seed_text`.
-    """
-    own, row = one.estimates.streams, one.row
-    if own is None or row.view is None:
-        return None
-    found = curve_scores(results[row.run.location].curves[row.category, row.view], iterations, seed_text)
-    if found is None:
-        return None
-    return replace(own, fit=replace(own.fit, differences=found.fit.differences, seed=found.fit.seed))
 
 
 def _wordings(run: RunReader, label: str) -> list[WordingPair]:

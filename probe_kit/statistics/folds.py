@@ -71,6 +71,18 @@ def split_by_fold(fold_of: NDArray[np.integer], numbers: Iterable[int]) -> list[
     return [Fold(np.flatnonzero(fold_of != number), np.flatnonzero(fold_of == number)) for number in numbers]
 
 
+def fold_of_groups(fold_of: ArrayLike, groups: ArrayLike) -> NDArray[np.intp]:
+    """Return the fold of each of G groups, in the order of their names, from (E,) folds and groups."""
+    folds: NDArray[np.intp] = np.asarray(fold_of, np.intp)[np.unique(np.asarray(groups), return_index=True)[1]]
+    return folds
+
+
+def sums_by_group(values: NDArray[np.floating], groups: ArrayLike) -> NDArray[np.float64]:
+    """Return (..., G) sums of (..., E) values over the episodes of each group, in the order of the names."""
+    names, group_of = np.unique(np.asarray(groups), return_inverse=True)
+    return np.asarray(values, np.float64) @ np.eye(names.size)[group_of]
+
+
 def fold_units(episodes: "pd.DataFrame", unit: FoldUnit) -> NDArray[np.str_]:
     """(E,) name of what folds must not separate: the group, or all groups about the same two concepts.
 

@@ -3,12 +3,14 @@
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import count
+from math import sqrt
+from statistics import NormalDist
 
 import numpy as np
 
 from probe_kit.statistics.estimates.balanced import CHANCE, GroupSums
 from probe_kit.statistics.estimates.crossfit import FEWEST_GROUPS
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most, findable
 from probe_kit.statistics.folds import OUTER_FOLDS
 from probe_kit.statistics.label_permutations import possible_flips, smallest_p
 from probe_kit.statistics.sign_flips import smallest_flip_p
@@ -16,8 +18,8 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 
 GROUPS_FOR_PROBES = OUTER_FOLDS
 """With fewer, `train` refuses the category."""
-GROUPS_FOR_RETENTION = max(OUTER_FOLDS, FEWEST_GROUPS)
-"""With fewer there are no probes, or no cross-fitted scores."""
+GROUPS_FOR_RETENTION = FEWEST_GROUPS
+"""With fewer there are no cross-fitted scores."""
 
 
 def least_probe_p(groups: int) -> float:
@@ -46,13 +48,15 @@ def groups_for_absence(episodes: int) -> int:
 
 
 def _limit_at_chance(groups: int, episodes: int) -> float:
-    """What `at_most` gives of one site that is right in half of the episodes, groups varying as episodes do.
+    """The larger of `at_most` and `findable` of one site that is right in half of the episodes.
 
-    Half of the groups lie a standard deviation above one half, and half of them as far below.
+    Groups vary as episodes do: half of them lie a standard deviation above one half, half of them as far below.
     """
     sizes = np.full(groups, float(episodes))
     around = np.resize([1.0, -1.0], groups) * np.sqrt(episodes * CHANCE * (1 - CHANCE))
-    return at_most(GroupSums((sizes * CHANCE + around - around.mean())[None, :], sizes))
+    site = GroupSums((sizes * CHANCE + around - around.mean())[None, :], sizes)
+    chance = NormalDist(CHANCE, sqrt(CHANCE * (1 - CHANCE) / site.n_episodes))
+    return max(at_most(site), findable(site, chance.inv_cdf(1 - SIGNIFICANCE)))
 
 
 def _fewest(enough: Callable[[int], bool], start: int) -> int:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.statistics.estimates.balanced import GroupSums
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most
+from probe_kit.statistics.estimates.verdict import at_most, findable, is_absent
 from probe_kit.statistics.folds import OUTER_FOLDS
 from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -175,7 +175,7 @@ def _part(items: int, signal: NDArray[np.float64], draws: int, seed: int) -> tup
                 here.mean(axis=1).max() > limit,
                 better_than_reference(here, reference, groups, draw).min() < SIGNIFICANCE,
                 better_than_best(here, untrained, groups, draw).min() < SIGNIFICANCE,
-                at_most(_group_sums(untrained)) < ABSENT_BELOW,
+                is_absent(at_most(_group_sums(untrained)), findable(_group_sums(untrained), limit)),
             )
         )
     chance, random_features, beaten, absent = np.mean(seen, axis=0).tolist()

@@ -10,7 +10,7 @@ import numpy as np
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
 from probe_kit.extract.store.recorded.scene_only import check_scene_run
-from probe_kit.statistics.folds import FoldUnit
+from probe_kit.statistics.folds import FoldUnit, sums_by_group
 from probe_kit.train.choices import Baseline, Incomplete, LabelControl, Target
 from probe_kit.train.controls.fit_controls import add_baselines, add_untrained, check_untrained, prepare_baselines
 from probe_kit.train.crossval.category_problem import POOLED, CategoryProblem, category_problem
@@ -368,5 +368,8 @@ def _curve(
         decisions=np.stack([probe.decisions for probe in found.values()]),
         strengths=np.stack([probe.strengths for probe in found.values()]),
         null=np.stack([probe.null for probe in found.values()]),
+        inner=np.stack([sums_by_group(probe.inner, problem.groups) for probe in found.values()]).astype(
+            np.float32
+        ),
         parts=tuple(str(run.streams[site.stream].part) for site in found),
     )

@@ -8,8 +8,8 @@ from probe_kit.hashing import sha256_json
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import Incomplete, Target
 
-LABEL_FORMAT = "labels-2"  # of probes of a label of one's own, which are stored beside the others
-FORMAT = 5  # raise when settings have other fields or would give other numbers
+LABEL_FORMAT = "labels-3"  # of probes of a label of one's own, which are stored beside the others
+FORMAT = 6  # raise when settings have other fields or would give other numbers
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import pandas as pd
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, ProbeCurve, ProbeResults, ProbeSettings
 from probe_kit.train.results.probe_results import episodes_sha256
+from tests.support.inner_qualities import inner_of
 
 SUITE = "suite@1#0123456789ab"
 ASK = {"prompt": "p1", "picture": "frame", "picture_size": "224x224", "object": "target"}
@@ -89,17 +90,20 @@ def probes(
     for category, shares in accuracies.items():
         own = run.episodes[run.episodes["category"] == category]
         labels = (own["side_correct"] == "left").to_numpy()
+        groups = own["group_id"].to_numpy(dtype=str)
+        fold_of = np.unique(groups, return_inverse=True)[1] % 5
         right = draw.random((len(shares), len(own))) < np.array(shares)[:, None]
         curves[category, "mean"] = ProbeCurve(
             sites=tuple(Site("backbone", layer) for layer in range(len(shares))),
             labels=labels,
             episodes=own["episode_id"].to_numpy(dtype=str),
             items=own["item_id"].to_numpy(dtype=str),
-            groups=own["group_id"].to_numpy(dtype=str),
-            fold_of=np.arange(len(own)) // 2 % 5,
+            groups=groups,
+            fold_of=fold_of,
             decisions=np.where(right == labels, 1.0, -1.0),
             strengths=np.ones((len(shares), 5)),
             null=np.tile(np.linspace(1 - null_top, null_top, 99), (len(shares), 1)),
+            inner=inner_of(right, fold_of, groups),
         )
     settings = ProbeSettings(
         model=run.model, random_weights=False, weights=None, suite=run.suite, seed_text=run.suite,

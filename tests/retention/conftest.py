@@ -12,6 +12,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Site
 from probe_kit.train import ArrayRun, ProbeCurve, ProbeResults, ProbeSettings, save_results
 from probe_kit.train.results.probe_results import episodes_sha256
+from tests.support.inner_qualities import inner_of
 
 
 def outcomes(correct: int, wrong: int, oob: int, category: str = "color") -> pd.DataFrame:
@@ -57,16 +58,18 @@ def curve(
     # The same number of right decisions for the same share, so that accuracies are exactly as asked.
     rank = generator.permuted(np.tile(np.arange(len(episodes)), (len(sites), 1)), axis=1)
     right = rank < np.round(share * len(episodes))[:, None]
+    groups, fold_of = episodes["group_id"].to_numpy(dtype=str), np.arange(len(episodes)) // 2 % 5
     return ProbeCurve(
         sites=tuple(sites),
         labels=labels,
         episodes=episodes["episode_id"].to_numpy(dtype=str),
         items=episodes["item_id"].to_numpy(dtype=str),
-        groups=episodes["group_id"].to_numpy(dtype=str),
-        fold_of=np.arange(len(episodes)) // 2 % 5,
+        groups=groups,
+        fold_of=fold_of,
         decisions=np.where(right == labels, 1.0, -1.0),
         strengths=np.ones((len(sites), 5)),
         null=np.tile(np.linspace(1 - null_top, null_top, 99), (len(sites), 1)),
+        inner=inner_of(right, fold_of, groups),
     )
 
 

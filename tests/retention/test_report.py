@@ -85,7 +85,10 @@ def test_the_page_opens_with_what_is_encoded_and_used_in_plain_words(probed_run:
     assert "Summary: pi0-tiny" in opening
     color, shape = re.findall(r"<li>(.*?)</li>", opening.replace("\u00a0", " "), re.DOTALL)
     assert "<b>Color (100 items)</b>: the backbone holds the answer (90 %, " in color
-    assert "<b>Shape (100 items)</b>: the backbone does not hold the answer (" in shape
+    assert (
+        "<b>Shape (100 items)</b>: a linear probe of so many items does not find the answer in the backbone ("
+        in shape
+    )
 
 
 def test_random_weights_are_marked_in_summary_figures_and_certificate(probed_run: ProbedRun) -> None:

@@ -79,7 +79,9 @@ def test_no_sign_flip_gives_a_smaller_p(groups: int) -> None:
 
 
 @pytest.mark.parametrize("size", [2, 4, 8])
-def test_absence_can_be_said_where_the_limit_at_one_half_is_below_the_bound(size: int) -> None:
+def test_absence_can_be_said_where_the_limit_at_one_half_is_below_the_bound_and_the_bound_is_found(
+    size: int,
+) -> None:
     def limit(groups: int) -> float:
         """Korn and Graubard's, of groups that vary as single episodes do, with a variance of G − 1 degrees."""
         count = groups * size
@@ -87,8 +89,17 @@ def test_absence_can_be_said_where_the_limit_at_one_half_is_below_the_bound(size
         trials = count * (groups - 1) / groups * lost**2  # the variance is that of a sample, over G − 1
         return float(stats.beta.ppf(1 - SIGNIFICANCE, trials / 2 + 1, trials / 2))
 
+    def is_found(groups: int) -> bool:
+        """Whether a site at the bound exceeds the 95 % point of guessing in four of five experiments."""
+        count = groups * size
+        threshold = stats.norm.ppf(1 - SIGNIFICANCE, 0.5, np.sqrt(0.25 / count))
+        trials = count * (groups - 1) / groups
+        return bool(
+            stats.norm.sf(threshold, ABSENT_BELOW, np.sqrt(ABSENT_BELOW * (1 - ABSENT_BELOW) / trials)) >= 0.8
+        )
+
     found = groups_for_absence(size)
-    even = [groups for groups in range(4, 60, 2) if limit(groups) < ABSENT_BELOW]
+    even = [groups for groups in range(4, 60, 2) if limit(groups) < ABSENT_BELOW and is_found(groups)]
     assert even[0] - 1 <= found <= even[0]
     assert found >= GROUPS_FOR_RETENTION
 

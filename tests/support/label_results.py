@@ -8,6 +8,7 @@ from probe_kit.hooks import Site
 from probe_kit.train import LabelResults
 from probe_kit.train.labels.label_results import LabelCurve
 from probe_kit.train.labels.label_settings import LabelSettings
+from tests.support.inner_qualities import inner_of
 
 _PARTS = {"backbone": "backbone", "expert": "action"}
 
@@ -35,16 +36,18 @@ def label_results(
     scores += np.repeat(shifts - shifts.mean(axis=1, keepdims=True), each, axis=1)
     spread = null_spread * np.linspace(-1, 1, permutations)
     null = np.stack([chance + spread for _, chance in sites.values()])
+    chances = np.array([[chance] for _, chance in sites.values()])
     labels = np.tile(np.arange(each) % 2, groups).astype(float)
+    names = np.repeat([f"group-{number:03d}" for number in range(groups)], each)
+    folds = np.repeat(np.arange(groups) % 5, each)
     curve = LabelCurve(
         tuple(sites), tuple(_PARTS[site.stream] for site in sites), np.tile(labels, (len(sites), 1)), scores, null,
-        np.ones((len(sites), 5)),
+        np.ones((len(sites), 5)), inner_of(scores - chances, folds, names),
     )  # fmt: skip
     settings = LabelSettings(
         "made", False, None, suite, suite, "0" * 64, "0" * 64, (), ("mean",), "drawer", task,  # type: ignore[arg-type]
         "1" * 64, "group_id", "all", "2" * 64, window, 0, permutations, 0,
     )  # fmt: skip
-    names = np.repeat([f"group-{number:03d}" for number in range(groups)], each)
     return LabelResults(
         settings=settings,
         classes=() if task == "continuous" else ("no", "yes"),
@@ -52,7 +55,7 @@ def label_results(
         episodes=np.array([f"episode-{number:04d}" for number in range(n)]),
         inferences=np.zeros(n, np.int64),
         groups=names,
-        fold_of=np.repeat(np.arange(groups) % 5, each),
+        fold_of=folds,
         curves={"mean": curve},
         smallest_p=1 / (1 + permutations),
     )

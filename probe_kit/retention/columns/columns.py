@@ -483,13 +483,13 @@ _LAYER = (
     "several that are equally good; after +: how many others are."
 )
 _SCORE = (
-    "Accuracy of a linear probe at a site that is chosen on half of the questions and scored on the other half, "
+    "Accuracy of a linear probe on questions that took no part in training it or in choosing its site, "
     "balanced between the sides: chance is 50 %. Bold: the signal is shown."
 )
 _VERDICT = (
-    "Shown: above chance, family-wise, and above every control that was run. Absent: not shown, and the best site "
-    "can be at most as accurate as stated, below 65 % by default. Not shown: everything else, with what it could "
-    "be at most."
+    "Shown: above chance, family-wise, and above every control that was run. Absent, for a linear probe of so "
+    "many items: not shown, the best site can be at most as accurate as stated, below 65 % by default, and so "
+    "many items would have shown 65 %. Not shown: everything else, with what it could be at most."
 )
 _EXCEEDS = (
     "The controls that the best site is shown to exceed, paired by question: chance; random-features, an "

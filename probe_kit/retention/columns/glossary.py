@@ -28,7 +28,8 @@ VIEWER_WORDS = {
     "Δ": "How far from 50 % guessing alone may lead. Success is shown beyond it.",
     "shown": "A stream's best site exceeds chance, family-wise, and every control that was run: its signal.",
     "not shown": "Neither shown nor absent: more items would tell.",
-    "absent": "The best site can be at most as accurate as a stated limit, 65 % by default.",
+    "absent": "For a linear probe of so many items: the best site can be at most as accurate as a stated limit, "
+    "65 % by default, and so many items would have shown a site of that accuracy.",
     "retention": "Share of the backbone's accuracy above chance that is left where the action is made.",
     "used": "Swapping the two pictures turns the action: only an intervention shows it.",
     "log-odds": "How sure the probe is of the correct side in one episode; below zero it reads the other side.",

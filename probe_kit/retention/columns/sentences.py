@@ -36,7 +36,8 @@ Readable = Literal[
 """The backbone's evidence, then success, where no image swap is stored: these never say *used*."""
 _EVIDENCE = {
     "shown": "The probes find the answer in the backbone, beyond every control that was run",
-    "absent": "The backbone's best site can be at most as accurate as a stated limit, 65 % by default",
+    "absent": "No linear probe of so many items reaches a stated accuracy in the backbone, 65 % by default, and "
+    "so many items would have shown it",
     "not shown": "Neither shown nor absent: more items would tell",
 }
 _SUCCESS = {
@@ -200,7 +201,9 @@ _NOT_SHOWN = "success is not shown"
 
 def _backbone(row: RetentionRow) -> str:
     """Return the evidence of a backbone without signal, in words."""
-    return "absent from the backbone" if row.backbone.verdict == "absent" else "not shown in the backbone"
+    if row.backbone.verdict == "absent":
+        return "absent from the backbone for a linear probe of so many items"
+    return "not shown in the backbone"
 
 
 def _behaviour(row: RetentionRow) -> str:
@@ -283,7 +286,7 @@ def _in_stream(name: str, part: StreamPart, what: str) -> str:
     if part.verdict == "shown":
         return f"{name} holds {what} ({_accuracy(part)})"
     if part.verdict == "absent":
-        return f"{name} does not hold {what} ({score}; its best site has at most {most})"
+        return f"a linear probe of so many items does not find {what} in {name} ({score}; at most {most})"
     if part.exceeds.get("chance") is None:
         return f"whether {name} holds {what} was not tested against chance ({open_to})"
     missed = [_CONTROLS.get(name, name) for name, better in part.exceeds.items() if better is False]

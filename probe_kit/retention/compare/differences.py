@@ -230,7 +230,7 @@ class _Gap:
         first, second = pooled
         if first is None or second is None:
             return cls(mine is not None and theirs is not None and mine.paired_with(theirs), sr)
-        same = first.fit is not None and second.fit is not None and first.fit.seed == second.fit.seed
+        same = first.shares_groups_with(second)
         paired = same if mine is None or theirs is None else mine.paired_with(theirs)
         names = [name for name in first.names if name in second.names]
         gaps = {name: first.accuracy_difference(second, name) for name in names}

@@ -142,7 +142,7 @@ def match_runs(
     """Join a VLM run (as `scored` reads it) with a policy run and its probes.
 
     results: probes of the policy run; None joins known and used only. view: one that was probed, by default the
-    first. seed: of the halves in which sites are chosen, and of permutations.
+    first. seed: of permutations.
     Raises UsageError for runs of the wrong kinds or without a question in common, OtherFramesError if their first
     frames differ or carry no hash.
     """
@@ -153,7 +153,7 @@ def match_runs(
     if results is not None and chosen not in results.settings.views:
         raise UsageError(f"view {chosen!r} was not probed; probed were {', '.join(results.settings.views)}")
     known, used = (_right(pairs[column]) for column in ("outcome_asked", "outcome"))
-    encoded = None if results is None or chosen is None else _encoded(pairs, results, chosen, seed)
+    encoded = None if results is None or chosen is None else _encoded(pairs, results, chosen)
     whole, unprobed = _only_probed(_items(pairs, known, used, encoded))
     signals = {} if results is None or chosen is None else _signals(results, chosen)
     rows = [_joined(str(name), own, signals.get(str(name))) for name, own in whole.groupby("category", sort=False)]
@@ -233,33 +233,25 @@ def _right(outcomes: "pd.Series[str]") -> Bools:
 # -- encoded ---------------------------------------------------------------------------------------------
 
 
-def _encoded(pairs: "pd.DataFrame", results: ProbeResults, view: str, seed: int) -> NDArray[np.float64]:
+def _encoded(pairs: "pd.DataFrame", results: ProbeResults, view: str) -> NDArray[np.float64]:
     """(E,) whether the probe's decision is right, NaN where nothing was probed."""
     found: dict[str, bool] = {}
     for (_, name), curve in results.curves.items():
         if name == view:
-            found |= dict(zip(curve.episodes.tolist(), encoded_decisions(curve, seed).tolist(), strict=True))
+            found |= dict(zip(curve.episodes.tolist(), encoded_decisions(curve).tolist(), strict=True))
     return np.array([found.get(episode, np.nan) for episode in pairs["episode_id"]], np.float64)
 
 
-def encoded_decisions(curve: ProbeCurve, seed: int = 0) -> Bools:
-    """(E,) held-out decisions of the backbone's probe, at a site that was chosen on other groups.
+def encoded_decisions(curve: ProbeCurve) -> Bools:
+    """(E,) whether held-out decisions of the backbone's probe are right, at the site that the inner folds choose.
 
-    The groups are halved; in each half decisions are those of the site that is most often right in the other, the
-    first one on ties. The best site of all would be chosen by the luck that it is scored by.
+    Of each outer fold it is the site that is best in its inner folds, the first one on ties. The best site of all
+    would be chosen by the luck that it is scored by.
     """
     stream = curve.backbone_stream
     if stream is None:
         raise UsageError("no stream of the vision-language model was probed: there is nothing encoded to join")
-    names, group_of = np.unique(curve.groups, return_inverse=True)
-    generator = np.random.default_rng(derive_seed("encoded", seed))
-    half = np.where(generator.permutation(names.size) < names.size // 2, 1, -1)[group_of]
-    correct = curve.correct[curve.stream(stream)]
-    right = np.zeros(correct.shape[1], bool)
-    for side in (1, -1):
-        best = int(correct[:, half == -side].sum(axis=1).argmax())
-        right[half == side] = correct[best, half == side]
-    return right
+    return curve.nested_correct(curve.stream(stream))
 
 
 def _signals(results: ProbeResults, view: str) -> dict[str, bool]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.run_labels import full_names
@@ -22,7 +22,7 @@ from probe_kit.retention.compare.differences import (
     pair_differences,
 )
 from probe_kit.retention.compare.origins import origins_of
-from probe_kit.retention.estimators.stream_scores import RowEstimates, StreamScores
+from probe_kit.retention.estimators.stream_scores import RowEstimates
 from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
 
@@ -37,18 +37,10 @@ class PairedRuns:
     unpaired: tuple[str, ...]
 
 
-class Rescore(Protocol):
-    """Scores of a row's streams, on the halvings that another suite's groups have."""
-
-    def __call__(self, one: RowWithEstimates, seed_text: str) -> StreamScores | None:
-        """The row's own scores with halvings by `seed_text`; None without probes."""
-
-
 def compare_runs(
     runs: Sequence[RunReader],
     drawn: Sequence[RowWithEstimates],
     labels: Mapping[str, str],
-    rescore: Rescore,
     against: str | None = None,
     vlm_vla: bool = False,
     chosen: Sequence[tuple[str, str]] | None = None,
@@ -78,7 +70,7 @@ def compare_runs(
             for run in (here, there)
         ]
         unpaired += _left_out(both, items)
-        pairs.append(_on_common_items((sides[0], sides[1]), items, [here, there], rescore))
+        pairs.append(_on_common_items((sides[0], sides[1]), items, [here, there]))
     if not vlm_vla and chosen is None and len({ask_of(run) is None for run in runs}) == 2:
         unpaired.append("VLM runs and policy runs are not compared with each other here; --vlm-vla does that.")
     return PairedRuns(pair_differences(pairs), tuple(unpaired))
@@ -87,7 +79,6 @@ def compare_runs(
 def compare_groups(
     groups: Mapping[str, Sequence[RunReader]],
     drawn: Sequence[RowWithEstimates],
-    rescore: Rescore,
     against: str | None = None,
     origins: Mapping[str, str] | None = None,
 ) -> PairedRuns:
@@ -104,7 +95,7 @@ def compare_groups(
         items = {name: one for name, one in common_items(runs).items() if one.is_many}
         sides = [Side(name, [one for one in drawn if one.row.group == name]) for name in names]
         notes += _left_out(" and ".join(names), items)
-        pair = _on_common_items((sides[0], sides[1]), items, runs, rescore, others_too=True)
+        pair = _on_common_items((sides[0], sides[1]), items, runs, others_too=True)
         pairs.append(replace(pair, origins=grown))
     return PairedRuns(pair_differences(pairs), tuple(notes))
 
@@ -113,7 +104,6 @@ def _on_common_items(
     sides: tuple[Side, Side],
     items: Mapping[str, CommonItems],
     runs: Sequence[RunReader],
-    rescore: Rescore,
     others_too: bool = False,
 ) -> ComparedSides:
     """Both sides on the same items, with the draws of the first of `runs`.
@@ -129,8 +119,11 @@ def _on_common_items(
             return one
         outcomes = None if one.outcomes is None else own.select(one.outcomes)
         rates = {} if outcomes is None else {"sr": success_share(outcomes, seed_text)}
+        streams = one.estimates.streams if own.whole else None
         return replace(
-            one, estimates=RowEstimates(rates, rescore(one, seed_text) if own.whole else None), outcomes=outcomes
+            one,
+            estimates=RowEstimates(rates, None if streams is None else streams.as_of(seed_text)),
+            outcomes=outcomes,
         )
 
     kept = {name for name, own in items.items() if own.n_items}

@@ -25,8 +25,8 @@ _ENOUGH = 20  # label permutations, fewer than which have no 95 % point
 class CallLine:
     """Held-out accuracy of a stream's best site by captured inference; arrays (C,), accuracies as shares.
 
-    accuracy: of a site chosen on half of the groups of items and scored on the other half; low, high: its 95 %
-    interval, NaN with too few groups. significant: above chance against all sites of the
+    accuracy: of the sites that the inner folds choose, on the outer folds; low, high: its 95 % interval, NaN with
+    too few groups. significant: above chance against all sites of the
     stream, and above the controls that were run. null: what the best site of permuted labels stays below in 95 %,
     NaN with few label permutations. episodes: how many got that far. part: of the model, see `Stream.part`.
     """
@@ -45,8 +45,8 @@ class CallLine:
 @dataclass(frozen=True)
 class AlignedLine:
     """The same counted from an event of each episode: 0 is the last inference before the action that brought it
-    about. Sites are those that are best at their call, so that an accuracy is too high by the luck of that choice
-    and has no interval; (O,) offsets with at least `FEWEST` episodes.
+    about. Sites are those that the inner folds of every call choose. There is no interval; (O,) offsets with at
+    least `FEWEST` episodes.
     """
 
     stream: str
@@ -118,7 +118,7 @@ class CallCurves:
         """The stream's best sites counted from an event; None where too few episodes have it."""
         pools: dict[int, list[bool]] = {}
         for call, curve in self._curves.items():
-            right = curve.correct[curve.best(stream)]
+            right = curve.nested_correct(curve.stream(stream))
             for episode, hit in zip(curve.episodes, right, strict=True):
                 due = self.events.get(event, {}).get(str(episode))
                 if due is not None:

@@ -17,7 +17,7 @@ from probe_kit.retention.estimators.stream_scores import ACTION, BACKBONE, Strea
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.statistics.estimates.mover import NO_LIMITS
 from probe_kit.statistics.estimates.retention import Ratio, retention
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, is_absent
 from probe_kit.statistics.fieller import Interval
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED, Controls, Exceeds, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
@@ -120,9 +120,9 @@ def measure_retention(
 ) -> Retention | None:
     """Retention of `curve`, or None if it lacks the backbone or the stream the action is made in.
 
-    seed_text: of the run; with the names of the groups it seeds the halvings, so that runs on the same groups are
-    compared on the same halves. exceeds: what the backbone's best site is better than, as `Controls.exceeds` says;
-    chance alone by default. Raises UsageError if the action's stream has no such iteration.
+    seed_text: of the run; scores on equal groups of one are paired. exceeds: what the backbone's best site is
+    better than, as `Controls.exceeds` says; chance alone by default. Raises UsageError if the
+    action's stream has no such iteration.
     """
     peaks = stream_peaks(curve, iterations)
     if len(peaks) < 2:
@@ -150,7 +150,7 @@ def estimate_retention(
         interval=found.interval,
         published=_published(streams.peak(ACTION), streams.peak(BACKBONE)),
         defined=has_signal(exceeds),
-        note=_missing_signal(exceeds, streams.at_most, absent_below),
+        note=_missing_signal(exceeds, streams, absent_below),
     )
 
 
@@ -159,13 +159,13 @@ def _published(action: float, backbone: float) -> float:
     return nan if backbone == CHANCE else float((action - CHANCE) / (backbone - CHANCE))
 
 
-def _missing_signal(exceeds: Exceeds, at_most: Mapping[str, float], absent_below: float) -> str:
+def _missing_signal(exceeds: Exceeds, streams: StreamScores, absent_below: float) -> str:
     """Why there is nothing to retain; empty where the backbone's signal is shown."""
     if exceeds["chance"] is None:
         return "n/a (no permutations)"
     if not exceeds["chance"]:
-        most = f"{100 * at_most[BACKBONE]:.0f} %"
-        absent = at_most[BACKBONE] < absent_below
+        most = f"{100 * streams.at_most[BACKBONE]:.0f} %"
+        absent = is_absent(streams.at_most[BACKBONE], streams.findable[BACKBONE], absent_below)
         return (
             f"n/a (backbone absent, at most {most})"
             if absent

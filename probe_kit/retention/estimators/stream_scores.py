@@ -1,18 +1,17 @@
 """Cross-fitted scores of a category's streams, and what averages and differences of them are made of."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.statistics.bootstrap import units_seed
 from probe_kit.statistics.estimates.balanced import CHANCE
-from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
+from probe_kit.statistics.estimates.crossfit import CrossFit, crossfit
 from probe_kit.statistics.estimates.mover import correlation_of, difference_interval, mean_interval, not_surer
 from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
 from probe_kit.statistics.estimates.shares import Share
-from probe_kit.statistics.estimates.verdict import at_most
+from probe_kit.statistics.estimates.verdict import at_most, findable, permuted_threshold
 from probe_kit.statistics.fieller import Interval
 from probe_kit.train.results.probe_curve import ProbeCurve
 
@@ -32,12 +31,13 @@ class StreamScores:
     """Cross-fitted scores of K streams of one category and view.
 
     names: `action` and `backbone` in this order, as far as they were probed. fit: their scores, on the same
-    halvings. at_most: by name, an upper limit of the best site's accuracy, see `verdict.at_most`.
+    groups. at_most: by name, an upper limit of the best site's accuracy, see `verdict.at_most`.
     """
 
     names: tuple[str, ...]
     fit: CrossFit
     at_most: Mapping[str, float] = field(default_factory=dict)
+    findable: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def scores(self) -> Scores:
@@ -45,7 +45,7 @@ class StreamScores:
         return Scores.of(self.fit)
 
     def accuracy(self, name: str) -> float:
-        """Accuracy of a site chosen on half of the groups, on the other half."""
+        """Accuracy of the sites that the inner folds choose, on the outer folds."""
         return CHANCE + float(self.fit.above[self.names.index(name)])
 
     def interval(self, name: str) -> Interval:
@@ -56,21 +56,30 @@ class StreamScores:
         """Accuracy of the site that is best on all groups, scored on them too."""
         return float(self.fit.peaks[self.names.index(name)])
 
+    def as_of(self, seed_text: str) -> "StreamScores":
+        """The same, its groups taken to be those of another run's suite, which items in common may come from."""
+        return replace(self, fit=replace(self.fit, suite=seed_text))
+
 
 def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], seed_text: str) -> StreamScores | None:
     """The scores of streams by their rows of a curve; None without any.
 
-    Raises TooFewGroupsError for fewer than 4 groups, UnbalancedEpisodesError for a fold trained on one side only.
+    seed_text: of the run; scores on equal groups of one are paired. Raises TooFewGroupsError for fewer than 5
+    groups, UnbalancedEpisodesError for a fold trained on one side only.
     """
     if not rows:
         return None
-    own = {name: curve.sums.only(found) for name, found in rows.items()}
-    streams = []
-    for name, found in rows.items():
-        sites = [curve.sites[row] for row in found]
-        streams.append(Stream.of(own[name], [s.layer for s in sites], [s.iteration or 0 for s in sites]))
-    fit = crossfit(streams, units_seed(curve.groups, seed_text))
-    return StreamScores(tuple(rows), fit, {name: at_most(part) for name, part in own.items()})
+    streams = {name: curve.fit_stream(found) for name, found in rows.items()}
+    fit = crossfit(list(streams.values()), curve.group_names, seed_text)
+    return StreamScores(
+        tuple(rows),
+        fit,
+        {name: at_most(stream.scores) for name, stream in streams.items()},
+        {
+            name: findable(stream.scores, permuted_threshold(curve.null[rows[name]]))
+            for name, stream in streams.items()
+        },
+    )
 
 
 # -- averages and differences --------------------------------------------------------------------------------
@@ -124,7 +133,7 @@ class Rate:
 
 @dataclass(frozen=True)
 class PooledScores:
-    """Scores of one or more runs in one category. fit: their mean on common halvings, None on other groups."""
+    """Scores of one or more runs in one category. fit: their mean on common groups, None on other groups."""
 
     names: tuple[str, ...]
     scores: Scores
@@ -137,12 +146,12 @@ class PooledScores:
         if not names:
             return None
         fits = [_only(run, names) for run in runs]
-        if len({(fit.seed, fit.n_groups) for fit in fits}) > 1:
+        if not all(fit.shares_groups_with(fits[0]) for fit in fits):
             return cls(names, Scores.mean([Scores.of(fit) for fit in fits]), None)
-        above, peaks, gaps = (
-            np.mean([getattr(fit, part) for fit in fits], axis=0) for part in ("above", "peaks", "differences")
+        above, peaks, influence = (
+            np.mean([getattr(fit, part) for fit in fits], axis=0) for part in ("above", "peaks", "influence")
         )
-        fit = CrossFit(above, peaks, gaps, fits[0].n_groups, fits[0].n_episodes, fits[0].seed)
+        fit = replace(fits[0], above=above, peaks=peaks, influence=influence)
         return cls(names, Scores.of(fit), fit)
 
     def accuracy(self, name: str) -> Rate:
@@ -151,13 +160,17 @@ class PooledScores:
         interval = self.scores.accuracy_interval(row) if self.fit is None else accuracy_interval(self.fit, row)
         return Rate(CHANCE + float(self.scores.above[row]), interval)
 
+    def shares_groups_with(self, other: "PooledScores") -> bool:
+        """Whether both are of the same groups of one suite."""
+        return self.fit is not None and other.fit is not None and self.fit.shares_groups_with(other.fit)
+
     def covariance_with(self, other: "PooledScores") -> NDArray[np.float64]:
         """(K, L) covariance of the scores; 0 on other groups.
 
         Of a stream with itself it leaves room for unseen groups, in which one run may hold
         all and the other nothing.
         """
-        if self.fit is None or other.fit is None or self.fit.seed != other.fit.seed:
+        if self.fit is None or other.fit is None or not self.shares_groups_with(other):
             return np.zeros((len(self.names), len(other.names)))
         between = self.fit.covariance_with(other.fit)
         for name in set(self.names) & set(other.names):
@@ -179,6 +192,4 @@ class PooledScores:
 def _only(run: StreamScores, names: Sequence[str]) -> CrossFit:
     rows = [run.names.index(name) for name in names]
     fit = run.fit
-    return CrossFit(
-        fit.above[rows], fit.peaks[rows], fit.differences[rows], fit.n_groups, fit.n_episodes, fit.seed
-    )
+    return replace(fit, above=fit.above[rows], peaks=fit.peaks[rows], influence=fit.influence[rows])

@@ -11,11 +11,11 @@ from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.estimators.retention import Iterations, known_iteration
 from probe_kit.retention.estimators.stream_scores import ACTION, BACKBONE, Limits, limits
-from probe_kit.statistics.bootstrap import units_seed
 from probe_kit.statistics.estimates.balanced import GroupSums
 from probe_kit.statistics.estimates.crossfit import Stream, crossfit
 from probe_kit.statistics.estimates.retention import Ratio, retention
 from probe_kit.statistics.estimates.scores import Scores, t_quantile
+from probe_kit.statistics.folds import fold_of_groups, sums_by_group
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.labels.label_results import METRICS, LabelCurve, LabelResults
 
@@ -28,7 +28,7 @@ STEP = "step"
 class LabelPeak:
     """The score of a label in one stream.
 
-    above: score above chance of a site chosen on half of the groups, on the other half; ci: its 95 % interval,
+    above: score above chance of the sites that the inner folds choose, on the outer folds; ci: its 95 % interval,
     Student's. site: of the largest score above its own chance; score, chance, p_fwe: of that site. exceeds: by
     control that was run, whether the site exceeds it.
     """
@@ -93,8 +93,8 @@ def measure_label_retention(
     """Retention of the label that `results` are of.
 
     view: the first probed one by default. From every sample's score the chance of its site is subtracted, which
-    is the mean score of the label permutations there. Then a site is chosen on half of the groups and scored on
-    the other half, as for sides; see `probe_kit.statistics.estimates`.
+    is the mean score of the label permutations there. In every outer fold sites are chosen by the inner folds, as
+    for sides; see `probe_kit.statistics.estimates`.
     Raises UnknownSiteError for a view that was not probed, NoProbesError for a run without backbone or action, and
     UsageError for an iteration that the action does not have.
     """
@@ -104,8 +104,8 @@ def measure_label_retention(
         raise UnknownSiteError(f"view {view!r} was not probed; probed: {', '.join(own.views)}")
     curve = results.curves[view]
     rows = {ACTION: _rows(curve, ACTION, iterations), BACKBONE: _rows(curve, BACKBONE, "all")}
-    above = [_above_chance(curve, found, results.groups) for found in rows.values()]
-    scores = Scores.of(crossfit(above, units_seed(results.groups, own.seed_text), chance=0.0))
+    above = [_above_chance(curve, found, results) for found in rows.values()]
+    scores = Scores.of(crossfit(above, np.unique(results.groups).tolist(), own.seed_text, chance=0.0))
     action, backbone = (
         _peak(results, view, found, scores, place) for place, found in enumerate(rows.values())
     )  # fmt: skip
@@ -153,14 +153,19 @@ def _rows(curve: LabelCurve, part: str, iterations: Iterations) -> NDArray[np.in
     return rows if step is None else rows[[curve.sites[row].iteration == step for row in rows]]
 
 
-def _above_chance(curve: LabelCurve, rows: NDArray[np.intp], groups: NDArray[np.str_]) -> Stream:
+def _above_chance(curve: LabelCurve, rows: NDArray[np.intp], results: LabelResults) -> Stream:
     """Scores of every sample minus the chance of its site, summed by group."""
-    names, group_of = np.unique(groups, return_inverse=True)
-    member = np.eye(names.size)[group_of]
+    groups = results.groups
     chance = np.nan_to_num(curve.chance[rows])  # without permutations nothing is defined, and nothing is NaN
-    sums = GroupSums((curve.scores[rows] - chance[:, None]) @ member, member.sum(axis=0))
+    above = sums_by_group(curve.scores[rows] - chance[:, None], groups)
     sites = [curve.sites[row] for row in rows]
-    return Stream.of(sums, [site.layer for site in sites], [site.iteration or 0 for site in sites])
+    return Stream.of(
+        GroupSums(above, sums_by_group(np.ones(groups.size), groups)),
+        curve.inner[rows],
+        fold_of_groups(results.fold_of, groups),
+        [site.layer for site in sites],
+        [site.iteration or 0 for site in sites],
+    )
 
 
 def _peak(results: LabelResults, view: str, rows: NDArray[np.intp], scores: Scores, place: int) -> LabelPeak:

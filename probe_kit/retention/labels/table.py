@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 _NOTE = (
-    "above chance: score of a site chosen on half of the groups, on the other half, minus its mean score with "
+    "above chance: score of the sites that the inner folds choose, on the outer folds, minus its mean score with "
     "permuted labels; 95 % intervals over groups; ✓: signal, above chance and every control that was run"
 )
 _SIGNAL = " ✓"

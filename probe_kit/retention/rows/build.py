@@ -40,7 +40,7 @@ from probe_kit.retention.rows.parts import (
     RunInfo,
 )
 from probe_kit.retention.rows.row import RetentionRow
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, verdict
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, Verdict, verdict
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
 from probe_kit.train.results.control_scores import Controls, Exceeds, UntrainedScore, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
@@ -261,7 +261,7 @@ class _ProbedCategory:
             "ci": None if scored is None else limits(scored.interval(name)),
             "peak": peak.accuracy if scored is None else scored.peak(name),
             "at_most": most,
-            "verdict": None if most is None else verdict(has_signal(exceeds), most, self.settings.absent_below),
+            "verdict": None if scored is None else self._verdict(name, exceeds, scored),
             "site": str(peak.site),
             "layer": peak.site.layer,
             "depth": self.curve.depth(peak.site),
@@ -272,6 +272,10 @@ class _ProbedCategory:
             "minus_untrained": None if untrained is None else untrained.difference,
             "minus_untrained_ci": None if untrained is None else untrained.ci,
         }
+
+    def _verdict(self, name: str, exceeds: Exceeds, scored: StreamScores) -> Verdict:
+        bound = self.settings.absent_below
+        return verdict(has_signal(exceeds), scored.at_most[name], scored.findable[name], bound)
 
     def retention(self) -> RetentionPart:
         """Of both streams."""

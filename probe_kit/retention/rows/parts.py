@@ -113,12 +113,13 @@ class SwapEffect:
 class StreamPart:
     """What can be read in one stream.
 
-    score: accuracy of a site chosen on half of the groups of items, on the other half; balanced between the sides,
+    score: accuracy of the sites that the inner folds choose, on the outer folds; balanced between the sides,
     so that chance is one half. ci: its 95 % interval. peak: accuracy of the site that is best on all of them,
     which is too high by the luck of being chosen. at_most: an upper 95 % limit of the best site's accuracy.
-    verdict: `shown` (family-wise above chance, and above every control that was run), `absent` (not shown, and
-    `at_most` below a bound), or `not shown`. site, layer, depth: the first of the best sites, a place without an
-    interval of its own; ties: how many others are as accurate. p_fwe: of that site, family-wise. exceeds: whether
+    verdict: `shown` (family-wise above chance, and above every control that was run), `absent` (not shown,
+    `at_most` below a bound, and the bound findable by so many items), or `not shown`. site, layer, depth: the
+    first of the best sites, a place without an interval of its own; ties: how many others are as accurate.
+    p_fwe: of that site, family-wise. exceeds: whether
     it is better than `chance` and each control; None for one that was not run. selectivity: its accuracy above
     that of the same probe on random labels of items. minus_untrained: how much more accurate it is than the
     untrained network's best.

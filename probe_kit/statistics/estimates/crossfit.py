@@ -1,62 +1,83 @@
-"""Cross-fitted scores: a site is chosen on one half of the groups and scored on the other half."""
+"""Cross-fitted scores: the site of every outer fold is chosen by its inner folds and scored on the fold itself.
 
-from collections.abc import Iterator, Sequence
+The choice is repeated on resampled groups, and sites share it by how often they are best. The spread over the
+resamples says what the choice adds to the variance: Efron, “Estimation and accuracy after model selection”,
+Journal of the American Statistical Association 109 (2014).
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.errors import TooFewGroupsError, UsageError
+from probe_kit.statistics.bootstrap import draw_groups
 from probe_kit.statistics.estimates.balanced import CHANCE, GroupSums, Matrix
+from probe_kit.statistics.folds import OUTER_FOLDS
 
-Sides = NDArray[np.int8]
-"""(R, G): the half that a group belongs to in each of R splits, 1 or −1; 0 for a group that takes no part."""
-
-REPEATS = 100
-"""Splits of all groups, over which a score is averaged."""
-HALVINGS = 100
-"""Halvings of the groups, from which the covariance is measured."""
-REPEATS_OF_HALF = 10
-"""Splits of each half of a halving."""
-FEWEST_GROUPS = 4
-"""A half of a half needs a group to choose on and one to score on."""
-_AT_ONCE = 256
-"""Splits in memory at once: a matrix of so many columns and a few hundred sites fits into the cache."""
+RESAMPLES = 1000
+"""Resamples of the groups in which the sites are chosen anew."""
+FEWEST_GROUPS = OUTER_FOLDS
+"""Every outer fold tests a group of its own."""
 _EQUAL = 1e-9
-"""Sums closer than this differ by rounding only."""
+"""Qualities closer than this, as a share of the largest, differ by rounding only."""
 
 
 @dataclass(frozen=True)
 class Stream:
-    """The sites of one stream. They are scored by their sums and chosen by the guide, (S, G)."""
+    """The sites of one stream, on G groups in F outer folds.
+
+    scores: what a site scores in every group, held out by the outer folds. guide: (S, F, G) what sites are chosen
+    by, the larger the better: quality of a group's predictions in the inner folds of an outer fold, 0 for the
+    groups that the outer fold tests. fold_of: (G,) outer fold that tests a group, a position along F.
+    """
 
     scores: GroupSums
     guide: Matrix
+    fold_of: NDArray[np.intp]
 
     @classmethod
-    def of(cls, scores: GroupSums, layers: ArrayLike, iterations: ArrayLike | None = None) -> "Stream":
-        """Sites at (S,) layers and (S,) iterations, in any order.
+    def of(
+        cls,
+        scores: GroupSums,
+        inner: NDArray[np.floating],
+        fold_of: ArrayLike,
+        layers: ArrayLike,
+        iterations: ArrayLike | None = None,
+    ) -> "Stream":
+        """Sites at (S,) layers and (S,) iterations, in any order. inner: (S, F, G) qualities, see `guide`.
 
-        A stream that runs once is chosen by its sums. With several iterations the guide is half a site's sums and
-        half those of its surroundings, smoothed along layers and iterations. Raises UsageError for another number
-        of places than of sites, or no site.
+        A stream that runs once is chosen by its qualities. With several iterations the guide is half a site's
+        quality and half that of its surroundings, smoothed along layers and iterations. Raises UsageError for
+        another number of places than of sites, no site, qualities of other folds or groups, and a quality of a
+        group in the fold that tests it.
         """
-        at = np.asarray(layers)
+        at, folds = np.asarray(layers), np.asarray(fold_of, np.intp)
         steps = np.zeros_like(at) if iterations is None else np.asarray(iterations)
         if not len(scores.sums) == at.size == steps.size or at.size == 0:
             raise UsageError(
                 f"{at.size} layers and {steps.size} iterations for {len(scores.sums)} sites; expected one each, "
                 "and at least one site"
             )
-        if np.unique(steps).size < 2:
-            return cls(scores, scores.sums)
-        return cls(scores, (scores.sums + smoothing(at, steps) @ scores.sums) / 2)
+        quality: Matrix = np.asarray(inner, np.float64)
+        _check_inner(quality, scores, folds)
+        if np.unique(steps).size > 1:
+            quality = (quality + np.tensordot(smoothing(at, steps), quality, 1)) / 2
+        return cls(scores, quality, folds)
 
     @property
     def peak(self) -> float:
         """Accuracy of the most accurate site, above what choosing it will hold up to."""
         return float(self.scores.accuracies.max())
+
+    @property
+    def best(self) -> NDArray[np.intp]:
+        """(F,) position of the site that is best in the inner folds of each outer fold, the first one on ties."""
+        quality = self.guide.sum(axis=2)
+        least = quality.max(axis=0) - _EQUAL * np.abs(quality).max(axis=0)
+        first: NDArray[np.intp] = (quality >= least).argmax(axis=0)
+        return first
 
 
 @dataclass(frozen=True)
@@ -64,25 +85,28 @@ class CrossFit:
     """Cross-fitted scores of K streams on the same groups.
 
     above: (K,) mean held-out accuracy of the chosen sites, above chance. peaks: (K,) accuracy of the site that
-    is best on all groups, scored on them too. differences: (K, HALVINGS) score on one half of the groups minus
-    score on the other. n_groups, n_episodes: G and E. seed: of the halvings; equal seeds and groups have equal
-    halvings.
+    is best on all groups, scored on them too. influence: (K, G) how much a score grows by a group, through its own
+    score and through the choice of sites. n_episodes: E. groups: their G names. suite: what the names are from.
     """
 
     above: Matrix
     peaks: Matrix
-    differences: Matrix
-    n_groups: int
+    influence: Matrix
     n_episodes: float
-    seed: int
+    groups: tuple[str, ...]
+    suite: str
+
+    @property
+    def n_groups(self) -> int:
+        """G."""
+        return len(self.groups)
 
     @property
     def covariance(self) -> Matrix:
         """(K, K) of `above`, where no score is known better than unseen groups allow.
 
-        Half of the mean square difference between halves is the variance at half the size; half of that is the
-        variance at full size. A share t of groups at chance costs t of a score above chance. Where all G groups
-        agree, t² is 2 / ((G + 1)(G + 2)) on average; a variance is at least that times the squared score.
+        A share t of groups at chance costs t of a score above chance. Where all G groups agree, t² is
+        2 / ((G + 1)(G + 2)) on average; a variance is at least that times the squared score.
         """
         found = self.covariance_with(self)
         unseen = 2 / ((self.n_groups + 1) * (self.n_groups + 2)) * self.above**2
@@ -91,65 +115,77 @@ class CrossFit:
 
     @property
     def df(self) -> int:
-        """Degrees of freedom of the covariance: a group less, and at most half of the halvings."""
-        return min(self.n_groups - 1, HALVINGS // 2)
+        """Degrees of freedom of the covariance: a group less."""
+        return self.n_groups - 1
+
+    def shares_groups_with(self, other: "CrossFit") -> bool:
+        """Whether both are of the same groups of one suite."""
+        return (self.suite, self.groups) == (other.suite, other.groups)
 
     def covariance_with(self, other: "CrossFit") -> Matrix:
-        """(K, L) covariance with the scores of `other`; 0 where the two have other halvings, so other groups.
-
-        Equal seeds stand for equal groups: make the seed from the groups' names.
-        """
-        if (self.seed, self.n_groups) != (other.seed, other.n_groups):
+        """(K, L) covariance with the scores of `other`; 0 where the two are of other groups."""
+        if not self.shares_groups_with(other):
             return np.zeros((self.above.size, other.above.size))
-        covariance: Matrix = self.differences @ other.differences.T / HALVINGS / 4
+        covariance: Matrix = self.influence @ other.influence.T * (self.n_groups / (self.n_groups - 1))
         return covariance
 
 
-def crossfit(streams: Sequence[Stream], seed: int, chance: float = CHANCE) -> CrossFit:
-    """Choose each stream's best site on half of the groups and score it on the other half, both ways, 100 times.
+def crossfit(
+    streams: Sequence[Stream], groups: Sequence[str], suite: str = "", chance: float = CHANCE
+) -> CrossFit:
+    """Score each stream by the sites that its inner folds choose, on the outer folds.
 
-    streams: on the same groups, in the same order. seed: of the halvings; derive it from the suite and the names
-    of the groups (`units_seed`), so that neither other categories nor the order of work change a number, and so
-    that runs on the same groups stay paired. chance: 0 for sums from which the chance of every site is subtracted
-    already. Sites that are equally good share the choice, so that their order does not matter. Raises
-    TooFewGroupsError for fewer than 4 groups, and UsageError for NaN or streams on other groups.
+    streams: on the same groups, in the order of the names `groups`. suite: what the names are from; runs on equal
+    groups of one suite are paired. chance: 0 for sums from which the chance of every site is subtracted already.
+    Sites that are equally good share the choice, so that their order does not matter. Raises TooFewGroupsError for
+    fewer than 5 groups, and UsageError for NaN or streams on other groups.
     """
-    n_groups = _check(streams)
-    whole, parts = _splits(n_groups, seed)
-    above, differences = [], []
-    for stream in streams:
-        above.append(held_out_scores(stream, whole).mean() - chance)
-        of_half = held_out_scores(stream, parts).reshape(HALVINGS, 2, REPEATS_OF_HALF).mean(axis=2)
-        differences.append(of_half[:, 0] - of_half[:, 1])
-    peaks = np.array([stream.peak for stream in streams])
-    n_episodes = min(stream.scores.n_episodes for stream in streams)
-    return CrossFit(np.array(above), peaks, np.array(differences), n_groups, n_episodes, seed)
+    _check(streams, groups)
+    found = [_scored(stream) for stream in streams]
+    return CrossFit(
+        np.array([score for score, _ in found]) - chance,
+        np.array([stream.peak for stream in streams]),
+        np.array([influence for _, influence in found]),
+        min(stream.scores.n_episodes for stream in streams),
+        tuple(map(str, groups)),
+        suite,
+    )
 
 
-def held_out_scores(stream: Stream, sides: Sides) -> Matrix:
-    """(R,) accuracy in every split: the site that is best on either half, scored on the other half."""
-    return np.concatenate([_held_out(stream, part) for part in _in_parts(sides)])
+def _scored(stream: Stream) -> tuple[float, Matrix]:
+    """The score of a stream, and (G,) the influence of every group on it."""
+    sums, sizes = stream.scores.sums, stream.scores.sizes
+    times = draw_groups(sizes.size, 0, RESAMPLES).T.astype(np.float64)
+    of_group = np.empty(sizes.size)
+    of_resample = np.zeros(RESAMPLES)
+    for fold in range(stream.guide.shape[1]):
+        tested = stream.fold_of == fold
+        shares = _shared_choice(stream.guide[:, fold] @ times)
+        of_group[tested] = shares.mean(axis=1) @ sums[:, tested]
+        of_resample += sums[:, tested].sum(axis=1) @ shares
+    score = float(of_group.sum() / sizes.sum())
+    by_choice = _influence_on_choice(times, of_resample / sizes.sum())
+    return score, (of_group - score * sizes) / sizes.sum() + by_choice
 
 
-def _held_out(stream: Stream, sides: Sides) -> Matrix:
-    halves = [(sides == side).T.astype(np.float64) for side in (1, -1)]
-    sums = [stream.scores.sums @ half for half in halves]
-    guides = sums if stream.guide is stream.scores.sums else [stream.guide @ half for half in halves]
-    right = _score_of_best(guides[0], sums[1]) + _score_of_best(guides[1], sums[0])
-    shares: Matrix = right / (stream.scores.sizes @ (halves[0] + halves[1]))
+def _shared_choice(quality: Matrix) -> Matrix:
+    """(S, R) shares of the sites in the choice of every resample: equal among those of the largest quality."""
+    best = quality >= quality.max(axis=0) - _EQUAL * np.abs(quality).max(axis=0)
+    shares: Matrix = best / best.sum(axis=0)
     return shares
 
 
-def _score_of_best(guide: Matrix, sums: Matrix) -> Matrix:
-    """(R,) of (S, R): mean of `sums` over the sites at which `guide` is largest."""
-    best = guide >= guide.max(axis=0) - _EQUAL
-    mean: Matrix = np.einsum("sr,sr->r", best, sums) / best.sum(axis=0)
-    return mean
+def _influence_on_choice(times: Matrix, scores: Matrix) -> Matrix:
+    """(G,) covariance of how often a group is drawn, (G, R), with (R,) scores: the infinitesimal jackknife.
 
-
-def _in_parts(sides: Sides) -> Iterator[Sides]:
-    for start in range(0, len(sides), _AT_ONCE):
-        yield sides[start : start + _AT_ONCE]
+    So few resamples give covariances even where there are none, G / R of the variance of the scores in sum of
+    squares (Wager, Hastie and Efron, JMLR 15, 2014). The covariances are shrunk by that.
+    """
+    found: Matrix = (times - 1) @ (scores - scores.mean()) / scores.size
+    found -= found.mean()
+    length = float(found @ found)
+    by_few_resamples = len(times) / scores.size * float(scores.var())
+    return found * np.sqrt(max(0.0, 1 - by_few_resamples / length)) if length > 0 else found
 
 
 def smoothing(layers: ArrayLike, iterations: ArrayLike) -> Matrix:
@@ -171,39 +207,37 @@ def smoothing(layers: ArrayLike, iterations: ArrayLike) -> Matrix:
     return weights
 
 
-@lru_cache(maxsize=4)  # the same for all streams and views of a category
-def _splits(n_groups: int, seed: int) -> tuple[Sides, Sides]:
-    """Splits of all groups, (REPEATS, G), and of both halves of each halving, one after another."""
-    generator = np.random.default_rng(seed)
-    whole = _halve(generator, np.ones((REPEATS, n_groups), np.bool_))
-    halvings = _halve(generator, np.ones((HALVINGS, n_groups), np.bool_))
-    halves = np.stack([halvings == 1, halvings == -1], axis=1).reshape(-1, n_groups)
-    parts = _halve(generator, np.repeat(halves, REPEATS_OF_HALF, axis=0))
-    whole.setflags(write=False)
-    parts.setflags(write=False)
-    return whole, parts
-
-
-def _halve(generator: np.random.Generator, taking_part: NDArray[np.bool_]) -> Sides:
-    """(R, G) random halves of the groups that take part; of an odd number the second half has one more."""
-    drawn = np.where(taking_part, generator.random(taking_part.shape), np.inf)
-    rank = drawn.argsort(axis=1).argsort(axis=1)
-    first = rank < taking_part.sum(axis=1, keepdims=True) // 2
-    return np.where(taking_part, np.where(first, 1, -1), 0).astype(np.int8)
-
-
-def _check(streams: Sequence[Stream]) -> int:
+def _check(streams: Sequence[Stream], groups: Sequence[str]) -> None:
     counts = sorted({stream.scores.n_groups for stream in streams})
-    if len(counts) != 1:
-        raise UsageError(f"streams on {counts} groups; expected one or more streams on the same groups")
+    if counts != [len(groups)]:
+        raise UsageError(
+            f"streams on {counts} groups, and {len(groups)} names of groups; expected one or more streams on the "
+            "same groups, and a name for each"
+        )
     if counts[0] < FEWEST_GROUPS:
         raise TooFewGroupsError(
-            f"{counts[0]} independent groups of items; expected at least {FEWEST_GROUPS}, so that either half of "
-            "them can choose a site and score it. Extract more items of this category."
+            f"{counts[0]} independent groups of items; expected at least {FEWEST_GROUPS}, so that every outer "
+            "fold tests one. Extract more items of this category."
         )
     for stream in streams:
-        if not (np.isfinite(stream.scores.sums).all() and (stream.scores.sizes > 0).all()):
+        finite = np.isfinite(stream.scores.sums).all() and np.isfinite(stream.guide).all()
+        if not (finite and (stream.scores.sizes > 0).all()):
             raise UsageError(
                 "sums hold NaN, or a group has no episode; expected finite sums of groups with episodes"
             )
-    return counts[0]
+
+
+def _check_inner(quality: Matrix, scores: GroupSums, folds: NDArray[np.intp]) -> None:
+    sites, count = scores.sums.shape
+    if quality.ndim != 3 or quality.shape[::2] != (sites, count) or folds.shape != (count,):
+        raise UsageError(
+            f"inner qualities {quality.shape} and folds {folds.shape} for {sites} sites and {count} groups; "
+            "expected (sites, folds, groups), and a fold for each group"
+        )
+    if not ((folds >= 0) & (folds < quality.shape[1])).all():
+        raise UsageError(f"a group is tested by fold {folds.max()}; expected folds 0 to {quality.shape[1] - 1}")
+    if quality[:, folds, np.arange(count)].any():
+        raise UsageError(
+            "inner qualities of groups in the fold that tests them; expected 0 there, as these groups may not "
+            "take part in its choice"
+        )

@@ -24,10 +24,10 @@ from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results
 
 FRAME = "first_frame_sha256"
-Verdict = Literal["kept", "moved", "forgotten", "learned", "not shown in either", "not clear"]
+Verdict = Literal["kept", "transfer not shown", "forgotten", "learned", "not shown in either", "not clear"]
 VERDICTS: Mapping[Verdict, str] = {
     "kept": "signal in both, and probes transfer after recentring",
-    "moved": "signal in both, and no transfer is shown",
+    "transfer not shown": "signal in both, and more items would tell whether probes transfer",
     "forgotten": "signal in the first alone, and the 95 % interval of the drop excludes 0",
     "learned": "signal in the second alone, and the 95 % interval of the gain excludes 0",
     "not shown in either": "signal in neither",
@@ -79,7 +79,7 @@ class CategoryDrift:
         if here and there:
             if not self.sites:
                 return "not clear"
-            return "kept" if self.p_transfer < SIGNIFICANCE else "moved"
+            return "kept" if self.p_transfer < SIGNIFICANCE else "transfer not shown"
         if not (here or there):
             return "not shown in either"
         low, high = (self.difference and self.difference.backbone_ci) or (None, None)

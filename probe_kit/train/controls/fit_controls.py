@@ -103,7 +103,7 @@ def _baseline_scores(
         problem = category_problem(run.episodes, category, settings)
         probe = problem.probe(samples)
         right = correctness(probe.decisions, problem.labels)
-        share = problem.accuracy(probe)
+        share = problem.accuracy(probe.decisions)
         p = float(pointwise_p(right.mean(keepdims=True), probe.null[None, :])[0])
         yield BaselineScore(
             name=name,

@@ -18,7 +18,6 @@ from probe_kit.statistics.paired_bootstrap import better_than_reference
 from probe_kit.train.controls.baselines import Features, tile_pixels, word_counts
 from probe_kit.train.crossval.category_problem import CategoryProblem, category_problem
 from probe_kit.train.crossval.metrics import correctness
-from probe_kit.train.crossval.site_probe import SiteProbe
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, BaselineScore, ControlComparison
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
 SIDE = 12
 """Pixels along a tile: enough for colours and coarse shapes."""
 LAYERS = 5
-"""Random layers that are tried; the most accurate one of a category counts, which errs towards silence."""
+"""Random layers, whose mean is the reference: one alone is lucky or not, and the best of them is lucky."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,7 @@ def random_layer(parts: Sequence[Features], width: int, seed: int) -> Features:
 def random_feature_scores(
     results: ProbeResults, run: RunReader, inputs: RandomFeatureInputs
 ) -> tuple[list[BaselineScore], list[ControlComparison]]:
-    """The control's accuracy per category, as wide as the backbone, and every site compared with it.
+    """The control's mean accuracy per category, as wide as the backbone, and every site compared with it.
 
     A site is compared with layers of its own stream's width, on the same folds.
     """
@@ -75,26 +74,30 @@ def random_feature_scores(
     for category in results.settings.categories:
         problem = category_problem(run.episodes, category, results.settings)
         references = {
-            name: _reference(inputs, problem, stream.width, results.settings.seed)
+            name: _layer_decisions(inputs, problem, stream.width, results.settings.seed)
             for name, stream in run.streams.items()
         }
         first = references.get("backbone", next(iter(references.values())))
         scores.append(_score(first, problem, category))
-        right = {name: correctness(probe.decisions, problem.labels) for name, probe in references.items()}
+        right = {
+            name: correctness(decisions, problem.labels[None, :]).mean(axis=0)
+            for name, decisions in references.items()
+        }
         found += list(_held_against(results, category, right))
     return scores, found
 
 
-def _reference(inputs: RandomFeatureInputs, problem: CategoryProblem, width: int, seed: int) -> SiteProbe:
-    """The probe of the best of the random layers."""
+def _layer_decisions(
+    inputs: RandomFeatureInputs, problem: CategoryProblem, width: int, seed: int
+) -> NDArray[np.float64]:
+    """(LAYERS, E) held-out decisions of the probes of the random layers."""
     nothing = np.empty((problem.labels.size, 0), bool)
     layers = (inputs.layer(problem.rows, width, derive_seed("binding", seed, number)) for number in range(LAYERS))
-    probes = [problem.fit(Samples.pooled(layer), nothing) for layer in layers]
-    return max(probes, key=lambda one: int(correctness(one.decisions, problem.labels).sum()))
+    return np.array([problem.fit(Samples.pooled(layer), nothing).decisions for layer in layers])
 
 
-def _score(probe: SiteProbe, problem: CategoryProblem, category: str) -> BaselineScore:
-    share = problem.accuracy(probe)
+def _score(decisions: NDArray[np.float64], problem: CategoryProblem, category: str) -> BaselineScore:
+    share = problem.accuracy(decisions)
     return BaselineScore(
         name=RANDOM_FEATURES,
         category=category,
@@ -107,7 +110,7 @@ def _score(probe: SiteProbe, problem: CategoryProblem, category: str) -> Baselin
 
 
 def _held_against(
-    results: ProbeResults, category: str, references: dict[str, NDArray[np.bool_]]
+    results: ProbeResults, category: str, references: dict[str, NDArray[np.float64]]
 ) -> Iterator[ControlComparison]:
     for (name, view), curve in results.curves.items():
         if name != category:
@@ -115,7 +118,7 @@ def _held_against(
         for stream in dict.fromkeys(site.stream for site in curve.sites):
             rows, reference = curve.stream(stream), references[stream]
             seed = derive_seed("binding", results.settings.seed, category, view, stream)
-            p = better_than_reference(curve.correct[rows], reference.astype(float), curve.groups, seed)
+            p = better_than_reference(curve.correct[rows], reference, curve.groups, seed)
             for row, of_site in zip(rows, p, strict=True):
                 yield ControlComparison(
                     RANDOM_FEATURES, category, view, str(curve.sites[row]), float(reference.mean()), float(of_site)

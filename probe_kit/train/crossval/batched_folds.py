@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.statistics.folds import Fold
-from probe_kit.train.crossval.metrics import log_loss
-from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, Matrix, NestedFold, select_c
+from probe_kit.train.crossval.metrics import log_loss, log_losses
+from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerLosses, Matrix, NestedFold, select_c
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.backend import Array, array_namespace, to_device_of, to_numpy
 from probe_kit.train.solver.design_matrix import StackedDesign
@@ -38,13 +38,17 @@ def cross_validate_together(
     Raises ProbeNotConvergedError, and TooFewGroupsError for a training set with a single class.
     """
     inner = _at_once([one for nested in folds for one in nested.inner], labels)
-    loss = np.concatenate([_Together.of(samples, labels, some).losses() for some in inner], axis=1)
+    parts = [_Together.of(samples, labels, some).losses() for some in inner]
+    loss, by_episode = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
     begins = np.cumsum([0, *(len(nested.inner) for nested in folds[:-1])])
-    strengths: Matrix = STRENGTHS[select_c(np.add.reduceat(loss, begins, axis=1))]
-    outer = zip(_at_once([one.outer for one in folds], labels), _at_once(strengths, labels), strict=True)
-    return [
-        fitted for some, chosen in outer for fitted in _Together.of(samples, labels, some).fitted(np.array(chosen))
+    loss, by_episode = (np.add.reduceat(part, begins, axis=1) for part in (loss, by_episode))
+    chosen = select_c(loss)
+    found = [
+        (STRENGTHS[chosen[number]], InnerLosses.of(loss[:, number], by_episode[:, number], chosen[number]))
+        for number in range(len(folds))
     ]
+    outer = zip(_at_once([one.outer for one in folds], labels), _at_once(found, labels), strict=True)
+    return [fitted for some, own in outer for fitted in _Together.of(samples, labels, some).fitted(own)]
 
 
 def _at_once[T](folds: Iterable[T], labels: NDArray[np.bool_]) -> Iterator[tuple[T, ...]]:
@@ -78,24 +82,30 @@ class _Together:
         columns = to_device_of(design.samples, signs.reshape(len(signs), -1))
         return cls(folds, labels, coordinates, held_out, LogisticSolver(design), columns)
 
-    def losses(self) -> Matrix:
-        """(C, F, K) log-losses of the test episodes, summed, along the grid of C."""
-        return np.array([
-            [
-                log_loss(to_numpy(held_out @ own), self.labels[fold.test]) * fold.test.size
-                for held_out, own, fold in zip(self.held_out, self._of_folds(weights), self.folds, strict=True)
-            ]
-            for weights in self.solver.path_of_signs(self.signs, STRENGTHS)
-        ])  # fmt: skip
+    def losses(self) -> tuple[Matrix, Matrix]:
+        """(C, F, K) log-losses of the test episodes, summed, along the grid of C; (C, F, E) the first column's.
 
-    def fitted(self, strengths: Matrix) -> list[FittedFold]:
-        """Of every fold, with the (F, K) chosen strengths."""
+        Those by episode are 0 outside of a fold's test episodes.
+        """
+        loss = np.empty((STRENGTHS.size, len(self.folds), self.labels.shape[1]))
+        by_episode = np.zeros((STRENGTHS.size, len(self.folds), len(self.labels)))
+        for step, weights in enumerate(self.solver.path_of_signs(self.signs, STRENGTHS)):
+            parts = zip(self.held_out, self._of_folds(weights), self.folds, strict=True)
+            for number, (held_out, own, fold) in enumerate(parts):
+                decisions, truth = to_numpy(held_out @ own), self.labels[fold.test]
+                loss[step, number] = log_loss(decisions, truth) * fold.test.size
+                by_episode[step, number, fold.test] = log_losses(decisions[:, 0], truth[:, 0])
+        return loss, by_episode
+
+    def fitted(self, found: Sequence[tuple[Matrix, InnerLosses]]) -> list[FittedFold]:
+        """Of every fold, with its (K,) chosen strengths and the losses that chose them."""
+        strengths = np.array([own for own, _ in found])
         of_columns = to_device_of(self.signs, strengths.reshape(-1))
         (weights,) = self.solver.path_of_signs(self.signs, [of_columns])
         return [
-            FittedFold.of(coordinates, own, to_numpy(held_out @ own), chosen)
-            for coordinates, own, held_out, chosen in zip(
-                self.coordinates, self._of_folds(weights), self.held_out, strengths, strict=True
+            FittedFold.of(coordinates, own, to_numpy(held_out @ own), *fold)
+            for coordinates, own, held_out, fold in zip(
+                self.coordinates, self._of_folds(weights), self.held_out, found, strict=True
             )
         ]
 

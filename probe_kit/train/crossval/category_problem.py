@@ -57,13 +57,16 @@ class CategoryProblem:
         """Probe the samples of this category's episodes, and again for every column of (E, P) permuted labels."""
         return probe_site(samples, self.labels, permuted_labels, self.folds)
 
-    def accuracy(self, probe: SiteProbe) -> Accuracy:
-        """Held-out accuracy of a probe, balanced between the sides, groups of items as the unit."""
+    def accuracy(self, decisions: NDArray[np.float64]) -> Accuracy:
+        """Held-out accuracy of probes, balanced between the sides, groups of items as the unit.
+
+        decisions: (E,) of one probe, or (K, E) of several, whose mean accuracy it is.
+        """
         fold_of = np.empty(self.labels.size, np.int64)
         for number, fold in enumerate(self.folds):
             fold_of[fold.outer.test] = number
-        sums = balanced_sums(probe.decisions[None, :], self.labels, fold_of, self.groups)
-        return Accuracy(np.unique(self.groups), sums.sums[0], sums.sizes)
+        sums = balanced_sums(np.atleast_2d(decisions), self.labels, fold_of, self.groups)
+        return Accuracy(np.unique(self.groups), sums.sums.mean(axis=0), sums.sizes)
 
 
 def category_problem(episodes: "pd.DataFrame", category: str, settings: ProbeSettings) -> CategoryProblem:

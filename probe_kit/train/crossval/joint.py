@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.train.crossval.joint_design import JointSite
 from probe_kit.train.crossval.joint_objective import JointProblems
-from probe_kit.train.crossval.metrics import log_loss
-from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, Matrix, NestedFold, select_c
+from probe_kit.train.crossval.metrics import log_loss, log_losses
+from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerLosses, Matrix, NestedFold, select_c
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.backend import Array, array_namespace, to_numpy
 from probe_kit.train.solver.mixed_precision import solve
@@ -88,7 +88,7 @@ class _Columns:
     folds: Sequence[NestedFold]
 
     def fitted(self) -> list[FittedFold]:
-        chosen, starts = self._chosen()
+        chosen, starts, losses = self._chosen()
         inner = len(self.site.sets.outer) - len(chosen)
         fold, column = (part.ravel() for part in np.indices(chosen.shape))
         problems = self._problems(inner + fold, column, STRENGTHS[chosen].ravel())
@@ -96,25 +96,38 @@ class _Columns:
         decisions = to_numpy(problems.decisions(weights, self.samples.means)).reshape(*chosen.shape, -1)
         first = _kept(problems, weights, fold, np.flatnonzero(column == 0))
         return [
-            FittedFold(decisions[number][:, nested.outer.test].T, STRENGTHS[chosen[number]], *first[number])
+            FittedFold(
+                decisions[number][:, nested.outer.test].T,
+                STRENGTHS[chosen[number]],
+                *first[number],
+                losses[number],
+            )
             for number, nested in enumerate(self.folds)
         ]
 
-    def _chosen(self) -> tuple[NDArray[np.intp], Array]:
+    def _chosen(self) -> tuple[NDArray[np.intp], Array, list[InnerLosses]]:
         """(F, L) position of the chosen C by outer fold and column; (C, F, L, D + 1) weights to start from.
 
-        These are the mean of the inner folds'.
+        The weights are the mean of the inner folds'. Returns also the losses of every outer fold at its C.
         """
         sets = [(number, inner) for number, nested in enumerate(self.folds) for inner in nested.inner]
         of_fold = np.array([number for number, _ in sets])
         loss = np.zeros((STRENGTHS.size, len(self.folds), self.labels.shape[1]))
+        by_episode = np.zeros((STRENGTHS.size, len(self.folds), len(self.labels)))
         starts = []
-        for step, (weights, decided) in enumerate(self._along_grid(len(sets))):
-            for (number, inner), found in zip(sets, decided, strict=True):
-                loss[step, number] += log_loss(found[:, inner.test].T, self.labels[inner.test]) * inner.test.size
+        for step, (weights, of_sets) in enumerate(self._along_grid(len(sets))):
+            for (number, inner), found in zip(sets, of_sets, strict=True):
+                decided, truth = found[:, inner.test].T, self.labels[inner.test]
+                loss[step, number] += log_loss(decided, truth) * inner.test.size
+                by_episode[step, number, inner.test] = log_losses(decided[:, 0], truth[:, 0])
             starts.append([weights[of_fold == number].mean(axis=0) for number in range(len(self.folds))])
         xp = array_namespace(self.site.mean)
-        return select_c(loss), xp.stack([xp.stack(by_fold) for by_fold in starts])
+        chosen = select_c(loss)
+        losses = [
+            InnerLosses.of(loss[:, number], by_episode[:, number], chosen[number])
+            for number in range(len(self.folds))
+        ]
+        return chosen, xp.stack([xp.stack(by_fold) for by_fold in starts]), losses
 
     def _along_grid(self, sets: int) -> Iterator[tuple[Array, Matrix]]:
         """For each C, weights (S, L, D + 1) and decisions (S, L, E) of all inner folds, many at once."""
@@ -157,4 +170,7 @@ def _joined(parts: Sequence[FittedFold]) -> FittedFold:
     """One outer fold's probes, found in parts of the columns."""
     decisions = np.concatenate([part.decisions for part in parts], axis=1)
     strengths = np.concatenate([part.strengths for part in parts])
-    return FittedFold(decisions, strengths, parts[0].weights, parts[0].intercept, parts[0].spread)
+    total = np.concatenate([part.inner.total for part in parts])
+    first = parts[0]
+    inner = InnerLosses(total, first.inner.first)
+    return FittedFold(decisions, strengths, first.weights, first.intercept, first.spread, inner)

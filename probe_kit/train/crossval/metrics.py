@@ -16,8 +16,14 @@ def correctness(decisions: Matrix, labels: NDArray[np.bool_]) -> NDArray[np.bool
 
 def log_loss(decisions: Matrix, labels: NDArray[np.bool_]) -> Matrix:
     """Mean of −log P(label), in nats, over the first axis."""
-    loss: Matrix = np.logaddexp(0.0, np.where(labels, -decisions, decisions)).mean(axis=0)
+    loss: Matrix = log_losses(decisions, labels).mean(axis=0)
     return loss
+
+
+def log_losses(decisions: Matrix, labels: NDArray[np.bool_]) -> Matrix:
+    """Return −log P(label), in nats, of decisions and labels of one shape."""
+    losses: Matrix = np.logaddexp(0.0, np.where(labels, -decisions, decisions))
+    return losses
 
 
 def fold_auc(decisions: Matrix, labels: NDArray[np.bool_], folds: list[Fold]) -> float:

@@ -49,10 +49,28 @@ def nested_folds(
 
 
 @dataclass(frozen=True)
+class InnerLosses:
+    """Log-losses of an outer fold's inner folds, each label column at the C that was chosen by them.
+
+    total: (K,) summed over the training episodes. first: (E,) the first column's by episode, 0 for the episodes
+    that the outer fold tests.
+    """
+
+    total: Matrix
+    first: Matrix
+
+    @classmethod
+    def of(cls, loss: Matrix, by_episode: Matrix, chosen: NDArray[np.intp]) -> "InnerLosses":
+        """loss: (C, K) along the grid. by_episode: (C, E) of the first column. chosen: (K,) positions."""
+        return cls(np.take_along_axis(loss, chosen[None, :], 0)[0], by_episode[chosen[0]])
+
+
+@dataclass(frozen=True)
 class FittedFold:
     """The probes of one outer fold.
 
-    decisions: (n, K) of its test episodes. strengths: (K,) the C chosen for each label column.
+    decisions: (n, K) of its test episodes. strengths: (K,) the C chosen for each label column. inner: the inner
+    folds' losses at these C.
     weights (D,), intercept: the first column's probe on raw features, and the deviation (`spread`) of its
     training samples along them.
     """
@@ -62,14 +80,17 @@ class FittedFold:
     weights: Matrix
     intercept: float
     spread: float
+    inner: InnerLosses
 
     @classmethod
-    def of(cls, coordinates: Projection, weights: Array, decisions: Matrix, strengths: Matrix) -> "FittedFold":
+    def of(
+        cls, coordinates: Projection, weights: Array, decisions: Matrix, strengths: Matrix, inner: InnerLosses
+    ) -> "FittedFold":
         """With the first column of `weights` (R, K), found in `coordinates`."""
         raw, intercept = coordinates.raw_weights(weights[:, 0])
         along = float(np.std(to_numpy(coordinates.train @ weights[:, 0])))
         length = float(np.linalg.norm(raw))
-        return cls(decisions, strengths, raw, intercept, along / length if length else 0.0)
+        return cls(decisions, strengths, raw, intercept, along / length if length else 0.0, inner)
 
 
 def select_c(loss: Matrix) -> NDArray[np.intp]:

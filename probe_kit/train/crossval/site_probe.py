@@ -10,10 +10,11 @@ from probe_kit.statistics.folds import Fold
 from probe_kit.train.crossval.batched_folds import cross_validate_together, is_small
 from probe_kit.train.crossval.joint import can_be_joint, cross_validate_jointly
 from probe_kit.train.crossval.joint_design import JointSite
-from probe_kit.train.crossval.metrics import correctness, log_loss
+from probe_kit.train.crossval.metrics import correctness, log_loss, log_losses
 from probe_kit.train.crossval.nested_folds import (
     STRENGTHS,
     FittedFold,
+    InnerLosses,
     Matrix,
     NestedFold,
     nested_folds,
@@ -45,6 +46,8 @@ class SiteProbe:
     weights, intercepts: (F, D) float32 and (F,) of each outer fold's probe, on raw features.
     spreads: (F,) deviation of the fold's training samples along its weights, in units of the features.
     null: (P,) accuracies under the label permutations.
+    inner: (F, E) float32 log-likelihood of each episode's label in the inner folds of each outer fold, at its C; 0
+    for the episodes that the outer fold tests.
     """
 
     decisions: Matrix
@@ -53,6 +56,7 @@ class SiteProbe:
     intercepts: Matrix
     spreads: Matrix
     null: Matrix
+    inner: NDArray[np.float32]
 
 
 def probe_site(
@@ -76,6 +80,7 @@ def probe_site(
         intercepts=np.array([fold.intercept for fold in fitted]),
         spreads=np.array([fold.spread for fold in fitted]),
         null=correctness(decisions, columns)[:, 1:].mean(axis=0),
+        inner=-np.stack([fold.inner.first for fold in fitted]).astype(np.float32),
     )
 
 
@@ -100,24 +105,32 @@ def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[Nest
         return cross_validate_jointly(site, samples, labels, folds)
     if is_small(samples, labels):
         return cross_validate_together(samples, labels, folds)
-    return [_fit_fold(samples, labels, f.outer, choose_strengths(samples, labels, f.inner)) for f in folds]
+    return [_fit_fold(samples, labels, f.outer, *choose_strengths(samples, labels, f.inner)) for f in folds]
 
 
-def choose_strengths(samples: Samples, labels: NDArray[np.bool_], folds: list[Fold]) -> Matrix:
-    """For each label column the C of the grid with the lowest held-out log-loss; the smaller one on ties."""
+def choose_strengths(samples: Samples, labels: NDArray[np.bool_], folds: list[Fold]) -> tuple[Matrix, InnerLosses]:
+    """For each label column the C of the grid with the lowest held-out log-loss, and the losses there.
+
+    The smaller C on ties.
+    """
     loss = np.zeros((STRENGTHS.size, labels.shape[1]))
+    by_episode = np.zeros((STRENGTHS.size, len(labels)))
     for fold in folds:
         train = samples.of(fold.train)
         coordinates = Projection.fit(train.features)
         held_out, truth = coordinates(samples.of(fold.test).means), labels[fold.test]
         solver = LogisticSolver(coordinates.train)
         for step, weights in enumerate(solver.path(train.repeat(labels[fold.train]), STRENGTHS)):
-            loss[step] += log_loss(to_numpy(held_out @ weights), truth) * fold.test.size
-    chosen: Matrix = STRENGTHS[select_c(loss)]
-    return chosen
+            decisions = to_numpy(held_out @ weights)
+            loss[step] += log_loss(decisions, truth) * fold.test.size
+            by_episode[step, fold.test] = log_losses(decisions[:, 0], truth[:, 0])
+    chosen = select_c(loss)
+    return STRENGTHS[chosen], InnerLosses.of(loss, by_episode, chosen)
 
 
-def _fit_fold(samples: Samples, labels: NDArray[np.bool_], fold: Fold, strengths: Matrix) -> FittedFold:
+def _fit_fold(
+    samples: Samples, labels: NDArray[np.bool_], fold: Fold, strengths: Matrix, inner: InnerLosses
+) -> FittedFold:
     train = samples.of(fold.train)
     coordinates = Projection.fit(train.features)
     solver = LogisticSolver(coordinates.train)
@@ -129,7 +142,7 @@ def _fit_fold(samples: Samples, labels: NDArray[np.bool_], fold: Fold, strengths
         decisions[:, columns] = to_numpy(held_out @ weights)
         if columns[0] == 0:
             first = weights
-    return FittedFold.of(coordinates, first, decisions, strengths)
+    return FittedFold.of(coordinates, first, decisions, strengths, inner)
 
 
 def _out_of_fold(fitted: list[FittedFold], folds: list[NestedFold]) -> Matrix:

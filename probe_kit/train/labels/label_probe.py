@@ -22,13 +22,16 @@ class LabelProbe:
     """Held-out predictions for n samples, and what label permutations reach.
 
     predictions: (n,) class numbers or quantities. scores: (n,), their mean is the metric. null: (P,) metric of
-    every permutation. penalties: (F,) of each outer fold: λ of ridge, 1 / C of a binary label.
+    every permutation. penalties: (F,) of each outer fold: λ of ridge, 1 / C of a binary label. inner: (F, n)
+    quality of each sample's prediction in the inner folds of each outer fold, by which penalties are chosen, the
+    larger the better, minus the mean of the permutations'; 0 for the samples that the outer fold tests.
     """
 
     predictions: Matrix
     scores: Matrix
     null: Matrix
     penalties: Matrix
+    inner: Matrix
 
     @property
     def metric(self) -> float:
@@ -45,12 +48,15 @@ def fit_label_probe(
     """
     labels, place = _distinct(labels)
     outer = [fold.outer for fold in folds]
-    predictions, penalties = _fit_of(task)(features, labels, folds)
+    predictions, penalties, inner = _fit_of(task)(features, labels, folds)
     if task == "continuous":
         scores = explained_scores(predictions, labels, outer)
     else:
         scores = balanced_scores(predictions, labels)
-    return LabelProbe(predictions[:, 0], scores[:, 0], scores.mean(axis=0)[place[1:]], penalties)
+    above = np.stack([
+        one.above_permutations(place[1:], fold.outer.train) for one, fold in zip(inner, folds, strict=True)
+    ])  # fmt: skip
+    return LabelProbe(predictions[:, 0], scores[:, 0], scores.mean(axis=0)[place[1:]], penalties, above)
 
 
 def predict_once(
@@ -60,11 +66,37 @@ def predict_once(
 
     features: (n, D). labels: (n,); those of test samples have no effect. Raises ProbeNotConvergedError.
     """
-    predictions, penalties = _fit_of(task)(features, labels[:, None], [fold])
+    predictions, penalties, _ = _fit_of(task)(features, labels[:, None], [fold])
     return predictions[fold.outer.test, 0], float(penalties[0])
 
 
-def _fit_of(task: Task) -> "Callable[[NDArray[np.floating], Matrix, list[NestedFold]], tuple[Matrix, Matrix]]":
+@dataclass(frozen=True)
+class InnerQuality:
+    """Quality of an outer fold's inner predictions at the chosen penalties, the larger the better.
+
+    total: (K,) of every label column, summed over its training samples. first: (n,) the first column's by sample;
+    0 for the samples that the outer fold tests.
+    """
+
+    total: Matrix
+    first: Matrix
+
+    def above_permutations(self, columns: NDArray[np.intp], train: NDArray[np.intp]) -> Matrix:
+        """(n,) `first` minus the mean over `columns`, of which every one of the training samples bears a share.
+
+        Sites differ in what they reach with exchanged labels. Without permutations nothing is subtracted.
+        """
+        found = self.first.copy()
+        if columns.size:
+            found[train] -= self.total[columns].mean() / train.size
+        return found
+
+
+Fitted = tuple[Matrix, Matrix, list[InnerQuality]]
+"""(n, K) held-out predictions, (F,) penalties of the first column, and the inner quality of every outer fold."""
+
+
+def _fit_of(task: Task) -> Callable[[NDArray[np.floating], Matrix, list[NestedFold]], Fitted]:
     return {"binary": _logistic, "classes": _indicators, "continuous": _ridge}[task]
 
 
@@ -79,41 +111,42 @@ def _distinct(labels: Matrix) -> tuple[Matrix, NDArray[np.intp]]:
     return labels[:, kept], np.array(place, np.intp)
 
 
-def _logistic(features: NDArray[np.floating], labels: Matrix, folds: list[NestedFold]) -> tuple[Matrix, Matrix]:
+def _logistic(features: NDArray[np.floating], labels: Matrix, folds: list[NestedFold]) -> Fitted:
     """The side probes' logistic regression, without what its intercept learns from unequal classes."""
     truth = labels == 1
-    predictions, penalties = np.empty_like(labels), []
+    predictions, penalties, inner = np.empty_like(labels), [], []
     samples = Samples.pooled(features)
     for fold, fitted in zip(folds, cross_validate(samples, truth, folds), strict=True):
         share = truth[fold.outer.train].mean(axis=0)
         predictions[fold.outer.test] = fitted.decisions > np.log(share / (1 - share))
         penalties.append(1 / fitted.strengths[0])
-    return predictions, np.array(penalties)
+        inner.append(InnerQuality(-fitted.inner.total, -fitted.inner.first))
+    return predictions, np.array(penalties), inner
 
 
-def _ridge(features: NDArray[np.floating], labels: Matrix, folds: list[NestedFold]) -> tuple[Matrix, Matrix]:
+def _ridge(features: NDArray[np.floating], labels: Matrix, folds: list[NestedFold]) -> Fitted:
     """Ridge within the range of the training labels; λ by squared error."""
     return _nested(
         labels,
         folds,
         lambda fold: _quantities(features, labels, fold),
-        lambda truth: lambda predicted: -((truth - predicted) ** 2).sum(axis=0),
+        lambda truth: lambda predicted: -((truth - predicted) ** 2),
     )
 
 
-def _indicators(features: NDArray[np.floating], labels: Matrix, folds: list[NestedFold]) -> tuple[Matrix, Matrix]:
+def _indicators(features: NDArray[np.floating], labels: Matrix, folds: list[NestedFold]) -> Fitted:
     """Ridge on class indicators, the best class; λ by balanced accuracy."""
     classes = int(labels.max()) + 1
 
     def gain(truth: Matrix) -> Gain:
         worth = _worth(truth, classes)
-        return lambda predicted: ((predicted == truth) * worth).sum(axis=0)
+        return lambda predicted: (predicted == truth) * worth
 
     return _nested(labels, folds, lambda fold: _best_classes(features, labels, classes, fold), gain)
 
 
 Gain = Callable[[Matrix], Matrix]
-"""How good (m, K) predictions of a test fold are, (K,)."""
+"""How good every one of (m, K) predictions of a test fold is."""
 
 
 def _nested(
@@ -121,24 +154,29 @@ def _nested(
     folds: list[NestedFold],
     predict: Callable[[Fold], Iterator[Matrix]],
     gain_of: Callable[[Matrix], Gain],
-) -> tuple[Matrix, Matrix]:
-    """(n, K) held-out predictions, each column of an outer fold at the λ that is best in its inner folds.
+) -> Fitted:
+    """Return held-out predictions, each column of an outer fold at the λ that is best in its inner folds.
 
-    predict: predictions (m, K) of a fold at each penalty. Returns also the first column's λ by outer fold.
+    predict: predictions (m, K) of a fold at each penalty.
     """
-    predictions, penalties = np.empty_like(labels), []
+    predictions, penalties, qualities = np.empty_like(labels), [], []
     for fold in folds:
         quality = np.zeros((PENALTIES.size, labels.shape[1]))
+        by_sample = np.zeros((PENALTIES.size, len(labels)))
         for inner in fold.inner:
             gain = gain_of(labels[inner.test])
             for step, predicted in enumerate(predict(inner)):
-                quality[step] += gain(predicted)
+                gains = gain(predicted)
+                quality[step] += gains.sum(axis=0)
+                by_sample[step, inner.test] = gains[:, 0]
         chosen = _largest_of_best(quality)
         for step, predicted in enumerate(predict(fold.outer)):
             columns = np.flatnonzero(chosen == step)
             predictions[np.ix_(fold.outer.test, columns)] = predicted[:, columns]
         penalties.append(PENALTIES[chosen[0]])
-    return predictions, np.array(penalties)
+        total = np.take_along_axis(quality, chosen[None, :], 0)[0]
+        qualities.append(InnerQuality(total, by_sample[chosen[0]]))
+    return predictions, np.array(penalties), qualities
 
 
 def _quantities(features: NDArray[np.floating], labels: Matrix, fold: Fold) -> Iterator[Matrix]:

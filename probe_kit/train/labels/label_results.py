@@ -33,7 +33,9 @@ class LabelCurve:
     """All S sites of one view on the same n samples, with F outer folds and P label permutations.
 
     parts: what the stream of every site is part of. predictions, scores: (S, n), held out; the mean of the scores
-    is the metric. null: (S, P) metric of every permutation. penalties: (S, F) of each outer fold.
+    is the metric. null: (S, P) metric of every permutation. penalties: (S, F) of each outer fold. inner: (S, F, G)
+    quality of every group in the inner folds of each outer fold above that of the permutations, see `LabelProbe`;
+    without folds (S, 0, 0).
     """
 
     sites: tuple[Site, ...]
@@ -42,6 +44,7 @@ class LabelCurve:
     scores: Matrix
     null: Matrix
     penalties: Matrix
+    inner: NDArray[np.float32]
 
     @property
     def metric(self) -> Matrix:

@@ -27,7 +27,7 @@ from probe_kit.train.settings import LABEL_FORMAT
 SCORES, PREDICTIONS, CONTROLS = "scores.csv", "predictions.npz", "controls.json"
 _SAMPLES = ("labels", "episodes", "inferences", "groups", "fold_of")
 _ALIGNED = "aligned"
-_CURVE = ("predictions", "scores", "null", "penalties")
+_CURVE = ("predictions", "scores", "null", "penalties", "inner")
 
 
 def save_label_results(results: LabelResults, run: RunReader) -> None:

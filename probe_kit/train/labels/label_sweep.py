@@ -5,11 +5,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.statistics.folds import sums_by_group
 from probe_kit.train.data.run_reader import RunReader, check_several_wordings, seed_text_of
 from probe_kit.train.data.samples import Samples, is_token_view, sites_of
 from probe_kit.train.execution.dispatch import probe_columns
@@ -154,7 +156,10 @@ def _fit(
         inferences=samples.inferences.astype(np.int64),
         groups=samples.groups,
         fold_of=problem.fold_of,
-        curves={view: _curve(run, [key for key in keys if key[0] == view], probes) for view in settings.views},
+        curves={
+            view: _curve(run, [key for key in keys if key[0] == view], probes, samples.groups)
+            for view in settings.views
+        },
         smallest_p=problem.smallest_p,
         left_out=samples.left_out,
         stamp=stamp_of_run(run),
@@ -163,7 +168,10 @@ def _fit(
 
 
 def _curve(
-    run: RunReader, keys: Sequence[tuple[str, Site]], probes: dict[tuple[str, Site], LabelProbe]
+    run: RunReader,
+    keys: Sequence[tuple[str, Site]],
+    probes: dict[tuple[str, Site], LabelProbe],
+    groups: NDArray[np.str_],
 ) -> LabelCurve:
     own = [probes[key] for key in keys]
     return LabelCurve(
@@ -173,4 +181,5 @@ def _curve(
         scores=np.stack([probe.scores for probe in own]),
         null=np.stack([probe.null for probe in own]),
         penalties=np.stack([probe.penalties for probe in own]),
+        inner=np.stack([sums_by_group(probe.inner, groups) for probe in own]).astype(np.float32),
     )

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.sites import Site, part_of
 from probe_kit.statistics.estimates.balanced import GroupSums, balanced_sums
-from probe_kit.statistics.folds import Fold, split_by_fold
+from probe_kit.statistics.estimates.crossfit import Stream
+from probe_kit.statistics.folds import Fold, fold_of_groups, split_by_fold
 from probe_kit.statistics.label_permutations import max_statistic_p
 from probe_kit.train.crossval.metrics import correctness
 
@@ -20,6 +21,8 @@ class ProbeCurve:
     sites: S of them. labels: (E,) bool. episodes, items, groups: (E,) identities. fold_of: (E,) outer fold.
     parts: S times what the site's stream is part of, see `Stream.part`; default by the stream's name.
     decisions: (S, E) out-of-fold. strengths: (S, F) chosen C. null: (S, P) accuracies under label permutation.
+    inner: (S, F, G) log-likelihood of every group in the inner folds of each outer fold, the groups in the order
+    of their names; 0 for the groups that the outer fold tests.
     """
 
     sites: tuple[Site, ...]
@@ -31,6 +34,7 @@ class ProbeCurve:
     decisions: NDArray[np.float64]
     strengths: NDArray[np.float64]
     null: NDArray[np.float64]
+    inner: NDArray[np.float32]
     parts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -53,7 +57,32 @@ class ProbeCurve:
     @property
     def n_groups(self) -> int:
         """Number of independent groups of items."""
-        return int(np.unique(self.groups).size)
+        return len(self.group_names)
+
+    @property
+    def group_names(self) -> tuple[str, ...]:
+        """The G names of the groups, in order."""
+        return tuple(np.unique(self.groups).tolist())
+
+    def fit_stream(self, rows: NDArray[np.intp]) -> Stream:
+        """The sites at `rows`, which are one stream or a part of it, for cross-fitted scores.
+
+        Raises as `sums`, and as `Stream.of`.
+        """
+        sites = [self.sites[row] for row in rows]
+        return Stream.of(
+            self.sums.only(rows),
+            self.inner[rows],
+            fold_of_groups(self.fold_of, self.groups),
+            [site.layer for site in sites],
+            [site.iteration or 0 for site in sites],
+        )
+
+    def nested_correct(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """(E,) whether decisions are right at the site of `rows` that is best in each outer fold's inner folds."""
+        best: NDArray[np.intp] = rows[self.fit_stream(rows).best]
+        right: NDArray[np.bool_] = self.correct[best[self.fold_of], np.arange(self.labels.size)]
+        return right
 
     def stream(self, name: str) -> NDArray[np.intp]:
         """Positions of the sites of one stream."""

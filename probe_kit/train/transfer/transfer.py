@@ -256,6 +256,7 @@ def _curve(
             np.stack([one.scores[at] for one in own]),
             np.stack([one.null[at] for one in own]),
             penalties,
+            np.zeros((len(own), 0, 0), np.float32),
         )
         for at in (0, 1)
     )

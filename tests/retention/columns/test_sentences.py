@@ -204,8 +204,9 @@ def test_absence_is_said_of_a_bounded_backbone_only_and_more_items_are_asked_for
         ),
         (
             ("guessing", "shown", "absent", "does not follow"),
-            "(24 items): the backbone holds the answer (98 %, 88 to 100); the action expert does not hold it (50 "
-            "%; its best site has at most 62 %); the action does not follow a swap of the pictures (in 4 % of "
+            "(24 items): the backbone holds the answer (98 %, 88 to 100); a linear probe of so many items "
+            "does not find it in the action expert (50 %; at most 62 %); the action does not follow a swap of the "
+            "pictures (in 4 % of "
             "episodes), and the cube ends on the correct picture in 54 %, 34 to 74. The answer is not used in "
             "the first chunk: within 0.1 of its reach and 0.25 of the episodes (moved by 0.02 [-0.01, 0.05] of "
             "its reach, net follow rate 0.02 [-0.10, 0.12]); positive control: shape.",
@@ -213,7 +214,8 @@ def test_absence_is_said_of_a_bounded_backbone_only_and_more_items_are_asked_for
         (
             ("guessing", "at chance", "absent", "no swap"),
             "(24 items): the backbone is not shown to hold the answer (52 %; its best site could have up to 78 "
-            "%); the action expert does not hold it (50 %; its best site has at most 62 %); the cube ends on the "
+            "%); a linear probe of so many items does not find it in the action expert (50 %; at most 62 %); the "
+            "cube ends on the "
             "correct picture in 54 %, 34 to 74. Not shown in the backbone; success is not "
             "shown: more items would tell.",
         ),
@@ -241,16 +243,16 @@ The policy succeeds; the answer is not shown in the backbone; whether the answer
 `probe-kit intervene`.
 
 guessing | absent | no swap | absent
-Absent from the backbone; success is not shown: more items would tell.
+Absent from the backbone for a linear probe of so many items; success is not shown: more items would tell.
 
 misses | absent | no swap | absent, failure
-Absent from the backbone; the policy is right less often than guessing.
+Absent from the backbone for a linear probe of so many items; the policy is right less often than guessing.
 
 misses | at chance | no swap | not shown, failure
 The policy is right less often than guessing; not shown in the backbone: more items would tell.
 
 none | absent | no swap | absent
-Absent from the backbone.
+Absent from the backbone for a linear probe of so many items.
 
 none | at chance | no swap | not shown
 Not shown in the backbone: more items would tell.
@@ -306,9 +308,9 @@ The answer is not used in the first chunk: within 0.1 of its reach and 0.25 of t
 succeeds: actions after the first inference may follow.
 
 guessing | absent | does not follow | absent
-Absent from the backbone. The answer is not used in the first chunk: within 0.1 of its reach and 0.25 of the
-episodes (moved by 0.02 [-0.01, 0.05] of its reach, net follow rate 0.02 [-0.10, 0.12]); positive control:
-shape.
+Absent from the backbone for a linear probe of so many items. The answer is not used in the first chunk: within
+0.1 of its reach and 0.25 of the episodes (moved by 0.02 [-0.01, 0.05] of its reach, net follow rate 0.02
+[-0.10, 0.12]); positive control: shape.
 
 guessing | at chance | does not follow | not shown
 Not shown in the backbone: more items would tell. The answer is not used in the first chunk: within 0.1 of its

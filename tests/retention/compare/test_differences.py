@@ -29,11 +29,11 @@ def test_a_difference_is_the_later_group_minus_the_earlier(table: RetentionTable
     assert [row.category for row in table.differences] == ["color", "shape", "mean"]
     assert (color.group, color.minus, color.view) == ("with VQA", "without", "mean")
     other, weaker, one, _ = table.rows
-    assert color.backbone == pytest.approx(0.9 - 0.8)
+    assert color.backbone == pytest.approx(0.9 - 0.8, abs=1e-3)
     assert color.action == pytest.approx(one.action.score - other.action.score)  # type: ignore[operator]
     assert color.retention == pytest.approx(one.retention.value - other.retention.value)  # type: ignore[operator]
     assert weaker.backbone.score is not None
-    assert mean.backbone == pytest.approx((0.1 + 0.9 - weaker.backbone.score) / 2)
+    assert mean.backbone == pytest.approx((0.1 + 0.9 - weaker.backbone.score) / 2, abs=1e-3)
     assert shape.backbone_ci is not None
     assert shape.backbone_ci[0] is not None
     assert shape.backbone_ci[0] > 0
@@ -74,7 +74,7 @@ def test_a_group_is_the_mean_of_its_runs(probed_run: ProbedRun) -> None:
     strong, weak = probed_run({"color": SIGNAL}, "strong"), probed_run({"color": WEAK}, "weak")
     alone = probed_run({"color": SIGNAL}, "alone")
     table = retention_table({"both": [strong, weak], "strong": [alone]})
-    assert table.differences[0].backbone == pytest.approx(0.9 - (0.9 + 0.8) / 2)
+    assert table.differences[0].backbone == pytest.approx(0.9 - (0.9 + 0.8) / 2, abs=1e-3)
     assert table.differences[0].paired
     assert [(mean.group, mean.run.model) for mean in table.means] == [
         ("both", "strong"), ("both", "weak"), ("strong", "alone"),
@@ -91,7 +91,7 @@ def test_every_format_shows_groups_and_differences(table: RetentionTable) -> Non
     assert "with VQA $-$ without & mean & 0 & color" in table.to_latex("all")
     frame = table.differences_frame()
     assert frame["backbone"].tolist() == [row.backbone for row in table.differences]
-    assert frame["backbone"][0] == pytest.approx(0.1)
+    assert frame["backbone"][0] == pytest.approx(0.1, abs=1e-3)
     assert (frame["backbone_ci_low"] < frame["backbone"]).all()
 
 

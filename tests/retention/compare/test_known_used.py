@@ -137,11 +137,11 @@ def test_the_join_is_what_an_independent_count_gives(runs: tuple[SaidRun, SaidRu
 def test_encoded_decisions_are_chosen_on_other_groups(tmp_path: Path) -> None:
     """Among a hundred sites that guess the best one looks good, and its held-out decisions still guess."""
     policy = acted(tmp_path, {"color": np.ones((60, 2), bool)})
-    curve = probes(policy, {"color": [0.5] * 100}).curves["color", "mean"]
-    luck = curve.correct.mean(axis=1).max()
-    held_out = np.mean([encoded_decisions(curve, seed).mean() for seed in range(20)])
+    curves = [probes(policy, {"color": [0.5] * 100}, seed=seed).curves["color", "mean"] for seed in range(10)]
+    luck = np.mean([curve.correct.mean(axis=1).max() for curve in curves])
+    held_out = np.mean([encoded_decisions(curve).mean() for curve in curves])
     assert luck > 0.58
-    assert abs(held_out - 0.5) < 0.06
+    assert abs(held_out - 0.5) < 0.04
 
 
 def test_a_habit_is_neither_known_nor_used_and_a_coin_is_expected_in_a_quarter(tmp_path: Path) -> None:

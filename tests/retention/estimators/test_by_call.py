@@ -101,7 +101,7 @@ def test_aligned_accuracies_pool_the_calls_at_one_distance_from_the_event(
     assert line.offsets.tolist() == [-2, -1, 0, 1, 2, 3]
     assert line.episodes.tolist() == [100, 100, 200, 200, 100, 100]
     probed = {call: one.curves["color", "mean"] for call, one in by_call.items()}
-    right = {call: curve.correct[curve.best("backbone")] for call, curve in probed.items()}
+    right = {call: curve.nested_correct(curve.stream("backbone")) for call, curve in probed.items()}
     early, late = slice(None, 100), slice(100, None)
     wanted = [
         right[0][late].mean(), right[1][late].mean(), (right[0][early].sum() + right[2][late].sum()) / 200,

@@ -41,7 +41,7 @@ def some_episodes(curve: ProbeCurve, kept: np.ndarray) -> ProbeCurve:
 
 def some_sites(curve: ProbeCurve, rows: np.ndarray) -> ProbeCurve:
     """The curve with its sites in another order."""
-    own = {name: getattr(curve, name)[rows] for name in ("decisions", "strengths", "null")}
+    own = {name: getattr(curve, name)[rows] for name in ("decisions", "strengths", "null", "inner")}
     sites, parts = (tuple(held[row] for row in rows) for held in (curve.sites, curve.parts))
     return replace(curve, sites=sites, parts=parts, **own)
 
@@ -52,7 +52,7 @@ def test_retention_is_the_ratio_of_two_scores_above_one_half(curve_of: CurveOf, 
     assert found.note == ""
     above = {name: streams.accuracy(name) - 0.5 for name in ("action", "backbone")}
     assert found.value == pytest.approx(above["action"] / above["backbone"])
-    assert above["backbone"] == pytest.approx(0.4), "the best layer is the same on every half"
+    assert above["backbone"] == pytest.approx(0.4), "the best layer is the same in every fold"
     assert found.interval.low < found.value < found.interval.high
 
 
@@ -68,23 +68,23 @@ def test_its_limits_are_fiellers(curve_of: CurveOf, episodes: pd.DataFrame) -> N
     """All ratios whose numerator minus ratio times denominator lies within t standard errors of 0."""
     found, streams = measured(curve_of(episodes, *PLAIN))
     (top, bottom), V = streams.scores.above, streams.scores.covariance
-    square = stats.t.ppf(0.975, min(100 - 1, 50)) ** 2
+    square = stats.t.ppf(0.975, 99) ** 2
     limits = np.sort(
         np.roots([bottom**2 - square * V[1, 1], -2 * (top * bottom - square * V[0, 1]), top**2 - square * V[0, 0]])
     )
     assert (found.interval.low, found.interval.high) == pytest.approx(tuple(limits))
 
 
-def test_its_covariance_is_that_of_halves_and_leaves_room_for_unseen_groups(
+def test_its_covariance_is_that_of_groups_and_leaves_room_for_unseen_ones(
     curve_of: CurveOf, episodes: pd.DataFrame
 ) -> None:
     for accuracies in (PLAIN, ([0.5, 1.0], [[1.0, 0.9]])):
         _, streams = measured(curve_of(episodes, *accuracies))
-        V, gaps = streams.scores.covariance, streams.fit.differences
-        of_halves = gaps @ gaps.T / 100 / 4
+        V, influence = streams.scores.covariance, streams.fit.influence
+        of_groups = influence @ influence.T * 100 / 99
         unseen = 2 * streams.scores.above**2 / (101 * 102)
-        np.testing.assert_allclose(V.diagonal(), np.maximum(of_halves.diagonal(), unseen))
-        assert V[0, 1] == V[1, 0] == pytest.approx(of_halves[0, 1])
+        np.testing.assert_allclose(V.diagonal(), np.maximum(of_groups.diagonal(), unseen))
+        assert V[0, 1] == V[1, 0] == pytest.approx(of_groups[0, 1])
         assert np.linalg.eigvalsh(V).min() > 0
 
 
@@ -93,7 +93,7 @@ def test_identical_streams_retain_everything_with_narrow_limits(
     curve_of: CurveOf, episodes: pd.DataFrame, accuracy: float
 ) -> None:
     curve = curve_of(episodes, [0.5, accuracy], [[0.5, accuracy]])
-    found, _ = measured(replace(curve, decisions=curve.decisions[[0, 1, 0, 1]]))
+    found, _ = measured(replace(curve, decisions=curve.decisions[[0, 1, 0, 1]], inner=curve.inner[[0, 1, 0, 1]]))
     assert found.value == pytest.approx(1)
     assert found.published == pytest.approx(1)
     assert 0.85 < found.interval.low <= 1 <= found.interval.high < 1.15
@@ -214,8 +214,8 @@ def test_a_backbone_exactly_at_chance_has_no_ratio(curve_of: CurveOf, episodes: 
     assert str(found.interval) == "[no limits]"
 
 
-def test_three_groups_have_a_published_ratio_and_no_score(curve_of: CurveOf, outcome_table: Outcomes) -> None:
-    found = measure_retention(curve_of(outcome_table(6, 0, 0), [1.0], [[1.0]]))
+def test_four_groups_have_a_published_ratio_and_no_score(curve_of: CurveOf, outcome_table: Outcomes) -> None:
+    found = measure_retention(curve_of(outcome_table(8, 0, 0), [1.0], [[1.0]]))
     assert found is not None
     assert (found.streams, found.defined, found.note) == (None, False, NO_SCORES)
     assert isnan(found.value)

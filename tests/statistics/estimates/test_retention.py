@@ -5,15 +5,20 @@ from hypothesis import strategies as st
 from scipy.stats import t
 
 from probe_kit.statistics.estimates.balanced import GroupSums
-from probe_kit.statistics.estimates.crossfit import Stream, crossfit
+from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
 from probe_kit.statistics.estimates.mover import NO_LIMITS, difference_interval
 from probe_kit.statistics.estimates.retention import Ratio, retention, retention_difference
 from probe_kit.statistics.estimates.scores import Scores
+from tests.support.inner_qualities import stream_of
+
+
+def fitted(*streams: Stream) -> CrossFit:
+    return crossfit(streams, [f"g{number:03d}" for number in range(streams[0].fold_of.size)])
 
 
 def stream(seed: int, share: float, groups: int = 40, sites: int = 8) -> Stream:
     sums = np.random.default_rng(seed).binomial(4, share, (sites, groups)).astype(float)
-    return Stream.of(GroupSums(sums, np.full(groups, 4.0)), np.arange(sites))
+    return stream_of(GroupSums(sums, np.full(groups, 4.0)), np.arange(sites))
 
 
 def scores(expert: float, backbone: float, error: float = 0.03, df: float = 30) -> Scores:
@@ -31,13 +36,13 @@ def test_the_limits_solve_fiellers_equation() -> None:
 
 def test_identical_streams_retain_exactly_all() -> None:
     one = stream(0, 0.75)
-    found = retention(Scores.of(crossfit([one, one], 0)))
+    found = retention(Scores.of(fitted(one, one)))
     assert (found.value, found.interval.low, found.interval.high) == pytest.approx((1, 1, 1))
 
 
 def test_twelve_perfect_groups_leave_as_much_open_as_unseen_groups_may_hold() -> None:
-    perfect = Stream.of(GroupSums(np.full((5, 12), 4.0), np.full(12, 4.0)), np.arange(5))
-    found = retention(Scores.of(crossfit([perfect, perfect], 0)))
+    perfect = stream_of(GroupSums(np.full((5, 12), 4.0), np.full(12, 4.0)), np.arange(5))
+    found = retention(Scores.of(fitted(perfect, perfect)))
     assert found.value == 1
     assert 0.6 < found.interval.high - found.interval.low < 0.75
 
@@ -61,14 +66,14 @@ def test_a_mean_is_the_ratio_of_the_means() -> None:
 def test_a_dead_expert_keeps_its_zero() -> None:
     covered = []
     for seed in range(120):
-        fit = crossfit([stream(seed, 0.5, 24), stream(seed + 1000, 0.8, 24)], seed + 2000)
+        fit = fitted(stream(seed, 0.5, 24), stream(seed + 1000, 0.8, 24))
         found = retention(Scores.of(fit))
         covered.append(found.interval.low <= 0 <= found.interval.high)
     assert np.mean(covered) > 0.9
 
 
 def test_a_run_differs_from_itself_by_nothing() -> None:
-    fit = crossfit([stream(0, 0.6), stream(1, 0.75)], 0)
+    fit = fitted(stream(0, 0.6), stream(1, 0.75))
     found = retention_difference(Scores.of(fit), Scores.of(fit), fit.covariance_with(fit))
     assert found.value == 0
     alone = retention(Scores.of(fit)).interval
@@ -103,11 +108,9 @@ def test_a_difference_with_an_unknown_backbone_has_no_limits() -> None:
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 10_000), st.floats(0.5, 0.9), st.floats(0.5, 0.9), st.integers(4, 40))
+@given(st.integers(0, 10_000), st.floats(0.5, 0.9), st.floats(0.5, 0.9), st.integers(5, 40))
 def test_limits_hold_the_value_or_there_are_none(seed: int, expert: float, backbone: float, groups: int) -> None:
-    found = retention(
-        Scores.of(crossfit([stream(seed, expert, groups), stream(seed + 1, backbone, groups)], seed))
-    )
+    found = retention(Scores.of(fitted(stream(seed, expert, groups), stream(seed + 1, backbone, groups))))
     if found.interval.bounded:
         assert found.interval.low - 1e-9 <= found.value <= found.interval.high + 1e-9
     else:

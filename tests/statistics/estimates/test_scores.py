@@ -4,13 +4,18 @@ from scipy.stats import t
 
 from probe_kit.errors import UsageError
 from probe_kit.statistics.estimates.balanced import GroupSums
-from probe_kit.statistics.estimates.crossfit import Stream, crossfit
+from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
 from probe_kit.statistics.estimates.scores import Scores, accuracy_interval, t_quantile
+from tests.support.inner_qualities import stream_of
+
+
+def fitted(*streams: Stream) -> CrossFit:
+    return crossfit(streams, [f"g{number:03d}" for number in range(streams[0].fold_of.size)])
 
 
 def stream(share: float, groups: int, seed: int = 0) -> Stream:
     sums = np.random.default_rng(seed).binomial(4, share, (6, groups)).astype(float)
-    return Stream.of(GroupSums(sums, np.full(groups, 4.0)), np.arange(6))
+    return stream_of(GroupSums(sums, np.full(groups, 4.0)), np.arange(6))
 
 
 def test_a_mean_over_categories_adds_variances_and_degrees_of_freedom() -> None:
@@ -25,7 +30,7 @@ def test_a_mean_over_categories_adds_variances_and_degrees_of_freedom() -> None:
 
 
 def test_the_mean_of_one_category_is_that_category() -> None:
-    one = Scores.of(crossfit([stream(0.6, 20), stream(0.7, 20)], 0))
+    one = Scores.of(fitted(stream(0.6, 20), stream(0.7, 20)))
     mean = Scores.mean([one])
     np.testing.assert_array_equal(mean.above, one.above)
     np.testing.assert_array_equal(mean.covariance, one.covariance)
@@ -40,13 +45,13 @@ def test_a_mean_accuracy_has_students_interval_within_zero_and_one() -> None:
 
 
 def test_a_perfect_site_is_known_as_well_as_its_groups_allow() -> None:
-    perfect = Stream.of(GroupSums(np.full((2, 12), 4.0), np.full(12, 4.0)), np.arange(2))
-    interval = accuracy_interval(crossfit([perfect], 0), 0)
+    perfect = stream_of(GroupSums(np.full((2, 12), 4.0), np.full(12, 4.0)), np.arange(2))
+    interval = accuracy_interval(fitted(perfect), 0)
     assert (interval.low, interval.high) == pytest.approx((0.7575, 1.0), abs=5e-4)
 
 
 def test_the_interval_of_an_accuracy_holds_what_choosing_adds() -> None:
-    fit = crossfit([stream(0.7, 40)], 0)
+    fit = fitted(stream(0.7, 40))
     interval = accuracy_interval(fit, 0)
     assert interval.low < 0.5 + fit.above[0] < interval.high
     assert interval.high - interval.low > 3.9 * np.sqrt(0.7 * 0.3 / 160) * 0.8

@@ -19,7 +19,7 @@ ITEMS, WIDTH = 24, 8
 TRUTH = {
     "kept": "kept",
     "shifted": "kept",
-    "turned": "moved",
+    "turned": "transfer not shown",
     "forgotten": "forgotten",
     "learned": "learned",
     "never": "not shown in either",

@@ -5,11 +5,15 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from sklearn.metrics import accuracy_score
 
+from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Stream
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import ArrayRun, ProbeResults, train_probes
 from probe_kit.train.controls.random_features import RandomFeatureInputs, random_layer
+from probe_kit.train.crossval.category_problem import category_problem
+from probe_kit.train.data.samples import Samples
 
 ITEMS, WIDTH = 100, 24
 
@@ -74,3 +78,21 @@ def test_random_layers_repeat_and_differ_by_seed(suite: Suite, tmp_path: Path) -
     np.testing.assert_array_equal(inputs.layer(rows, 8, 0), inputs.layer(rows, 8, 0))
     assert (inputs.layer(rows, 8, 0) != inputs.layer(rows, 8, 1)).all()
     assert inputs.layer(rows, 8, 0).std() > 0.3  # neither dead nor saturated
+
+
+def test_the_reference_is_the_mean_of_five_layers_by_scikit_learns_accuracy(suite: Suite, tmp_path: Path) -> None:
+    """Every layer is probed by itself on the folds of the sites; none of them is chosen."""
+    run = run_of(suite, tmp_path / "random")
+    results = train_probes(run, permutations=0, controls=("random-features",), suite=suite.folder)
+    inputs = RandomFeatureInputs.of(run, suite)
+    problem = category_problem(run.episodes, "color", results.settings)
+    nothing = np.empty((problem.labels.size, 0), bool)
+    accuracies = []
+    for number in range(5):
+        layer = inputs.layer(problem.rows, WIDTH, derive_seed("binding", 0, number))
+        decisions = problem.fit(Samples.pooled(layer), nothing).decisions
+        accuracies.append(accuracy_score(problem.labels, decisions > 0))
+    assert len(set(accuracies)) > 1, "else the mean is the best"
+    control = results.controls.of_category("color")["random-features"]
+    assert control.accuracy == pytest.approx(np.mean(accuracies))
+    assert [one.reference for one in results.controls.excess] == pytest.approx([np.mean(accuracies)] * 3)

@@ -51,6 +51,8 @@ def test_decisions_strengths_and_weights_are_those_of_single_folds(
             for ours, theirs in ((found.decisions, single.decisions), (found.weights, single.weights)):
                 np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-6 * np.abs(theirs).max())
             assert found.spread == pytest.approx(single.spread, rel=1e-6)
+            np.testing.assert_allclose(found.inner.total, single.inner.total, rtol=0, atol=1e-5)
+            np.testing.assert_allclose(found.inner.first, single.inner.first, rtol=0, atol=1e-5)
 
 
 def test_torch_gives_the_decisions_of_numpy() -> None:

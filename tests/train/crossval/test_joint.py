@@ -80,7 +80,7 @@ WORLDS: dict[str, Callable[[], np.ndarray]] = {
 def alone(samples: Samples, labels: np.ndarray) -> list[FittedFold]:
     """Every training set on axes of its own, all in float64."""
     return [
-        probe._fit_fold(samples, labels, fold.outer, probe.choose_strengths(samples, labels, fold.inner))
+        probe._fit_fold(samples, labels, fold.outer, *probe.choose_strengths(samples, labels, fold.inner))
         for fold in FOLDS
     ]
 
@@ -93,6 +93,8 @@ def assert_same(found: list[FittedFold], expected: list[FittedFold]) -> None:
             np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-7 * np.abs(theirs).max())
         assert one.intercept == pytest.approx(other.intercept, rel=1e-6, abs=1e-8)
         assert one.spread == pytest.approx(other.spread, rel=1e-6)
+        for part in ("total", "first"):
+            np.testing.assert_allclose(getattr(one.inner, part), getattr(other.inner, part), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("world", WORLDS.values(), ids=WORLDS.keys())

@@ -47,6 +47,18 @@ def test_nested_cross_validation_equals_the_same_loops_over_scikit_learn() -> No
     assert probe.strengths.tolist() == chosen
 
 
+def test_inner_log_likelihoods_are_those_of_scikit_learn_at_the_chosen_strength() -> None:
+    folds = nested_folds(LABELS, ITEMS, seed=0)
+    probe = probe_site(Samples.pooled(FEATURES), LABELS, NONE, folds)
+    for fold, strength, inner in zip(folds, probe.strengths, probe.inner, strict=True):
+        expected = np.zeros(60)
+        for one in fold.inner:
+            log_p = scikit_learn_probe(strength, one.train).predict_log_proba(FEATURES[one.test])
+            expected[one.test] = np.where(LABELS[one.test], log_p[:, 1], log_p[:, 0])
+        np.testing.assert_allclose(inner, expected, atol=1e-5)
+        assert not inner[fold.outer.test].any(), "a fold has no part in the choice of its site"
+
+
 def test_permuted_columns_are_probed_like_real_labels() -> None:
     folds = nested_folds(LABELS, ITEMS, seed=0)
     permuted = flip_items(LABELS, ITEMS, 3, seed=0)

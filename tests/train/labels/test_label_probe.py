@@ -150,6 +150,36 @@ def test_a_binary_label_is_predicted_as_by_scikit_learn_without_the_prior_of_the
     assert probe.metric == pytest.approx(balanced_accuracy_score(y, decisions > prior), abs=1e-12)
 
 
+@pytest.mark.parametrize("task", ["binary", "classes", "continuous"])
+def test_inner_qualities_are_those_by_which_penalties_are_chosen_above_the_permutations(task: str) -> None:
+    """Of every outer fold, by the same loops over scikit-learn, at the penalty that was chosen."""
+    x, columns = problem(task)
+    grid = 1 / STRENGTHS if task == "binary" else PENALTIES
+
+    def qualities(fold: NestedFold, y: NDArray[np.float64], penalty: float) -> NDArray[np.float64]:
+        found = np.zeros(y.size)
+        for i in fold.inner:
+            train, test = scaled(x, i)
+            truth = y[i.test]
+            if task == "binary":
+                decisions = logistic(train, test, y[i.train], 1 / penalty)
+                found[i.test] = -np.logaddexp(0, np.where(truth == 1, -decisions, decisions))
+            elif task == "classes":
+                right = indicators(train, test, y[i.train], penalty) == truth
+                found[i.test] = right / np.array([(truth == one).sum() for one in truth])
+            else:
+                found[i.test] = -((truth - clipped_ridge(train, test, y[i.train], penalty)) ** 2)
+        return found
+
+    folds = nested(GROUPS)
+    probe = fit_label_probe(x, columns, task, folds)  # type: ignore[arg-type]
+    for fold, penalty, inner in zip(folds, probe.penalties, probe.inner, strict=True):
+        best = [max(qualities(fold, y, one).sum() for one in grid) for y in columns.T[1:]]
+        expected = qualities(fold, columns[:, 0], penalty)
+        expected[fold.outer.train] -= np.mean(best) / fold.outer.train.size
+        np.testing.assert_allclose(inner, expected, atol=1e-6)
+
+
 def test_the_mean_of_the_scores_is_the_metric_of_scikit_learn() -> None:
     x, columns = problem("continuous")
     one = [Fold(np.arange(40, 120), np.arange(40)), Fold(np.arange(40), np.arange(40, 120))]

@@ -233,12 +233,12 @@ def add_label_controls(
         if name in before.names:
             continue
         if name == RANDOM:
-            references = {stream: _best_layer(inputs, problem, width, results) for stream, width in widths.items()}
-            scores += [_scored(name, probe, results, stream) for stream, probe in references.items()]
+            references = {stream: _layers(inputs, problem, width, results) for stream, width in widths.items()}
+            scores += [_scored(name, probes, results, stream) for stream, probes in references.items()]
         else:
             probe = problem.probe(Samples.pooled(inputs.features(name)))
-            references = dict.fromkeys(widths, probe)
-            scores.append(_scored(name, probe, results))
+            references = {stream: [probe] for stream in widths}
+            scores.append(_scored(name, [probe], results))
         comparisons += list(_compared(name, references, results))
     run = {score.name for score in scores}
     missing = {name: why for name, why in {**before.left_out, **left_out}.items() if name not in run}
@@ -247,30 +247,41 @@ def add_label_controls(
     )
 
 
-def _best_layer(inputs: ControlInputs, problem: LabelProblem, width: int, results: LabelResults) -> LabelProbe:
+def _layers(inputs: ControlInputs, problem: LabelProblem, width: int, results: LabelResults) -> list[LabelProbe]:
+    """The probes of the random layers."""
     seeds = (derive_seed("label random features", results.settings.seed, number) for number in range(LAYERS))
-    return max((problem.score(inputs.layer(width, seed)) for seed in seeds), key=lambda probe: probe.metric)
+    return [problem.score(inputs.layer(width, seed)) for seed in seeds]
 
 
-def _scored(name: Name, probe: LabelProbe, results: LabelResults, stream: str = "") -> LabelControl:
-    own = results.settings
-    p = float(pointwise_p(np.array([probe.metric]), probe.null[None, :])[0])
+def _mean_scores(probes: Sequence[LabelProbe]) -> NDArray[np.float64]:
+    """(n,) mean over probes of the score of every sample."""
+    scores: NDArray[np.float64] = np.mean([probe.scores for probe in probes], axis=0)
+    return scores
+
+
+def _scored(name: Name, probes: Sequence[LabelProbe], results: LabelResults, stream: str = "") -> LabelControl:
+    """The mean of the probes: one, or the random layers, which have no label permutations."""
+    own, scores = results.settings, _mean_scores(probes)
+    null = np.mean([probe.null for probe in probes], axis=0)
+    p = float(pointwise_p(np.array([scores.mean()]), null[None, :])[0])
     return LabelControl(
         name,
-        probe.metric,
-        score_interval(probe.scores, results.labels, results.groups, own.task, results.deviations),
-        float(probe.null.mean()) if probe.null.size else None,
+        float(scores.mean()),
+        score_interval(scores, results.labels, results.groups, own.task, results.deviations),
+        float(null.mean()) if null.size else None,
         None if np.isnan(p) else p,
         stream,
-        by_step=tuple(results.by_step(probe.scores).tolist()),
+        by_step=tuple(np.mean([results.by_step(probe.scores) for probe in probes], axis=0).tolist()),
     )
 
 
-def _compared(name: Name, references: dict[str, LabelProbe], results: LabelResults) -> Iterator[LabelComparison]:
+def _compared(
+    name: Name, references: dict[str, list[LabelProbe]], results: LabelResults
+) -> Iterator[LabelComparison]:
     for view, curve in results.curves.items():
         for stream in dict.fromkeys(site.stream for site in curve.sites):
-            rows, reference = curve.stream(stream), references[stream]
+            rows, reference = curve.stream(stream), _mean_scores(references[stream])
             seed = derive_seed("label control", results.settings.seed, name, view, stream)
-            p = better_than_reference(curve.scores[rows], reference.scores, results.groups, seed, results.widening)
+            p = better_than_reference(curve.scores[rows], reference, results.groups, seed, results.widening)
             for row, of_site in zip(rows, p, strict=True):
-                yield LabelComparison(name, view, str(curve.sites[row]), reference.metric, float(of_site))
+                yield LabelComparison(name, view, str(curve.sites[row]), float(reference.mean()), float(of_site))

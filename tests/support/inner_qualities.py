@@ -1,0 +1,22 @@
+"""Inner qualities of made-up probes, whose decisions in the inner folds are those of the outer folds."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from probe_kit.statistics.estimates.balanced import GroupSums
+from probe_kit.statistics.estimates.crossfit import Stream
+from probe_kit.statistics.folds import sums_by_group
+
+
+def inner_of(scores: ArrayLike, fold_of: NDArray[np.integer], groups: NDArray[np.str_]) -> NDArray[np.float32]:
+    """(S, F, G) sums of (S, E) scores by group, 0 for the groups of the outer fold itself."""
+    values, folds = np.asarray(scores, np.float64), np.unique(fold_of)
+    parts = [sums_by_group(np.where(fold_of == fold, 0.0, values), groups) for fold in folds]
+    return np.stack(parts, axis=1).astype(np.float32)
+
+
+def stream_of(scores: GroupSums, layers: ArrayLike, iterations: ArrayLike | None = None) -> Stream:
+    """Sites in five folds, whose inner qualities are their sums outside of the fold."""
+    fold_of = np.arange(scores.n_groups) % 5
+    inner = np.where(fold_of == np.arange(5)[:, None], 0.0, scores.sums[:, None, :])
+    return Stream.of(scores, inner, fold_of, layers, iterations)
