@@ -58,11 +58,14 @@ def explained_interval(
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     if names.size == 1:
         return -inf, 1.0
-    missing, varying = 1 - float(scores.mean()), float(deviations.mean())
+    explained, varying = float(scores.mean()), float(deviations.mean())
+    missing = 1 - explained
     if missing <= 0:
         return 1.0, 1.0
     relative = deviations / varying if varying > 0 else np.ones(scores.size)
     rest = np.bincount(group_of, (1 - scores) - missing * relative)
     error = sqrt(float(rest @ rest) * names.size / (names.size - 1)) / scores.size
     reach = float(stdtrit(names.size - 1, 1 - SIGNIFICANCE / 2)) * error * widening / missing
-    return 1 - missing * exp(min(reach, 100.0)), 1 - missing * exp(-reach)
+    low, high = 1 - missing * exp(min(reach, 100.0)), 1 - missing * exp(-reach)
+    # The subtractions round: around a score of -5e-17, the limits of groups that all agree would both be 0.
+    return min(low, explained), max(high, explained)

@@ -47,7 +47,7 @@ def begin(settings: ExtractSettings, folder: Path) -> None:
 
 
 def test_a_scene_run_has_the_identity_and_the_plan_that_it_had(suite: Suite) -> None:
-    """A change that nobody meant would stop runs from being continued."""
+    """A hash that changes by accident would stop runs from being continued."""
     prepared = prepare(expert(suite))
     assert sha256_json(prepared.identity())[:16] == "3777166dc1fb5cab"
     assert sha256_json(prepared.plan.to_json())[:16] == "f31538462ceed37f"

@@ -66,3 +66,9 @@ def test_a_single_group_and_a_constant_label_are_no_error() -> None:
     assert explained_interval(scores, np.ones(60), np.zeros(60)) == (-inf, 1.0)
     low, high = explained_interval(np.zeros(60), np.zeros(60), GROUPS)
     assert (low, high) == (0.0, 0.0)
+
+
+def test_a_score_lies_within_its_interval_although_subtractions_round() -> None:
+    scores = np.full(len(GROUPS), -5e-17)
+    low, high = explained_interval(scores, np.ones(len(GROUPS)), GROUPS)
+    assert low <= scores.mean() <= high
