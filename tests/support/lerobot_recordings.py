@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from probe_kit._system.scheduling import same_scheduling
 from probe_kit.hooks.contract.observation import Observation
 
 CAMERA = "observation.images.top"
 FPS = 5
 
 
+@same_scheduling()
 def write_recording(
     folder: Path,
     episodes: Iterable[Sequence[Observation]],

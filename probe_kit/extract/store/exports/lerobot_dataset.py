@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from probe_kit._system.optional_dependencies import require
+from probe_kit._system.scheduling import same_scheduling
 from probe_kit.env.scoring.trajectory import MOTION, STATE
 from probe_kit.errors import UsageError
 from probe_kit.extract.store.format.commits import FRAME_COUNT
@@ -20,6 +21,7 @@ EPISODES = "probe_kit_episodes.csv"
 _STATE = [*STATE["tool"], "opening"]
 
 
+@same_scheduling()
 def write_lerobot(run: Run, folder: Path) -> None:
     """The data set in `folder`: an episode of T steps has T rows, each with what the policy did next.
 

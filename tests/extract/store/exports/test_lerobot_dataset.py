@@ -1,6 +1,7 @@
 """A LeRobotDataset of a run is one that lerobot itself loads, with the run's numbers."""
 
 import csv
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,6 +47,7 @@ def test_a_run_without_all_frames_has_no_data_set(small_suite: Suite, tmp_path: 
 def test_lerobot_loads_the_data_set_with_the_runs_numbers(filmed: Run, tmp_path: Path) -> None:
     datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot's data sets lack a library")
     root = export_run(filmed.path, "lerobot", tmp_path / "data")
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
     data = datasets.LeRobotDataset("probe_kit/run", root=root, video_backend="pyav")
     assert (data.num_episodes, data.num_frames, data.fps) == (EPISODES, EPISODES * STEPS, 5)
     for number in range(EPISODES):
