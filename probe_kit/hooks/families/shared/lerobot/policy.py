@@ -3,8 +3,6 @@
 Never lerobot's own `from_pretrained`: it returns partly or fully random models without an error.
 """
 
-import json
-import tempfile
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
@@ -13,6 +11,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+import draccus  # the decoder of lerobot, which installs it
 import numpy as np
 import torch
 from lerobot.configs.policies import PreTrainedConfig
@@ -257,15 +256,15 @@ class LerobotPolicy(Policy):
             raise CheckpointError(
                 f"{folder} holds a {kind!r} policy; expected {cls.config_type}. Pass the right --model"
             )
-        known = {field.name for field in fields(PreTrainedConfig.get_choice_class(cls.config_type))}
+        config_class = PreTrainedConfig.get_choice_class(cls.config_type)
+        known = {field.name for field in fields(config_class)}
         values = known_values(
             values, {*known, "type"}, cls.newer_fields, evaluation.unread, path, cls.takes_unread
         )
         if "rtc_config" in values:
             values["rtc_config"] = None  # real-time chunking mixes in actions of the chunk before
-        with tempfile.TemporaryDirectory() as place:
-            (Path(place) / CONFIG_FILE).write_text(json.dumps(values), encoding="utf-8")
-            return PreTrainedConfig.from_pretrained(place)
+        # `from_pretrained` decodes in the same way, behind a command line with a help text for every field: 80 ms.
+        return draccus.decode(config_class, {name: value for name, value in values.items() if name != "type"})
 
     @classmethod
     def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
