@@ -105,7 +105,7 @@ def _warn_of_one_pattern(labels: Labels, samples: LabelledSamples, blocks: dict[
     warnings.warn(
         f"label {labels.target!r} is the same in every group: each of the {len(blocks)} groups holds "
         f"{', '.join(shown)}{more} in this order. Exchanging labels between groups changes nothing, so every "
-        "p is 1. Give groups in which the label differs (--group-by), or a label that differs between the groups",
+        "p is 1. Give groups in which the label differs (--group-by; `groups` in Python), or a label that differs between the groups",
         stacklevel=4,
     )
 
@@ -116,7 +116,7 @@ def _check_groups(labels: Labels, samples: LabelledSamples) -> None:
     if groups.size < OUTER_FOLDS:
         raise TooFewGroupsError(
             f"label {labels.target!r}: {groups.size} groups ({by}) have labels; expected at least {OUTER_FOLDS}. "
-            "Label more episodes, or give smaller groups with --group-by"
+            "Label more episodes, or give smaller groups (--group-by; `groups` in Python)"
         )
     for number, name in enumerate(labels.coded.classes):
         having = np.unique(samples.groups[samples.values == number]).size
