@@ -302,6 +302,12 @@ def _describe(stored: Any) -> str:
     return f"{stored.name} {stored.layers} layers{steps} x {stored.tokens} tokens x {stored.width}"
 
 
+def _has_groups_for_probes(run: "Run") -> bool:
+    from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
+
+    return bool(run.episodes.groupby("category")["group_id"].nunique().min() >= GROUPS_FOR_PROBES)
+
+
 def _print_outcomes(run: "Run") -> None:
     from probe_kit.extract.run_layout import AT_END, ONCE
 
@@ -310,6 +316,7 @@ def _print_outcomes(run: "Run") -> None:
     say(f"{len(run.episodes)} episodes: {text}")
     if ONCE in run.episodes and (lost := int((run.episodes[ONCE] & ~run.episodes[AT_END]).sum())):
         say(f"{lost} of them had success before their end only; see the columns {ONCE} and {AT_END}")
-    step = "retention" if not run.streams else "labels" if run.inputs is not None else "train"
+    can_probe = bool(run.streams) and (run.inputs is not None or _has_groups_for_probes(run))
+    step = "retention" if not can_probe else "labels" if run.inputs is not None else "train"
     say(marked("next: [bold]probe-kit {} {}[/]", step, run.location))
     out.print(str(run.location), soft_wrap=True)

@@ -84,7 +84,10 @@ def from_csv(
     count, groups = len(suite.items), len({item.group_id for item in suite.items})
     out.print(f"{suite.identity}: {count} items in {groups} groups in {out_folder}", soft_wrap=True)
     err.print(f"next: probe-kit suite validate {out_folder} --baselines", soft_wrap=True)
-    err.print(f"then: probe-kit extract --model pi0-tiny --suite {out_folder} --out runs/{out_folder.name}", soft_wrap=True)
+    err.print(
+        f"then: probe-kit extract --model pi0-tiny --suite {out_folder} --out runs/{out_folder.name}",
+        soft_wrap=True,
+    )
 
 
 @app.command("show")
