@@ -1,4 +1,4 @@
-"""Execute the notebooks and keep their outputs: `uv run python notebooks/execute.py [NAME ...]`.
+"""Execute the notebooks and keep their outputs: `./with-uv python notebooks/execute.py [NAME ...]`.
 
 They run in one temporary folder, in order, so that they share what they make and know no path of this machine.
 """

@@ -85,7 +85,7 @@ def from_csv(
     out.print(f"{suite.identity}: {count} items in {groups} groups in {out_folder}", soft_wrap=True)
     err.print(f"next: probe-kit suite validate {out_folder} --baselines", soft_wrap=True)
     err.print(
-        f"then: probe-kit extract --model pi0-tiny --suite {out_folder} --out runs/{out_folder.name}",
+        f"then: probe-kit extract --model pi0-tiny --suite {out_folder} --out runs/{out_folder.name}-questions",
         soft_wrap=True,
     )
 

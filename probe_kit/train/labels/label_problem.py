@@ -105,7 +105,8 @@ def _warn_of_one_pattern(labels: Labels, samples: LabelledSamples, blocks: dict[
     warnings.warn(
         f"label {labels.target!r} is the same in every group: each of the {len(blocks)} groups holds "
         f"{', '.join(shown)}{more} in this order. Exchanging labels between groups changes nothing, so every "
-        "p is 1. Give groups in which the label differs (--group-by; `groups` in Python), or a label that differs between the groups",
+        "p is 1. Give groups in which the label differs (--group-by; `groups` in Python), or a label that differs "
+        "between the groups",
         stacklevel=4,
     )
 
