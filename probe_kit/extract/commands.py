@@ -303,9 +303,7 @@ def _describe(stored: Any) -> str:
 
 
 def _has_groups_for_probes(run: "Run") -> bool:
-    from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
-
-    return bool(run.episodes.groupby("category")["group_id"].nunique().min() >= GROUPS_FOR_PROBES)
+    return bool(run.episodes.groupby("category")["group_id"].nunique().min() >= OUTER_FOLDS)
 
 
 def _print_outcomes(run: "Run") -> None:

@@ -24,6 +24,8 @@ from tests.support.little_run import intervene_on_little_run
 from tests.support.reading import readings
 from tests.support.representations import WAYS, carrying, rewritten
 
+pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
+
 Edit = Callable[[dict[str, Any]], object]
 PLAN, COMMIT, TIMES = "plan/*.json", "commits/00000004.json", "times/00000004.json"
 CERTIFIED = "certificates/*.json"

@@ -31,6 +31,8 @@ from tests.support.little_run import episode, little_plan, little_writer, write_
 from tests.support.reading import readings
 from tests.support.rehashing import rehash, write_record
 
+pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
+
 Edit = Callable[[dict[str, Any]], object]
 
 

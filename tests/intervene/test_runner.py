@@ -41,6 +41,8 @@ from probe_kit.retention import retention_table
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
+pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
+
 FILES = ("episodes.npz", "effects.csv", "certificate.json")
 
 

@@ -30,6 +30,8 @@ from probe_kit.intervene.results.ties import describe_tie, tie_at_site
 from probe_kit.intervene.store.settings import PER_STEP
 from tests.intervene.wirings import WIRINGS, WORDS, WiredSession, outcomes_of, replay_inputs
 
+pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
+
 SUITE = "suite@1#0123456789ab"
 VERDICTS = {
     "copied": "used",

@@ -14,6 +14,8 @@ from probe_kit.retention.behaviour.vlm_answers import scored
 from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.suite import Suite
 
+pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
+
 
 @pytest.fixture(scope="module")
 def runs(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Run]:

@@ -31,6 +31,8 @@ from tests.support.changed_suites import without_twins
 from tests.support.little_run import STREAMS, certify, episode, little_settings, still
 from tests.support.rehashing import write_record
 
+pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
+
 Selection = tuple[Sequence[str], int, Sequence[Wording] | None]
 COLOR: list[Selection] = [(["color"], items, None) for items in (2, 4, 6)]
 CHAINS: dict[str, list[Selection]] = {

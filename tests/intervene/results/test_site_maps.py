@@ -29,6 +29,8 @@ from probe_kit.intervene.results.site_maps import keys_in_use
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
+pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
+
 LAST = 3
 
 

@@ -14,6 +14,8 @@ from probe_kit.train import LabelResults, Labels, load_label_results, train_prob
 from tests.support.labelled_run import write_labelled_run
 from tests.support.recorded_run import write_recorded_run
 
+pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
+
 TARGET = "dataset.state.x"
 
 

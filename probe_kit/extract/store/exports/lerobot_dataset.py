@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from probe_kit._execution.scheduling import same_scheduling
 from probe_kit._system.optional_dependencies import require
-from probe_kit._system.scheduling import same_scheduling
 from probe_kit.env.scoring.trajectory import MOTION, STATE
 from probe_kit.errors import UsageError
 from probe_kit.extract.store.format.commits import FRAME_COUNT

@@ -28,6 +28,8 @@ from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.results.results import verdicts_of
 from tests.intervene.wirings import WiredSession, outcomes_of, replay_inputs
 
+pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
+
 SUITE = "suite@1#0123456789ab"
 ROLES = ("image", "language", "state")
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from probe_kit._system.scheduling import same_scheduling
+from probe_kit._execution.scheduling import same_scheduling
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="no scheduling policies here")
 
