@@ -5,23 +5,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import ProbeKitError
 from probe_kit.hooks.checkpoints.adapter_files import ADAPTER_WEIGHTS
 from probe_kit.hooks.checkpoints.checkpoint import (
     ADAPTER_FILE,
-    CONFIG_FILE,
     NotCachedError,
     cached_folder,
     is_on_hub,
+    missing_bytes,
     missing_weights,
-    weights_sizes,
 )
+from probe_kit.hooks.checkpoints.folders import file_state, has_configuration
 from probe_kit.hooks.checkpoints.hub import without_network
 
 if TYPE_CHECKING:
     from probe_kit.hooks.contract.model import Model
 
-_CONFIGURATIONS = (CONFIG_FILE, ADAPTER_FILE, "config.yaml")
 _OUTLINES: dict[tuple[object, ...], "Outline"] = {}
 
 
@@ -63,7 +63,7 @@ def outline_of(
     if place is None or folder is None:
         return None
     complete = is_complete(place)
-    key = (name, place, dtype, repr(sorted(options.items())), complete, _state(folder))
+    key = (name, place, dtype, repr(sorted(options.items())), complete, file_state(folder))
     if key in _OUTLINES:
         return _OUTLINES[key]
     outline = _built(load, place, dtype, options, complete)
@@ -102,51 +102,53 @@ def is_configured(place: str | None) -> bool:
 
 def _folder(place: str | None) -> Path | None:
     """Where the configuration of a checkpoint is; None where it is not here."""
-    if place is None:
+    folder = None if place is None else _local(place)
+    if place is None or folder is None:
         return None
     if not is_on_hub(place):
-        local = Path(place).expanduser()
-        return local if local.exists() else None
-    folder = cached_folder(place)
-    configured = folder is not None and any((folder / name).is_file() for name in _CONFIGURATIONS)
-    return folder if configured else None
+        return folder if folder.exists() else None
+    return folder if has_configuration(folder) or (folder / ADAPTER_FILE).is_file() else None
 
 
-def _state(folder: Path) -> tuple[object, ...]:
-    """A value that changes with the small files of a folder."""
-    files = folder.glob("*.json") if folder.is_dir() else [folder]
-    return tuple(sorted((path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in files))
+def _local(place: str) -> Path | None:
+    """The folder that a path names, or that the hub's cache has of a hub id; None where it has nothing."""
+    return cached_folder(place) if is_on_hub(place) else Path(place).expanduser()
 
 
 def is_complete(place: str) -> bool:
     """Whether a checkpoint with its weights, and those of an adapter's base, is here. Asks no network."""
-    folder = cached_folder(place) if is_on_hub(place) else Path(place).expanduser()
+    folder = _local(place)
     if folder is None:
         return False
-    base = _base(folder)
-    if base is not None:
-        own = any((folder / name).is_file() for name in ADAPTER_WEIGHTS)
-        return own and (base == "." or is_complete(str(folder / base) if (folder / base).is_dir() else base))
-    return not is_on_hub(place) or not missing_weights(folder)
+    if (base := _base(folder)) is None:
+        return _has_weights(place)
+    return any((folder / name).is_file() for name in ADAPTER_WEIGHTS) and _has_weights(base)
+
+
+def _has_weights(place: str) -> bool:
+    """Whether the hub's cache has the weights of a hub id; those of a path are left to its loading."""
+    if not is_on_hub(place):
+        return True
+    folder = cached_folder(place)
+    return folder is not None and not missing_weights(folder)
 
 
 def bytes_to_fetch(place: str) -> int | None:
-    """Bytes of the weights that the cache lacks, from the index of their files; None where it is not here."""
-    folder = cached_folder(place) if is_on_hub(place) else Path(place).expanduser()
-    if folder is None:
-        return None
-    base = _base(folder)
-    if base is not None and base != ".":
-        beside = folder / base
-        return 0 if is_complete(place) else bytes_to_fetch(str(beside) if beside.is_dir() else base)
-    return weights_sizes(folder)
+    """Bytes of the weights that the cache lacks, of an adapter its base's; None where no index says it."""
+    folder = _local(place)
+    if folder is not None and (base := _base(folder)) is not None:
+        folder = _local(base)
+    return None if folder is None else missing_bytes(folder)
 
 
 def _base(folder: Path) -> str | None:
-    """The base that an adapter in `folder` names; None where there is no adapter."""
-    from probe_kit._system.bounded_json import load_json
+    """The base of the adapter in a folder, as path or hub id; None where there is no adapter.
 
+    It is never an adapter itself: loading refuses such a base.
+    """
     try:
-        return str(load_json(folder / ADAPTER_FILE)["base_model_name_or_path"])
+        named = str(load_json(folder / ADAPTER_FILE)["base_model_name_or_path"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
+    beside = folder / named
+    return str(beside) if beside.is_dir() else named

@@ -24,7 +24,7 @@ _CONFIGURATIONS = ("*config*.json", "dims.json", "*.yaml", "*.yml")
 PATTERNS = ("*.json", "*.safetensors", "*.model", "*.txt", "*.jinja")
 SMALL_FILES = ("*.json", "*.model", "*.txt", "*.jinja", "adapter_model.safetensors")
 """Those of them that hold no weights, but for an adapter's."""
-COMMIT_DIGITS = 40
+_COMMIT_DIGITS = 40
 """Of a commit's full name."""
 RUN_WEIGHTS = "checkpoints/latest-checkpoint.pt"
 """Where a folder of a training run of Prismatic keeps its weights."""
@@ -66,34 +66,28 @@ def without_revision(checkpoint: str | None) -> str | None:
 def pinned(checkpoint: str) -> str:
     """A hub id with the commit that the cache has of its revision; anything else as it is. Asks no network."""
     named = hub_name(checkpoint) if is_on_hub(checkpoint) else None
-    if named is None:
-        return checkpoint
-    commit = _cached_commit(named)
-    return checkpoint if commit is None else f"{checkpoint.partition('@')[0]}@{commit}"
+    snapshot = None if named is None else _snapshot(named)
+    return checkpoint if snapshot is None else f"{without_revision(checkpoint)}@{snapshot.name}"
 
 
 def cached_folder(checkpoint: str) -> Path | None:
     """Where the cache of the hub has a hub id; None where it has nothing of it. Asks no network."""
     named = hub_name(checkpoint) if is_on_hub(checkpoint) else None
-    return None if named is None else _cached(named)
-
-
-def _cached(named: HubName) -> Path | None:
-    """The folder of a revision in the cache, or None."""
-    commit = _cached_commit(named)
-    if commit is None:
+    snapshot = None if named is None else _snapshot(named)
+    if named is None or snapshot is None:
         return None
-    folder = _cache_of(named.repository) / "snapshots" / commit / named.folder
+    folder = snapshot / named.folder
     return folder if folder.is_dir() else None
 
 
-def _cached_commit(named: HubName) -> str | None:
-    """The commit of a revision as the cache has it; None where it has none."""
-    cache, revision = _cache_of(named.repository), named.revision or "main"
-    if (cache / "snapshots" / revision).is_dir() and len(revision) == COMMIT_DIGITS:
-        return revision
-    ref = cache / "refs" / revision
-    return read_regular_text(ref).strip() if ref.is_file() else None
+def _snapshot(named: HubName) -> Path | None:
+    """The cache's folder of a revision's commit, by which it is called; None where it has none."""
+    cache, commit = _cache_of(named.repository), named.revision or "main"
+    snapshots = cache / "snapshots"
+    if len(commit) != _COMMIT_DIGITS or not (snapshots / commit).is_dir():
+        ref = cache / "refs" / commit
+        commit = read_regular_text(ref).strip() if ref.is_file() else ""
+    return snapshots / commit if commit and (snapshots / commit).is_dir() else None
 
 
 def _cache_of(repository: str) -> Path:
@@ -130,16 +124,12 @@ def _fetched(checkpoint: str, patterns: Sequence[str]) -> Path:
     if named is None:
         raise CheckpointError(_not_here(checkpoint))
     named = _with_pin(named)
-    snapshots = _cache_of(named.repository) / "snapshots"
-    if why := unreachable():
-        commit = _cached_commit(named)
-        if commit is None or not (snapshots / commit).is_dir():
-            raise CheckpointError(
-                _not_fetched(checkpoint, f"{why}; the cache has no copy", OFFLINE_WAY_OUT)
-            ) from NotCachedError(named.repository)
-        place = snapshots / commit
-    else:
-        place = _downloaded(checkpoint, named, patterns)
+    why = unreachable()
+    place = _snapshot(named) if why else _downloaded(checkpoint, named, patterns)
+    if place is None:
+        raise CheckpointError(
+            _not_fetched(checkpoint, f"{why}; the cache has no copy", OFFLINE_WAY_OUT)
+        ) from NotCachedError(named.repository)
     record_commit(named.repository, place.name)
     folder = place / named.folder
     if not folder.is_dir():
@@ -314,7 +304,7 @@ def check_unambiguous(folder: Path) -> None:
         )
 
 
-def weights_sizes(folder: Path) -> int | None:
+def missing_bytes(folder: Path) -> int | None:
     """Bytes of the weights that an index of shards lists and the folder lacks; None where no index says it.
 
     An index has the size of all tensors, `total_size`.

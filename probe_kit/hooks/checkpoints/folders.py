@@ -17,9 +17,9 @@ from probe_kit.hooks.checkpoints.adapter_files import (
     base_folder_of,
     remember_joined,
 )
-from probe_kit.hooks.checkpoints.checkpoint import ADAPTER_FILE, PATTERNS, is_weights, plain_folder
+from probe_kit.hooks.checkpoints.checkpoint import ADAPTER_FILE, CONFIG_FILE, PATTERNS, is_weights, plain_folder
 
-_CONFIGURATIONS = ("config.json", "config.yaml")
+_CONFIGURATIONS = (CONFIG_FILE, "config.yaml")
 _READ_TOGETHER = (
     (("policy_preprocessor.json",), ("policy_preprocessor",)),
     (("policy_postprocessor.json",), ("policy_postprocessor",)),
@@ -36,44 +36,39 @@ _DONE: dict[tuple[object, ...], Path] = {}
 
 
 def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
-    """The folder of a checkpoint, by path or hub id; that of an adapter alone has its base's files too.
+    """The folder of a checkpoint, by path or hub id; that of an adapter alone is joined with its base's files.
 
-    patterns: see `plain_folder`. Raises CheckpointError as that does, and for a base that cannot be read.
-    """
-    return with_base_files(plain_folder(checkpoint, patterns), patterns)
-
-
-def with_base_files(folder: Path, patterns: Sequence[str]) -> Path:
-    """Return a checkpoint's folder, or that of a LoRA adapter without configuration joined with its base's files.
-
-    patterns: the files that are needed of a base on the hub. A file of the adapter replaces the base's, so its
+    patterns: see `plain_folder`; also of a base on the hub. A file of the adapter replaces the base's, so its
     statistics win. The joined folder holds links and is removed at the end of the process.
-    Raises CheckpointError for a base that is not there, or has no configuration either.
+    Raises CheckpointError as `plain_folder` does, and for a base that is not there or has no configuration either.
     """
+    folder = plain_folder(checkpoint, patterns)
     file = folder / ADAPTER_FILE
-    if not file.is_file() or _has_configuration(folder):
+    if not file.is_file() or has_configuration(folder):
         return folder
     base = base_folder_of(folder, adapter_settings(file), patterns)
-    if not _has_configuration(base):
+    if not has_configuration(base):
         raise CheckpointError(
             f"{folder} is a LoRA adapter without config.json, and its base {base} has none either. Correct "
             f"base_model_name_or_path in {file}, or copy the config.json, processor and tokenizer files of the "
             "base into the adapter's folder"
         )
-    key = (_state(folder), _state(base))
+    key = (file_state(folder), file_state(base))
     if key not in _DONE:
         _DONE[key] = _join(folder, base)
     return _DONE[key]
 
 
-def _has_configuration(folder: Path) -> bool:
+def has_configuration(folder: Path) -> bool:
+    """Whether a folder has the configuration of a network."""
     return any((folder / name).is_file() for name in _CONFIGURATIONS)
 
 
-def _state(folder: Path) -> tuple[object, ...]:
-    """A value that changes with the files of a folder."""
-    files = [(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in _existing(folder)]
-    return (str(folder.resolve()), *sorted(files))
+def file_state(place: Path) -> tuple[object, ...]:
+    """A value that changes with the files of a folder, or with one file."""
+    paths = _existing(place) if place.is_dir() else [place]
+    files = [(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in paths]
+    return (str(place.resolve()), *sorted(files))
 
 
 def _existing(folder: Path) -> Iterable[Path]:

@@ -16,6 +16,7 @@ from torch import nn
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks import Observation, load_model, load_policy
 from probe_kit.hooks.checkpoints.adapter_files import adapter_in
+from probe_kit.hooks.registry import find_family
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.models.magma import shipped_statistics
 from tests.support.every_checkpoint import WRITERS
@@ -393,3 +394,35 @@ def test_an_adapter_whose_base_has_no_configuration_is_refused_by_name(tmp_path:
     write_adapter(tmp_path / "tuned", factors("q_proj", torch.zeros(4, 4)), "../base")
     with pytest.raises(CheckpointError, match=r"without config\.json, and its base .*base has none either.*copy"):
         load_model("pi0", str(tmp_path / "tuned"))
+
+
+@pytest.mark.parametrize(
+    ("base", "message"),
+    [
+        ("{folder}/tuned", "its base .*tuned has none either"),
+        ("../tuned", "its base .*tuned has none either"),
+        ("../other", "other of the LoRA adapter .* is an adapter itself"),
+    ],
+)
+def test_adapters_whose_bases_lead_back_to_them_are_refused_by_name_in_plan_and_run(
+    base: str, message: str, tmp_path: Path
+) -> None:
+    own = factors("q_proj", torch.zeros(4, 4))
+    for name, named in (("tuned", base.format(folder=tmp_path)), ("other", "../tuned")):
+        (tmp_path / name).mkdir()
+        write_adapter(tmp_path / name, own, named)
+    for read in (find_family("pi0").outline, find_family("pi0").load):
+        with pytest.raises(CheckpointError, match=message):
+            read(str(tmp_path / "tuned"))
+
+
+def test_the_outline_follows_every_file_of_a_folder_and_passes_over_links_to_nothing(tmp_path: Path) -> None:
+    write, options = WRITERS["internvla-m1"]
+    place, family = write(tmp_path / "model"), find_family("internvla-m1")
+    first = family.outline(str(place), options)
+    folder = place if place.is_dir() else place.parent
+    (folder / "left.json").symlink_to(tmp_path / "nothing")
+    assert family.outline(str(place), options) is first
+    configuration = folder / "config.yaml"
+    configuration.write_text(configuration.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+    assert family.outline(str(place), options) is not first
