@@ -19,7 +19,6 @@ from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
 from probe_kit.models.lerobot.groot import VLM
 
 _AGAIN = "Download the checkpoint again"
-_NEEDED = ("processor_config.json", "statistics.json", "embodiment_id.json")
 
 
 @dataclass(frozen=True)
@@ -77,17 +76,20 @@ def nvidias_config(folder: Path, embodiment: str | None) -> GrootConfig:
     embodiment: its tag; None where the files have one only. Raises CheckpointError for missing files, UsageError
     for a tag that they do not have.
     """
-    content = {name: read_json_object(folder / name, CheckpointError, _AGAIN) for name in _NEEDED}
-    modalities = processor_settings(folder).get("modality_configs", {})
-    statistics = content["statistics.json"]
-    tags = sorted(set(modalities) & set(statistics) & set(content["embodiment_id.json"]))
+    settings = processor_settings(folder)
+    statistics, numbers = (
+        read_json_object(folder / name, CheckpointError, _AGAIN)
+        for name in ("statistics.json", "embodiment_id.json")
+    )
+    modalities = settings.get("modality_configs", {})
+    tags = sorted(set(modalities) & set(statistics) & set(numbers))
     tag = tags[0] if embodiment is None and len(tags) == 1 else embodiment
     if tag is None or tag not in tags:
         asked = "no embodiment was chosen" if embodiment is None else f"there is no embodiment {embodiment!r}"
         raise UsageError(f"{folder}: {asked}. Choose with -M embodiment=TAG; it has {', '.join(tags) or 'none'}")
     network = read_json_object(folder / CONFIG_FILE, CheckpointError, _AGAIN)
-    read_state_fields(folder, tag)
-    check_widths(folder, network)
+    read_state_fields(folder, settings, tag)
+    check_widths(folder, settings, network)
     widths = {
         feature: sum(stat_dim_from_entry(statistics[tag].get(feature, {}).get(key, {})) for key in own)
         for feature in ("state", "action")

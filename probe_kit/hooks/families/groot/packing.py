@@ -75,16 +75,16 @@ def read_steps(
     whether pictures are made square with bars first; None for what the files say.
     Raises CheckpointError for files that are missing, and for a step or field that is not known here.
     """
-    raw = is_raw_groot_n1_7_checkpoint(folder)
-    steps = _nvidias_steps(folder, config) if raw else _lerobots_steps(folder, config)
+    settings = processor_settings(folder) if is_raw_groot_n1_7_checkpoint(folder) else None
+    steps = _lerobots_steps(folder, config) if settings is None else _nvidias_steps(folder, config, settings)
     encode = steps.encode if letterbox is None else replace(steps.encode, letter_box_transform=letterbox)
-    if (resize or ("nvidia" if raw else "lerobot")) == "nvidia":
-        encode = nvidias_pictures(encode, processor_settings(folder) if raw else None)
+    if (resize or ("lerobot" if settings is None else "nvidia")) == "nvidia":
+        encode = nvidias_pictures(encode, settings)
     return replace(steps, encode=encode)
 
 
-def _nvidias_steps(folder: Path, config: GrootConfig) -> Steps:
-    fields = read_state_fields(folder, str(config.embodiment_tag))
+def _nvidias_steps(folder: Path, config: GrootConfig, settings: Mapping[str, Any]) -> Steps:
+    fields = read_state_fields(folder, settings, str(config.embodiment_tag))
     before, behind = make_groot_pre_post_processors(config)
     found = _chosen([*before.steps, *behind.steps], "processor_config.json and statistics.json")
     return replace(found, fields=fields)

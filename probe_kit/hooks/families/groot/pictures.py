@@ -55,9 +55,8 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
             return torch.from_numpy(np.ascontiguousarray(self._by_area(square))).permute(2, 0, 1)
         tensor = torch.from_numpy(square).permute(2, 0, 1)
         target, crop = list(self.image_target_size or ()), list(self.image_crop_size or ())
-        for step in (functional.resize, functional.center_crop, functional.resize):
-            tensor = step(tensor, crop if step is functional.center_crop else target)
-        return tensor
+        cut = functional.center_crop(functional.resize(tensor, target), crop)
+        return functional.resize(cut, target)
 
     def _by_area(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Resized, cut, and resized again."""
@@ -83,11 +82,10 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
     @property
     def rule(self) -> str:
         """In words, for the card."""
+        size = " x ".join(map(str, self.image_target_size or ()))
         if not self.use_albumentations:
-            size = " x ".join(map(str, self.image_target_size or ()))
             return f"squashed to {size} bilinearly, as {NVIDIAS_VERSION}; lerobot is bicubic (-M resize=lerobot)"
         if self.shortest_image_edge is None:
-            size = " x ".join(map(str, self.image_target_size or ()))
             return f"squashed to {size} by area, as {NVIDIAS_VERSION}; lerobot does not squash (-M resize=lerobot)"
         return f"shortest edge {self.shortest_image_edge} by area, as {NVIDIAS_VERSION}, and lerobot"
 

@@ -77,12 +77,12 @@ def processor_settings(folder: Path) -> dict[str, Any]:
     return settings
 
 
-def read_state_fields(folder: Path, tag: str) -> StateFields:
-    """What the processor file says of the state of embodiment `tag`.
+def read_state_fields(folder: Path, settings: Mapping[str, Any], tag: str) -> StateFields:
+    """What the settings of the processor file say of the state of embodiment `tag`.
 
     Raises CheckpointError for several frames of the state, and for a field that may change numbers unseen.
     """
-    path, settings = folder / PROCESSOR_FILE, processor_settings(folder)
+    path = folder / PROCESSOR_FILE
     modalities = settings.get("modality_configs", {}).get(tag, {})
     check_values(modalities, _MODALITIES, f"{path}: {tag}")
     for name, own in modalities.items():
@@ -107,9 +107,8 @@ def read_state_fields(folder: Path, tag: str) -> StateFields:
     )
 
 
-def check_widths(folder: Path, network: Mapping[str, Any]) -> None:
+def check_widths(folder: Path, settings: Mapping[str, Any], network: Mapping[str, Any]) -> None:
     """Raise CheckpointError where processor and network say different widths of state or action."""
-    settings = processor_settings(folder)
     for name in ("max_state_dim", "max_action_dim"):
         own, other = settings.get(name), network.get(name)
         if own is not None and other is not None and own != other:
