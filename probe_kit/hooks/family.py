@@ -249,12 +249,7 @@ class Family:
         if place is not None and self.config_types and (fetch or not is_on_hub(place)):
             with naming_checkpoint(self.name, place):
                 weights = fetch and not random_weights
-                check_files(
-                    checkpoint_folder(place, self.files),
-                    self.config_types,
-                    weights,
-                    self.instead,
-                )
+                check_files(checkpoint_folder(place, self.files), self.config_types, weights, self.instead)
         return self._with_own(chosen, place)
 
     def _with_own(self, chosen: Mapping[str, Any], place: str | None) -> dict[str, Any]:

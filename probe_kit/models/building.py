@@ -9,6 +9,8 @@ import torch
 from torch import nn
 from torch.overrides import TorchFunctionMode
 
+from probe_kit.models.sizes_only import building_device
+
 
 def without_precision(values: Mapping[str, Any]) -> dict[str, Any]:
     """A configuration's values without the precision its files are stored in, in its parts too.
@@ -33,7 +35,7 @@ class _WithoutFilling(TorchFunctionMode):
 def build_empty[Network: nn.Module](
     make: Callable[[], Network], dtype: torch.dtype, device: str = "meta"
 ) -> Network:
-    """What `make` makes, in eval mode, with parameters of `dtype`.
+    """What `make` makes, in eval mode, with parameters of `dtype`; without memory where only sizes are needed.
 
     device: `meta` for parameters that have names and shapes but no memory, to be filled with
     `load_weights(…, assign=True)`; `cpu` for uninitialised weights. The rotary frequencies, which no
@@ -42,7 +44,7 @@ def build_empty[Network: nn.Module](
     before = torch.get_default_dtype()
     torch.set_default_dtype(dtype)
     try:
-        with torch.device(device), _WithoutFilling():
+        with torch.device(building_device(device)), _WithoutFilling():
             network = make()
     finally:
         torch.set_default_dtype(before)

@@ -90,11 +90,20 @@ def _snapshot(named: HubName) -> Path | None:
     return snapshots / commit if commit and (snapshots / commit).is_dir() else None
 
 
+def is_in_cache(folder: Path) -> bool:
+    """Whether a folder lies in the cache of the hub."""
+    return _cache() in folder.parents
+
+
 def _cache_of(repository: str) -> Path:
+    # Not the hub's own function: it refuses names that no repository can have, and nothing is looked up here.
+    return _cache() / f"models--{repository.replace('/', '--')}"
+
+
+def _cache() -> Path:
     from huggingface_hub import constants
 
-    # Not the hub's own function: it refuses names that no repository can have, and nothing is looked up here.
-    return Path(constants.HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}"
+    return Path(constants.HF_HUB_CACHE)
 
 
 def is_on_hub(checkpoint: str) -> bool:

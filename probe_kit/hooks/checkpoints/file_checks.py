@@ -11,15 +11,13 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     ADAPTER_FILE,
     CONFIG_FILE,
     check_unambiguous,
+    is_in_cache,
     missing_weights,
 )
 
 
 def check_files(
-    folder: Path,
-    types: Sequence[str],
-    weights: bool = True,
-    instead: Sequence[tuple[str, str]] = (),
+    folder: Path, types: Sequence[str], weights: bool = True, instead: Sequence[tuple[str, str]] = ()
 ) -> None:
     """Look at what can be wrong with a checkpoint before anything heavy is imported.
 
@@ -57,7 +55,7 @@ def _type_of(config: Any) -> Any:
 
 def _way_to_weights(folder: Path) -> str:
     """Advice where weights are missing; an adapter in a folder below is no weights of this one."""
-    if "snapshots" in folder.parts:
+    if is_in_cache(folder):
         return (
             "Either the repository lacks them, or its copy in the cache is incomplete: compare with the files on "
             "its page, and fetch it again with the network on"

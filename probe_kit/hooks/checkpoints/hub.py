@@ -87,8 +87,7 @@ def way_out(error: Exception) -> str:
 
     cause = _cause(error)
     if isinstance(cause, errors.GatedRepoError):
-        asked = "ask for access on the model's page" if get_token() else "run `hf auth login`"
-        return f"{asked[0].upper()}{asked[1:]}"
+        return "Ask for access on the model's page" if get_token() else "Run `hf auth login`"
     if isinstance(cause, errors.RevisionNotFoundError):
         return "Look the branches, tags and commits up on its page"
     if _status(cause) == 401 and get_token():

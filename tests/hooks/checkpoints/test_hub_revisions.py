@@ -210,3 +210,10 @@ def test_a_shard_that_the_repository_lacks_is_named(server: Hub, tmp_path: Path)
         WeightsError, match=r"model-00002-of-00002\.safetensors .*are missing.*repository lacks them"
     ):
         load_model("pi0", REPO)
+
+
+def test_a_folder_called_snapshots_is_not_taken_for_the_cache(tmp_path: Path) -> None:
+    made = write_intact(tmp_path / "snapshots" / "step-100")
+    (made / "model.safetensors").unlink()
+    with pytest.raises(WeightsError, match=r"no weights in .*step-100.*Download the checkpoint again"):
+        load_model("pi0", str(made))

@@ -15,7 +15,6 @@ from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.magma import UNUSED_WEIGHTS, MagmaConfig, MagmaNetwork, build_magma, shipped_statistics
-from probe_kit.models.sizes_only import building_device
 from probe_kit.models.statistics_choice import STATISTICS_FILE, chosen_name, read_statistics, stored_statistics
 
 _DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
@@ -93,7 +92,7 @@ def load_checkpoint(
 def _random(
     config: MagmaConfig, dtype: torch.dtype, checkpoint: str, seed: int
 ) -> tuple[MagmaNetwork, WeightsAudit]:
-    network = build_magma(config, dtype, device=building_device())
+    network = build_magma(config, dtype, device="cpu")
     initialise(network, seed)
     with torch.no_grad():
         for name, parameter in network.named_parameters():

@@ -17,7 +17,6 @@ from probe_kit.hooks.families.prismatic.quantised import check_quantisation, qua
 from probe_kit.hooks.families.prismatic.release import read_release
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.prismatic import PrismaticConfig, PrismaticNetwork, build_prismatic
-from probe_kit.models.sizes_only import building_device
 from probe_kit.models.statistics_choice import stored_statistics
 
 FILES = (*PATTERNS, RUN_WEIGHTS)
@@ -125,7 +124,7 @@ def _check_other_heads(folders: tuple[Path, ...]) -> None:
 def _random(
     config: PrismaticConfig, dtype: torch.dtype, checkpoint: str, seed: int
 ) -> tuple[PrismaticNetwork, WeightsAudit]:
-    network = build_prismatic(config, dtype, device=building_device())
+    network = build_prismatic(config, dtype, device="cpu")
     initialise(network, seed)
     weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
     return network, load_weights(network, weights, weights.tensors)

@@ -10,7 +10,6 @@ from torch import nn
 from probe_kit.errors import UsageError, WeightsError
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights
 from probe_kit.models.initialisation import initialise
-from probe_kit.models.sizes_only import building_device
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
@@ -68,7 +67,7 @@ def twin[Network: nn.Module](
 ) -> Filled[Network]:
     """The same architecture with random weights of `seed`; float32 unless asked otherwise."""
     name = checked_dtype(dtype or "float32")
-    network = build(DTYPES[name], building_device())
+    network = build(DTYPES[name], "cpu")
     initialise(network, seed)
     weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
     audit = load_weights(network, weights, weights.tensors)

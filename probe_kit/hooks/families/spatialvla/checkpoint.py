@@ -13,7 +13,6 @@ from probe_kit.hooks.checkpoints.checkpoint import chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
 from probe_kit.models.initialisation import initialise
-from probe_kit.models.sizes_only import building_device
 from probe_kit.models.spatialvla import SpatialVLAConfig, SpatialVLANetwork, build_spatialvla
 
 PROCESSOR_FILE = "processor_config.json"
@@ -99,7 +98,7 @@ def read_processor(folder: Path) -> dict[str, Any]:
 def _random(
     config: SpatialVLAConfig, dtype: torch.dtype, checkpoint: str, seed: int
 ) -> tuple[SpatialVLANetwork, WeightsAudit]:
-    network = build_spatialvla(config, dtype, device=building_device())
+    network = build_spatialvla(config, dtype, device="cpu")
     initialise(network, seed)
     weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
     return network, load_weights(network, weights, weights.tensors)
