@@ -29,7 +29,7 @@ from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.families.pi0_fast import CAPTURED, FAST
 from probe_kit.hooks.families.pi0_fast.actions import ActionText, DecodedChunk, FastTokenizer, fast_folder
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
-from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
+from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.paligemma import PaliGemmaPolicy, sizes_file
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
@@ -63,15 +63,13 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     family = "pi0-fast"
     config_type = "pi0_fast"
-    decoding = Decoding()
     known_steps = (CROP, "pi0_fast_prepare_state_tokenizer_processor_step", "action_tokenizer_processor")
     interventions = FAST
 
     acting_stream = "action"
     suffix_roles = ("action",)
 
-    def __init__(self, network: Any, folder: Path, decoding: Decoding | None = None) -> None:
-        self.decoding = decoding or Decoding()
+    def __init__(self, network: Any, folder: Path) -> None:
         self.problems: list[tuple[str, ...]] = []
         super().__init__(network, folder)
         self.prompt_kv: Stream | None = kept_prompt(self._decoder.config)
@@ -96,10 +94,14 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
             if not 1 <= evaluation.captured <= most:
                 raise UsageError(f"captured_tokens is {evaluation.captured}; expected 1 to {most}")
             chooser(evaluation.temperature or 0, ())
-            self.decoding = evaluation
             self.stacks |= self._stacks()
             self._show(self.shown)
             self.streams = {name: self.stacks[name].stream(name) for name in ("backbone", "action")}
+
+    @property
+    def decoding(self) -> Decoding:
+        """How tokens are put out: as chosen, or as the checkpoint says."""
+        return self.evaluation if isinstance(self.evaluation, Decoding) else Decoding()
 
     @property
     def temperature(self) -> float:
@@ -118,13 +120,6 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
         """As lerobot words it, in lower case where that is chosen."""
         return super().prompts([text.lower() if self.decoding.lowercase else text for text in instructions], state)
-
-    @classmethod
-    def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
-        """Raise InstructionError for the text that is read, from configuration and tokenizer alone."""
-        lowercase = isinstance(evaluation, Decoding) and evaluation.lowercase
-        texts = [text.lower() if lowercase else text for text in instructions]
-        super().check_words(checkpoint, texts, evaluation)
 
     def _notes(self) -> tuple[str, ...]:
         most, chunk, executed = (

@@ -501,7 +501,7 @@ class LerobotPolicy(Policy):
     def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
         """Raise InstructionError as `tokenise` would, from configuration and tokenizer alone."""
         text = cls.__new__(cls)  # what tokenises needs no network
-        text.folder = checkpoint_folder(checkpoint)
+        text.folder, text.evaluation = checkpoint_folder(checkpoint), evaluation
         text.config = cls._read_config(text.folder, evaluation)
         text.tokenise(instructions)
 
