@@ -1,24 +1,27 @@
 """Reading of foreign `.npz` files: their sizes are read before their arrays are unpacked."""
 
 import math
+import zlib
 from io import BytesIO
 from pathlib import Path
 from tokenize import TokenError
 from typing import TYPE_CHECKING, Any, BinaryIO
-from zipfile import ZipFile, ZipInfo
+from zipfile import BadZipFile, ZipFile, ZipInfo
 
 if TYPE_CHECKING:
     from numpy.lib.npyio import NpzFile
 
 MOST_BYTES = 4 << 30
 """Of all arrays of a file, unpacked."""
+UNREADABLE = (OSError, ValueError, EOFError, KeyError, AttributeError, RuntimeError, BadZipFile, zlib.error)
+"""What `open_arrays`, and reading of an array, raise for a file that is none, damaged or asks for a password."""
 
 
 def open_arrays(source: Path | BinaryIO | bytes) -> "NpzFile":
     """Open an `.npz` file; a context manager that holds arrays by name. Nothing is unpickled.
 
-    Raises ValueError for a file whose arrays have more than `MOST_BYTES` once they are unpacked, and what
-    `zipfile` and numpy raise for one that is no such file.
+    Raises ValueError for a file whose arrays have more than `MOST_BYTES` once they are unpacked, and one of
+    `UNREADABLE` for one that is no such file.
     """
     import numpy as np
 

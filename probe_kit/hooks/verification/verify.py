@@ -1,17 +1,16 @@
 """`probe-kit verify`: compares an adapter with outputs recorded from the original implementation."""
 
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile
-from zlib import error
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
 from probe_kit._system.bounded_json import load_gzipped_json, load_json
 from probe_kit.errors import UsageError
 from probe_kit.hooks.checkpoints.third_party import in_words, while_loading
@@ -117,16 +116,12 @@ def verify_reference(family: str, folder: Path) -> Verification:
         return Verification(family, str(folder), run(folder, recorded))
 
 
-_DAMAGED = (OSError, ValueError, EOFError, KeyError, AttributeError, NotImplementedError, BadZipFile, error)
-"""What numpy raises for an .npz file that is none, or no longer."""
-
-
 def _read_arrays(file: Path) -> dict[str, NDArray[Any]]:
     """What an .npz file holds. Raises UsageError if it is damaged or holds something else than numbers."""
     try:
         with open_arrays(file) as arrays:
             return {name: arrays[name] for name in arrays.files}
-    except _DAMAGED as why:
+    except UNREADABLE as why:
         raise UsageError(
             f"{file} cannot be read as arrays ({in_words(why)}). Record it again, or copy it again from its source"
         ) from why
@@ -190,7 +185,7 @@ def _read_key_list(file: Path) -> dict[str, Any]:
         keys: dict[str, Any] = dict(content["keys"].items())
         for entry in keys.values():
             tuple(entry["shape"]), str(entry["dtype"])
-    except (OSError, EOFError, error, ValueError, KeyError, TypeError, AttributeError) as why:
+    except (OSError, EOFError, zlib.error, ValueError, KeyError, TypeError, AttributeError) as why:
         raise UsageError(
             f"{file} is no key list ({in_words(why)}); expected JSON with `keys`: name, then shape and dtype"
         ) from why

@@ -6,11 +6,10 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from io import BytesIO
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
-from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.extract.run_layout import PROBES
@@ -149,7 +148,7 @@ def _read(run: RunReader, bundle: Bundle) -> LabelResults:
             stamp=stamp,
             aligned=aligned,
         )
-    except (BadZipFile, ValueError, KeyError, TypeError, OSError) as error:
+    except (*UNREADABLE, TypeError) as error:
         raise RunDamagedError(
             f"{run.location}/{bundle.folder} holds no probes of a label: {error!r}. Remove {bundle.folder} and "
             "run the same `probe-kit train` again"

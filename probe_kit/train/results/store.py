@@ -10,11 +10,10 @@ from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
-from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError
 from probe_kit.extract.run_layout import PROBE_DIRECTIONS, PROBES
@@ -222,7 +221,7 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
     try:
         with open_arrays(bundle.read(DECISIONS)) as arrays:
             curves = _unpack(arrays)
-    except (BadZipFile, ValueError, KeyError, TypeError, OSError) as error:
+    except (*UNREADABLE, TypeError) as error:
         raise RunDamagedError(
             f"{run.location}/{bundle.folder}/{DECISIONS} cannot be read: {error}. Remove {bundle.folder} and run "
             "the same `probe-kit train` again"

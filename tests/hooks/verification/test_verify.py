@@ -94,6 +94,17 @@ def test_a_folder_without_a_reference_is_refused(tmp_path: Path) -> None:
         verify_reference("pi0", tmp_path)
 
 
+def test_a_reference_that_asks_for_a_password_is_refused_by_name(tmp_path: Path) -> None:
+    file = tmp_path / "reference.npz"
+    np.savez(file, a=np.zeros(3))
+    content = bytearray(file.read_bytes())
+    for header, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        content[content.index(header) + flags] |= 1
+    file.write_bytes(content)
+    with pytest.raises(UsageError, match=r"reference\.npz cannot be read as arrays .*password"):
+        verify_reference("pi0", tmp_path)
+
+
 def test_nan_and_another_shape_are_never_ok() -> None:
     recorded = {"a": np.zeros(3), "b": np.zeros(3), "c": np.zeros(3), "in_x": np.zeros(1)}
     produced = {"a": lambda: np.array([0, np.nan, 0]), "b": lambda: np.zeros(4)}
