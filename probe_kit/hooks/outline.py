@@ -18,6 +18,7 @@ from probe_kit.hooks.checkpoints.checkpoint import (
 )
 from probe_kit.hooks.checkpoints.folders import file_state, has_configuration
 from probe_kit.hooks.checkpoints.hub import without_network
+from probe_kit.hooks.checkpoints.third_party import in_words
 
 if TYPE_CHECKING:
     from probe_kit.hooks.contract.model import Model
@@ -83,7 +84,7 @@ def _built(load: Any, place: str, dtype: str | None, options: Mapping[str, Any],
             raise
         return Outline(None, str(error), complete)
     except Exception as error:  # noqa: BLE001 - a network may need numbers while it is built
-        return Outline(None, f"{type(error).__name__}: {str(error).partition(chr(10))[0]}", complete)
+        return Outline(None, in_words(error), complete)
 
 
 def _lacks_repository(error: BaseException | None) -> bool:
