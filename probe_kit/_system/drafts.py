@@ -1,5 +1,6 @@
 """Atomic writes: files and folders are written beside their final place and renamed when complete."""
 
+import errno
 import fcntl
 import os
 import shutil
@@ -48,19 +49,20 @@ def full_disk_in_words(path: Path) -> Iterator[None]:
     try:
         yield
     except DiskSpaceError as error:  # of a part of the same draft, which the caller cannot know
-        if f".{path.name}." not in str(error):
+        if _prefix(path) not in str(error):
             raise
-        raise DiskSpaceError(
-            f"the disk of {path} is full; nothing was written there. Free some space or choose another disk, then "
-            "run the same command again"
-        ) from error
+        raise _full(path, errno.ENOSPC) from error
     except OSError as error:
         if error.errno not in FULL_DISK:
             raise
-        raise DiskSpaceError(
-            f"the disk of {path} {FULL_DISK[error.errno]}; nothing was written there. Free some space or choose "
-            "another disk, then run the same command again"
-        ) from error
+        raise _full(path, error.errno) from error
+
+
+def _full(path: Path, number: int) -> DiskSpaceError:
+    return DiskSpaceError(
+        f"the disk of {path} {FULL_DISK[number]}; nothing was written there. Free some space or choose another "
+        "disk, then run the same command again"
+    )
 
 
 @contextmanager

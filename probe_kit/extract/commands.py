@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from probe_kit.suite.ladder import Wording
 
 
-OUTER_FOLDS = 5
-"""Groups that probes need at least."""
 LARGE = 64 * 10**9
 """Bytes above which a run is begun with --yes only."""
 
@@ -251,14 +249,14 @@ def print_sufficiency(extraction: "Extraction") -> None:
 
     from probe_kit.extract.plan import Plan
     from probe_kit.extract.recordings.recorded_plan import RecordedPlan
-    from probe_kit.suite.validation.sufficiency import Smallest, sufficiencies
+    from probe_kit.suite.validation.sufficiency import GROUPS_FOR_PROBES, Smallest, sufficiencies
 
     plan, scored = extraction.plan, not getattr(extraction.settings, "capture_only", False)
     if not isinstance(plan, Plan):
         groups = len({row.to_json()["group_id"] for row in plan.episodes})
-        if groups < OUTER_FOLDS:
+        if groups < GROUPS_FOR_PROBES:
             kind = "recorded episodes" if isinstance(plan, RecordedPlan) else "groups of episodes"
-            say(marked("[yellow]{} {}; probes need {} or more[/]", groups, kind, OUTER_FOLDS))
+            say(marked("[yellow]{} {}; probes need {} or more[/]", groups, kind, GROUPS_FOR_PROBES))
         return
     table = Table(show_header=False, title=f"enough for ({Smallest.of(plan.suite).words})", box=None)
     table.add_column(style="dim", no_wrap=True)
@@ -303,7 +301,9 @@ def _describe(stored: Any) -> str:
 
 
 def _has_groups_for_probes(run: "Run") -> bool:
-    return bool(run.episodes.groupby("category")["group_id"].nunique().min() >= OUTER_FOLDS)
+    from probe_kit.suite.validation.sufficiency import GROUPS_FOR_PROBES
+
+    return bool(run.episodes.groupby("category")["group_id"].nunique().min() >= GROUPS_FOR_PROBES)
 
 
 def _print_outcomes(run: "Run") -> None:

@@ -18,6 +18,7 @@ import shutil
 import stat
 import tempfile
 import zlib
+from collections import Counter
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -139,17 +140,16 @@ def _unpacked(file: Path) -> Path:
 def _unpack(archive: ZipFile, file: Path, folder: Path) -> None:
     """Write the members of a zip file, once names, kinds and sizes of all of them are found acceptable."""
     members = [member for member in archive.infolist() if not member.is_dir()]
-    names = [member.filename for member in members]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise RunDamagedError(f"{file} has two files called {twice!r}. {_RESTORE}")
+    names = Counter(member.filename for member in members)
+    if twice := [name for name, count in names.items() if count > 1]:
+        raise RunDamagedError(f"{file} has two files called {twice[0]!r}. {_RESTORE}")
     for member in members:
         kind = stat.S_IFMT(member.external_attr >> 16)
         if kind not in (0, stat.S_IFREG):
             raise RunDamagedError(f"{file} has {member.filename!r}, which is no regular file. {_RESTORE}")
         _check_name(member.filename, str(file))
-    _check_sizes(len(members), sum(member.file_size for member in members), str(file))
     packed, unpacked = file.stat().st_size, sum(member.file_size for member in members)
+    _check_sizes(len(members), unpacked, str(file))
     if unpacked > FREE_EXPANSION and unpacked > MOST_EXPANSION * packed:
         raise RunDamagedError(
             f"{file} has {packed:,} bytes and unpacks to {unpacked:,}; expected at most {MOST_EXPANSION} times as "

@@ -110,13 +110,12 @@ class Cell:
     @cached_property
     def key(self) -> str:
         """Hash of `known`: what the run's folder is named by."""
-        return self.packed_key or sha256_json(self.known)[:KEY_DIGITS]
+        return self.packed_key or key_of(self.known)
 
     @property
     def folder(self) -> str:
         """The run's folder below `out`."""
-        seed = f"-seed{self.seed}" if self.seed else ""
-        return f"{self.model}/{self.way}{seed}-{self.key}"
+        return folder_of(self.name, self.key)
 
     def location(self, out: str) -> str:
         """Where the run lies below `out`."""
@@ -129,6 +128,16 @@ class Cell:
         return replace(
             self.settings, suite=folder, categories=self.selection.categories, items=self.selection.items
         )
+
+
+def key_of(known: Mapping[str, Any]) -> str:
+    """The key of a cell with these settings, see `Cell.known`."""
+    return sha256_json(known)[:KEY_DIGITS]
+
+
+def folder_of(name: str, key: str) -> str:
+    """The folder below `out` of the run of the cell `name`, such as `base/plain/seed 1`."""
+    return f"{name.replace('/seed ', '-seed')}-{key}"
 
 
 def checkpoint_stamp(checkpoint: str | None) -> Any:

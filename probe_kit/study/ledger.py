@@ -22,8 +22,8 @@ from probe_kit.extract.rollout.events import traceback_of
 from probe_kit.extract.settings import flat_settings
 from probe_kit.extract.store.format.hashes import HASH, as_record, read_record
 from probe_kit.extract.store.locations.locate import locate
-from probe_kit.hashing import sha256_json, sha256_text
-from probe_kit.study.cells import KEY_DIGITS, Cell
+from probe_kit.hashing import sha256_text
+from probe_kit.study.cells import Cell, folder_of, key_of
 
 FOLDER = "ledger"
 Stage = Literal["checking", "playing", "episodes", "probes", "waiting"]
@@ -187,10 +187,11 @@ class Ledger:
     def _entry(self, name: str, content: bytes) -> Entry:
         """The record in the file `name`, found to be of the cell and the settings that the file's name says."""
         entry = self._parsed(f"{FOLDER}/{name}", content, Entry)
-        if name != f"{_file_stem(entry)}.json":
+        expected = f"{_file_stem(folder_of(entry.cell, key_of(entry.settings)))}.json"
+        if name != expected:
             raise RunDamagedError(
-                f"{self._location}/{FOLDER}/{name} is the record of {entry.cell} and belongs into "
-                f"{_file_stem(entry)}.json. {_ADVICE}"
+                f"{self._location}/{FOLDER}/{name} is the record of {entry.cell} and belongs into {expected}. "
+                f"{_ADVICE}"
             )
         return entry
 
@@ -204,15 +205,13 @@ class Ledger:
             raise RunDamagedError(f"{name} is no record of a ledger ({message}). {_ADVICE}") from error
 
 
-def _file_stem(entry: Entry) -> str:
-    """The name that `name_of` gives the cell of a record."""
-    folder = entry.cell.replace("/seed ", "-seed").replace("/", "+")
-    return f"{folder}-{sha256_json(entry.settings)[:KEY_DIGITS]}"
-
-
 def name_of(cell: Cell) -> str:
     """What the record of a cell is called."""
-    return cell.folder.replace("/", "+")
+    return _file_stem(cell.folder)
+
+
+def _file_stem(folder: str) -> str:
+    return folder.replace("/", "+")
 
 
 def settings_changed(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:

@@ -4,16 +4,15 @@ A folder's name says what should lie there. No number is taken before the conten
 """
 
 import json
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.settings import ExtractSettings, flat_settings
 from probe_kit.hashing import canonical_json
+from probe_kit.hooks.checkpoints.checkpoint import COMMIT_DIGITS, is_on_hub, without_revision
 from probe_kit.study.cells import Cell
 
 if TYPE_CHECKING:
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
 _OF_LOADED_MODEL = {"dtype", "weights_sha256", "execute", "captured_calls", "policy", "begun", "zeros_for"}
 """Settings of a run that the loaded model decides where the file leaves them open."""
-_HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 _MOST_SHOWN = 3
 
 
@@ -107,19 +105,20 @@ def _short(value: Any) -> str:
 
 
 def _other_weights(run: "Run", cell: Cell) -> Iterator[str]:
-    """The seed of random weights, or the hub id, as the process that loaded them recorded it."""
+    """The seed of random weights, or the hub id, as the process that loaded them recorded it.
+
+    A card has the commit of a hub id. A file may name a branch or nothing: then repository and folder count.
+    """
     if not run.commits():
         return
     card: Mapping[str, Any] = run.certificate.get("policy") or {}
     if cell.settings.random_weights and "weights_seed" in card:
         yield from _different("weights_seed", card["weights_seed"], cell.settings.weights_seed)
     stored, expected = str(card.get("checkpoint")), str(cell.settings.checkpoint)
-    if _is_hub_id(stored) and _is_hub_id(expected):  # a folder may have been moved, and is bound by its hash
-        yield from _different("checkpoint", stored, expected)
-
-
-def _is_hub_id(name: str) -> bool:
-    return bool(_HUB_ID.fullmatch(name)) and not Path(name).exists()
+    if is_on_hub(stored) and is_on_hub(expected):  # a folder may have been moved, and is bound by its hash
+        has_commit = len(expected.partition("@")[2]) == COMMIT_DIGITS
+        names = (name if has_commit else without_revision(name) for name in (stored, expected))
+        yield from _different("checkpoint", *names)
 
 
 def _other_items(run: "Run", contents: Mapping[str, str]) -> Iterator[str]:

@@ -31,16 +31,19 @@ _NAME_PATTERN = "'^[a-z0-9][a-z0-9._-]{0,59}$'"
 class LoadedStudy:
     """A study file without mistakes. file: where it lies. cells: the runs that it needs.
 
-    archive: the folder of an archive that it was read from, whose runs hold no activations; else None. pack: its
-    record.
+    pack: the record of the archive that it was read from, whose runs hold no activations; else None.
     """
 
     file: Path
     study: schema.Study
     suite: PlannedSuite
     cells: tuple[Cell, ...]
-    archive: Path | None = None
     pack: Pack | None = None
+
+    @property
+    def archive(self) -> Path | None:
+        """The folder of the archive, None without one."""
+        return None if self.pack is None else self.file.parent
 
 
 def find_study(name: str) -> Path:
@@ -88,11 +91,11 @@ def load_study(name: str | Path) -> LoadedStudy:
     cells, found = _checked(study, suite)
     if mistakes := [*mistakes, *found]:
         raise StudyFileError(str(file), content, mistakes)
-    if archive is None or pack is None:
+    if pack is None:
         return LoadedStudy(file, study, suite, tuple(cells))
-    keys, home = {name: run.key for name, run in pack.runs.items()}, str(archive / RUNS)
+    keys, home = {name: run.key for name, run in pack.runs.items()}, str(file.parent / RUNS)
     packed = tuple(replace(cell, packed_key=keys.get(cell.name, "")) for cell in cells)
-    return LoadedStudy(file, study.model_copy(update={"out": home}), suite, packed, archive, pack)
+    return LoadedStudy(file, study.model_copy(update={"out": home}), suite, packed, pack)
 
 
 def _packed_suite(pack: Pack) -> PlannedSuite:

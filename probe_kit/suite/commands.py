@@ -137,8 +137,9 @@ def _list_categories(suite: "Suite", as_json: bool) -> None:
     from rich.table import Table
 
     from probe_kit.suite.categories import category_of
+    from probe_kit.suite.suite import count_by_category
 
-    counts = {c: sum(item.category == c for item in suite.items) for c in suite.categories}
+    counts = count_by_category(suite.items)
     if as_json:
         print_json({"suite": suite.identity, "items": counts})
         return
@@ -219,6 +220,7 @@ def convert(
 ) -> None:
     """Convert a benchmark to a suite and compare the count of every stage with the paper."""
     from probe_kit.suite.converters import convert as convert_source
+    from probe_kit.suite.suite import count_by_category
 
     with err.status("converting"):
         suite = convert_source(
@@ -232,7 +234,7 @@ def convert(
             emit_curation=emit_curation,
             **_options(option or []),
         )
-    counts = ", ".join(f"{c} {sum(i.category == c for i in suite.items)}" for c in suite.categories)
+    counts = ", ".join(f"{category} {count}" for category, count in count_by_category(suite.items).items())
     out.print(f"{suite.identity}: {counts} items in {out_folder}", soft_wrap=True)
     if reasons := load_json(out_folder / "stats.json").get("reasons"):
         left_out = "; ".join(f"{reason} {count}×" for reason, count in reasons.items())

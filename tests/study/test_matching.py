@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 
 from probe_kit.errors import SettingsMismatchError
-from probe_kit.extract import Run, open_run
+from probe_kit.extract import ExtractSettings, Run, open_run
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.retention.compare.common_items import common_items
-from probe_kit.study.matching import check_same_items
+from probe_kit.study.cells import Cell
+from probe_kit.study.matching import check_same_items, differences
 from probe_kit.study.planned_suite import planned_suite
 from probe_kit.study.schema import SuiteTable
 from probe_kit.suite import Suite
@@ -50,3 +51,20 @@ def test_a_study_sees_that_the_suite_in_its_folder_was_changed(
     before, after = (planned_suite(SuiteTable(path=str(suite.folder)))[0] for suite in (small_suite, changed))
     assert (before.contents != after.contents) is items_differ
     assert (before.identity != after.identity) is not items_differ
+
+
+@pytest.mark.parametrize(
+    ("checkpoint", "differs"),
+    [
+        ("lab/first", False), ("lab/first@v1", False), ("lab/second", True), ("lab/second@v1", True),
+        ("lab/first/inner", True), (f"lab/first@{'c' * 40}", False), (f"lab/first@{'d' * 40}", True),
+    ],
+)  # fmt: skip
+def test_a_run_of_another_checkpoint_of_the_hub_is_seen_though_its_card_has_a_commit(
+    checkpoint: str, differs: bool, small_suite: Suite, tmp_path: Path
+) -> None:
+    run = run_of(small_suite, tmp_path / "run")
+    run.__dict__["certificate"] = {"policy": {"checkpoint": f"lab/first@{'c' * 40}"}}
+    suite = planned_suite(SuiteTable(path=str(small_suite.folder)))[0]
+    cell = Cell("base", "plain", 0, ExtractSettings("pi0", checkpoint), {}, suite)
+    assert any(words.startswith("checkpoint: stored 'lab/first") for words in differences(run, cell)) is differs

@@ -145,6 +145,14 @@ def assert_none_silent(name: Path, folder: Path, seeds: range) -> None:
     assert verdicts["error"] > len(seeds) // 4
 
 
+def assert_no_archive_is_silent(study: LoadedStudy, folder: Path, seeds: range) -> None:
+    """Changes of an archive as a folder, and as a zip file."""
+    pack_study(study, folder / "pack")
+    assert_none_silent(folder / "pack", folder / "pack", seeds)
+    pack_study(study, folder / "pack.zip")
+    assert_no_zip_is_silent(folder / "pack.zip", folder, seeds)
+
+
 def assert_no_zip_is_silent(archive: Path, folder: Path, seeds: range) -> None:
     """Changed bytes of the zip file itself."""
     before, content, verdicts, wrong = tables_of(archive), archive.read_bytes(), Counter[str](), list[str]()
@@ -184,10 +192,7 @@ def test_no_change_of_a_study_folder_is_silent(played: LoadedStudy, tmp_path: Pa
 
 @pytest.mark.slow
 def test_no_change_of_an_archive_is_silent(played: LoadedStudy, tmp_path: Path) -> None:
-    pack_study(played, tmp_path / "pack")
-    assert_none_silent(tmp_path / "pack", tmp_path / "pack", range(FEW))
-    pack_study(played, tmp_path / "pack.zip")
-    assert_no_zip_is_silent(tmp_path / "pack.zip", tmp_path, range(FEW))
+    assert_no_archive_is_silent(played, tmp_path, range(FEW))
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +211,4 @@ def test_none_of_three_hundred_changes_of_a_study_folder_is_silent(probed: Loade
 
 @pytest.mark.slow
 def test_none_of_three_hundred_changes_of_an_archive_is_silent(probed: LoadedStudy, tmp_path: Path) -> None:
-    pack_study(probed, tmp_path / "pack")
-    assert_none_silent(tmp_path / "pack", tmp_path / "pack", range(MANY))
-    pack_study(probed, tmp_path / "pack.zip")
-    assert_no_zip_is_silent(tmp_path / "pack.zip", tmp_path, range(MANY))
+    assert_no_archive_is_silent(probed, tmp_path, range(MANY))

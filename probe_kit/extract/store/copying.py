@@ -44,8 +44,8 @@ def copy_run(
     arrays = {*run.root.arrays, *(() if trajectories else (TRAJECTORY,))}
     left_out = {*arrays, *(() if directions else (PROBE_DIRECTIONS,))}
     keys = [key for key in _copied_keys(run, arrays, pictures, directions) if run.location.exists(key)]
-    strange = set(target.keys("")) - {*keys, LEFT_OUT_FILE}
-    if target.exists(RUN_FILE) or strange or (isinstance(target, Folder) and target.keys("")):
+    present = set(target.keys(""))
+    if present - {*keys, LEFT_OUT_FILE} or (isinstance(target, Folder) and present):
         raise UsageError(f"{target} is not empty; choose another place for the copy")
     if isinstance(target, Folder):
         folder = Path(target.address)

@@ -142,7 +142,7 @@ class Run:
         """
         _ = self.label, self._seconds, self.failed, self.provenances, self.columns
         if self._commits:
-            read_certificate(self.root)
+            _ = self._certificates
 
     def __repr__(self) -> str:
         return run_text(self)
@@ -248,6 +248,10 @@ class Run:
         return pd.DataFrame(list(rows.values()), columns=list(names.values()))
 
     @cached_property
+    def _certificates(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        return read_certificate(self.root)
+
+    @cached_property
     def certificate(self) -> dict[str, Any]:
         """What was loaded and checked: the first process's record, then what every process measured.
 
@@ -255,7 +259,8 @@ class Run:
         answers with and without capture have one hash, `mixed` what changes numbers and was not the same for all
         episodes.
         """
-        certificate, processes = read_certificate(self.root)
+        first, processes = self._certificates
+        certificate = dict(first)
         checks = [process["capture_check"] for process in processes if process.get("capture_check")]
         if checks:
             certificate["hooks_on_equals_hooks_off"] = all(
@@ -271,7 +276,7 @@ class Run:
         """Sources of the processes that played it, the first process's first; empty before the first episode."""
         if not self._commits:
             return ()
-        certificate, processes = read_certificate(self.root)
+        certificate, processes = self._certificates
         found: list[RunSources] = []
         for record in (certificate, *processes):
             if (sources := RunSources.of_record(record)) not in found:

@@ -5,10 +5,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, UsageError
-from probe_kit.extract import open_run
 from probe_kit.study.cells import Cell
 from probe_kit.study.ledger import NOT_TRIED_AGAIN, Entry, Failure, Ledger, name_of, settings_changed
-from probe_kit.study.matching import check_run_of_cell
 from probe_kit.study.mistakes import unknown
 from probe_kit.study.planning.cost import Cost, Work, cost_of
 from probe_kit.study.planning.planned_probes import (
@@ -19,7 +17,7 @@ from probe_kit.study.planning.planned_probes import (
     what_decides,
 )
 from probe_kit.study.reading import LoadedStudy
-from probe_kit.study.tables.stored_runs import noted_run
+from probe_kit.study.tables.stored_runs import noted_run, open_matching
 
 if TYPE_CHECKING:
     from probe_kit.extract import Run
@@ -168,10 +166,7 @@ class _Stored:
     def _look(self, cell: Cell) -> "Run | ProbeKitError":
         if cell.name not in self._runs:
             try:
-                location, settings_sha256 = noted_run(self._study, cell)
-                run = open_run(location, allow_partial=True)
-                check_run_of_cell(run, cell, self._study.cells, settings_sha256, self._study.file)
-                self._runs[cell.name] = run
+                self._runs[cell.name] = open_matching(self._study, cell, True, self._entry(cell))
             except ProbeKitError as error:
                 self._runs[cell.name] = error
         return self._runs[cell.name]
@@ -181,7 +176,8 @@ class _Stored:
 
     def planned(self, cell: Cell) -> PlannedCell:
         """A cell with what is stored of it."""
-        location, entry = str(noted_run(self._study, cell)[0]), self._entry(cell)
+        entry = self._entry(cell)
+        location = str(noted_run(self._study, cell, entry)[0])
         if cell.unavailable:
             return PlannedCell(cell, location, "skipped", 0, f"skipped: {cell.unavailable}")
         run = self._look(cell)

@@ -63,8 +63,8 @@ def make_table(study: LoadedStudy, name: str, partial: bool = False) -> NamedTab
     if name not in study.study.tables:
         raise UsageError(unknown("table", name, list(study.study.tables)))
     table = study.study.tables[name]
-    if study.archive is not None and table.kind == "drift":
-        return _packed(study.archive, study.pack, name)
+    if study.pack is not None and table.kind == "drift":
+        return _packed(study.file.parent, study.pack, name)
     runs = stored_runs(study, _wanted(study, table), partial, _categories(table))
     if not runs.found:
         raise UsageError(
@@ -94,13 +94,13 @@ def _categories(table: TableTable) -> tuple[str, ...] | None:
     return None if table.categories is None else slugs(table.categories)
 
 
-def _packed(archive: Path, pack: Pack | None, name: str) -> NamedTable:
+def _packed(archive: Path, pack: Pack, name: str) -> NamedTable:
     """A table as it was packed, because it is made of activations."""
     file = archive / TABLES / f"{name}.json"
     try:
         return table_of_record(load_json(file))
     except FileNotFoundError:
-        why = ({} if pack is None else pack.missing).get(f"table {name}", "it was not made")
+        why = pack.missing.get(f"table {name}", "it was not made")
         raise UsageError(f"the archive holds no table {name!r}: {why}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RunDamagedError(f"{file} is no record of a table ({error!r}). Fetch the archive again") from error

@@ -16,7 +16,7 @@ from probe_kit.errors import (
 from probe_kit.extract import open_run
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.study.cells import Cell, Selection
-from probe_kit.study.ledger import Ledger
+from probe_kit.study.ledger import Entry, Ledger
 from probe_kit.study.matching import check_run_of_cell, check_same_items
 from probe_kit.study.reading import LoadedStudy, load_study, shipped_studies
 from probe_kit.study.schema import ProbesTable
@@ -124,30 +124,40 @@ def _seen(error: ProbeKitError) -> str:
     return str(error).partition(". ")[0].removesuffix(".")
 
 
-def noted_run(study: LoadedStudy, cell: Cell) -> tuple["Location", str | None]:
+def noted_run(study: LoadedStudy, cell: Cell, entry: Entry | None = None) -> tuple["Location", str | None]:
     """The location of a cell's run, and the hash of its settings and weights, by ledger or archive.
 
-    The hash is None without a record. Raises RunDamagedError for a record that was changed.
+    The hash is None without a record. entry: the cell's record in the ledger, read where None.
+    Raises RunDamagedError for a record that was changed.
     """
     home = locate(cell.location(study.study.folder))
     if study.pack is not None:
         packed = study.pack.runs.get(cell.name)
         return home, None if packed is None else packed.settings_sha256
-    played = Ledger(study.study.folder).of(cell).played
+    played = (Ledger(study.study.folder).of(cell) if entry is None else entry).played
     if played is None:
         return home, None
     return locate(played.served_by) if played.served_by else home, played.settings_sha256
 
 
-def open_stored(study: LoadedStudy, cell: Cell, partial: bool = False) -> "Run":
-    """The run of a cell, found to be of its settings, weights and suite, and to hold all items of its blocks.
+def open_matching(study: LoadedStudy, cell: Cell, partial: bool, entry: Entry | None = None) -> "Run":
+    """The run of a cell, found to be of its settings, weights and suite.
 
-    partial: accept missing episodes. Raises what `open_run` raises, RunIncompleteError for a run of fewer items,
-    and SettingsMismatchError for the run of another cell.
+    entry: as of `noted_run`. Raises what `open_run` raises, and SettingsMismatchError for the run of another cell.
     """
-    location, settings_sha256 = noted_run(study, cell)
+    location, settings_sha256 = noted_run(study, cell, entry)
     run = open_run(location, allow_partial=partial)
     check_run_of_cell(run, cell, study.cells, settings_sha256, study.file)
+    return run
+
+
+def open_stored(study: LoadedStudy, cell: Cell, partial: bool = False) -> "Run":
+    """The run of a cell, as `open_matching` gives it, found to hold all items of its blocks.
+
+    partial: accept missing episodes. Raises what `open_matching` raises, and RunIncompleteError for a run of fewer
+    items.
+    """
+    run = open_matching(study, cell, partial)
     planned = run.items["category"].value_counts().to_dict()
     expected = cell.selection.counts(cell.suite)
     fewer = [name for name, count in expected.items() if planned.get(name, 0) < count]
@@ -184,7 +194,7 @@ def probe_keys(study: LoadedStudy, runs: Sequence[tuple[StoredRun, "Run"]], part
 
 def study_probes(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> ProbeResults | None:
     """The probes of the file that are stored of a run, None without any. Raises as `probe_keys`."""
-    (key,) = probe_keys(study, [(stored, run)], partial)
+    key = _probe_key(study, stored, run, partial)
     return load_results(run, key) if key else None
 
 

@@ -19,6 +19,8 @@ from probe_kit.statistics.sufficiency import (
 from probe_kit.suite.items import LAYOUTS
 from probe_kit.suite.suite import Suite
 
+__all__ = ["GROUPS_FOR_PROBES", "MARGIN", "Smallest", "Sufficiency", "sufficiencies"]
+
 MARGIN = 0.1
 """Margin of a success rate that the plan gives a number of items for."""
 

@@ -8,13 +8,12 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from importlib import import_module
 from itertools import islice
 
 import numpy as np
 
 from probe_kit.errors import MissingExtraError, ProbeKitError, RunDamagedError
-from probe_kit.extract.run_layout import DATA, INTERVENTIONS, PROBES
+from probe_kit.extract.run_layout import DATA
 from probe_kit.extract.store.format.arrays import open_array
 from probe_kit.extract.store.format.columns import Columns
 from probe_kit.extract.store.format.commits import Commit, pictures_of, redo, redo_picture
@@ -25,15 +24,16 @@ from probe_kit.extract.store.format.rows import Rows
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.extract.store.run import Run
 from probe_kit.extract.store.sealing import columns_of_rows
+from probe_kit.hooks.family import imported
 
 READERS = min(8, max(4, os.cpu_count() or 1))
 """Objects that are read and hashed at once: both let other threads work."""
 BATCH = 256
-RESULT_READERS: Mapping[str, str] = {
-    PROBES: "probe_kit.train.every_result:readers_of_results",
-    INTERVENTIONS: "probe_kit.intervene.results.every_result:readers_of_results",
-}
-"""By home of bundles, the function that gives a reader per stored result of a run. It lies in a folder above."""
+RESULT_READERS = (
+    "probe_kit.train.every_result:readers_of_results",
+    "probe_kit.intervene.results.every_result:readers_of_results",
+)
+"""Functions that give a reader per stored result of a run. They lie in folders above."""
 
 Job = tuple[str, int, str, str, str]
 """Key, length, checksum, whose it is, and what to do."""
@@ -67,9 +67,8 @@ def reading_problems(root: Root) -> Iterator[str]:
     if run.has_trajectories:
         for row in range(len(run.episodes)):
             yield from _complaints(partial(run.trajectory, row))
-    for name in RESULT_READERS.values():
-        module, _, function = name.partition(":")
-        listing: Callable[[Run], Iterator[Callable[[], object]]] = getattr(import_module(module), function)
+    for name in RESULT_READERS:
+        listing: Callable[[Run], Iterator[Callable[[], object]]] = imported(name)
         try:
             readers = list(listing(run))
         except RunDamagedError as error:
