@@ -16,7 +16,7 @@ from scipy.special import ndtri
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.estimates.balanced import balanced_sums
 from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
-from probe_kit.statistics.folds import fold_of_groups, sums_by_group
+from probe_kit.statistics.folds import fold_numbers, fold_of_groups, sums_by_group
 from probe_kit.train.crossval.site_probe import SiteProbe, nested_folds, probe_site
 from probe_kit.train.data.samples import Samples
 
@@ -96,9 +96,7 @@ def _neighbours(values: Matrix) -> Matrix:
 def probe_streams(data: DataSet, seed: int) -> list[Stream]:
     """The streams of (expert, backbone) as `train_probes` and `retention` make them."""
     folds = nested_folds(data.labels, data.groups, derive_seed("folds", seed))
-    fold_of = np.empty(data.labels.size, np.int64)
-    for number, fold in enumerate(folds):
-        fold_of[fold.outer.test] = number
+    fold_of = fold_numbers([fold.outer for fold in folds])
     nothing = np.empty((data.labels.size, 0), np.bool_)
     streams = []
     for features in data.features:

@@ -31,7 +31,7 @@ from probe_kit.statistics.estimates.crossfit import Stream, crossfit
 from probe_kit.statistics.estimates.mover import difference_interval, mean_interval
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most, findable, is_absent
-from probe_kit.statistics.folds import fold_of_groups, sums_by_group
+from probe_kit.statistics.folds import fold_numbers, fold_of_groups, sums_by_group
 from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site
@@ -274,9 +274,7 @@ def _probed(seed: int) -> NDArray[np.float64]:
     for share in MISSING:
         kept = ~labels | (drawn >= share)
         folds = nested_folds(labels[kept], groups[kept], seed=0)
-        fold_of = np.zeros(int(kept.sum()), np.int64)
-        for number, fold in enumerate(folds):
-            fold_of[fold.outer.test] = number
+        fold_of = fold_numbers([fold.outer for fold in folds])
         nothing = np.empty((fold_of.size, 0), np.bool_)
         probes = [probe_site(Samples.pooled(one[kept]), labels[kept], nothing, folds) for one in features]
         decisions, inner = (np.array([getattr(one, part) for one in probes]) for part in ("decisions", "inner"))
