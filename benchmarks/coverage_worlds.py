@@ -81,13 +81,14 @@ def draw(world: World, seed: int) -> DataSet:
 
 def _noise(generator: np.random.Generator, sites: int, group_of: NDArray[np.intp]) -> Matrix:
     """(S, E, D) standard normal values."""
-    of_group = _neighbours(generator.standard_normal((sites, int(group_of[-1]) + 1, WIDTH)))
-    own = _neighbours(generator.standard_normal((sites, group_of.size, WIDTH)))
+    of_group = neighbours(generator.standard_normal((sites, int(group_of[-1]) + 1, WIDTH)))
+    own = neighbours(generator.standard_normal((sites, group_of.size, WIDTH)))
     values: Matrix = np.sqrt(OF_GROUP) * of_group[:, group_of] + np.sqrt(1 - OF_GROUP) * own
     return values
 
 
-def _neighbours(values: Matrix) -> Matrix:
+def neighbours(values: Matrix) -> Matrix:
+    """Values (S, …) of which every site resembles the one before it; changes `values`."""
     for site in range(1, len(values)):
         values[site] = NEIGHBOURS * values[site - 1] + np.sqrt(1 - NEIGHBOURS**2) * values[site]
     return values

@@ -18,6 +18,7 @@ from functools import partial
 from itertools import product
 
 import numpy as np
+from coverage_worlds import neighbours
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -142,7 +143,7 @@ def unequal(draws: int, seed: int) -> Table:
 
 
 SITES = (1, 4, 19, 180)
-OF_GROUP, NEIGHBOURS = 0.3, 0.9
+OF_GROUP = 0.3
 
 
 def draw_right(
@@ -150,18 +151,12 @@ def draw_right(
 ) -> NDArray[np.bool_]:
     """(S, E) correctness of sites with (S,) accuracies above chance; neighbours and groups are alike."""
     of_group, own = (
-        _neighbours(generator.standard_normal((above.size, count)))
+        neighbours(generator.standard_normal((above.size, count)))
         for count in (int(group_of[-1]) + 1, group_of.size)
     )
     values = np.sqrt(OF_GROUP) * of_group[:, group_of] + np.sqrt(1 - OF_GROUP) * own
     right: NDArray[np.bool_] = values < ndtri(0.5 + above)[:, None]
     return right
-
-
-def _neighbours(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    for site in range(1, len(values)):
-        values[site] = NEIGHBOURS * values[site - 1] + np.sqrt(1 - NEIGHBOURS**2) * values[site]
-    return values
 
 
 def absent(draws: int, seed: int) -> Table:
