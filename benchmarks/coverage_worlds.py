@@ -16,7 +16,7 @@ from scipy.special import ndtri
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.estimates.balanced import balanced_sums
 from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
-from probe_kit.statistics.folds import fold_of_groups, sums_by_group
+from probe_kit.statistics.folds import fold_numbers, fold_of_groups, sums_by_group
 from probe_kit.train.crossval.site_probe import SiteProbe, nested_folds, probe_site
 from probe_kit.train.data.samples import Samples
 
@@ -81,13 +81,14 @@ def draw(world: World, seed: int) -> DataSet:
 
 def _noise(generator: np.random.Generator, sites: int, group_of: NDArray[np.intp]) -> Matrix:
     """(S, E, D) standard normal values."""
-    of_group = _neighbours(generator.standard_normal((sites, int(group_of[-1]) + 1, WIDTH)))
-    own = _neighbours(generator.standard_normal((sites, group_of.size, WIDTH)))
+    of_group = neighbours(generator.standard_normal((sites, int(group_of[-1]) + 1, WIDTH)))
+    own = neighbours(generator.standard_normal((sites, group_of.size, WIDTH)))
     values: Matrix = np.sqrt(OF_GROUP) * of_group[:, group_of] + np.sqrt(1 - OF_GROUP) * own
     return values
 
 
-def _neighbours(values: Matrix) -> Matrix:
+def neighbours(values: Matrix) -> Matrix:
+    """Values (S, …) of which every site resembles the one before it; changes `values`."""
     for site in range(1, len(values)):
         values[site] = NEIGHBOURS * values[site - 1] + np.sqrt(1 - NEIGHBOURS**2) * values[site]
     return values
@@ -96,9 +97,7 @@ def _neighbours(values: Matrix) -> Matrix:
 def probe_streams(data: DataSet, seed: int) -> list[Stream]:
     """The streams of (expert, backbone) as `train_probes` and `retention` make them."""
     folds = nested_folds(data.labels, data.groups, derive_seed("folds", seed))
-    fold_of = np.empty(data.labels.size, np.int64)
-    for number, fold in enumerate(folds):
-        fold_of[fold.outer.test] = number
+    fold_of = fold_numbers([fold.outer for fold in folds])
     nothing = np.empty((data.labels.size, 0), np.bool_)
     streams = []
     for features in data.features:

@@ -36,7 +36,7 @@ from probe_kit.train.crossval.joint_objective import JointProblems
 from probe_kit.train.crossval.nested_folds import (
     STRENGTHS,
     FittedFold,
-    InnerLosses,
+    InnerQuality,
     NestedFold,
     nested_folds,
 )
@@ -129,8 +129,8 @@ def alone_seconds(
 
     seconds = OUTER_FOLDS * INNER_FOLDS * processor_seconds(one_inner)
     kept: list[FittedFold] = []
-    losses = InnerLosses(np.zeros(labels.shape[1]), np.zeros(len(labels)))
-    once = processor_seconds(lambda: kept.append(probe._fit_fold(samples, labels, outer, strengths, losses)))
+    quality = InnerQuality(np.zeros(labels.shape[1]), np.zeros(len(labels)))
+    once = processor_seconds(lambda: kept.append(probe._fit_fold(samples, labels, outer, strengths, quality)))
     return seconds + OUTER_FOLDS * once, kept[0].decisions
 
 

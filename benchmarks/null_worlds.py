@@ -29,6 +29,7 @@ from threadpoolctl import threadpool_limits
 from probe_kit.statistics.folds import OUTER_FOLDS, Fold, grouped_folds
 from probe_kit.statistics.label_permutations import flip_groups, flip_items, max_statistic_p, pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
+from probe_kit.train.controls.random_features import LAYERS
 from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site
 from probe_kit.train.data.samples import Samples
@@ -131,7 +132,7 @@ def control_alarms(accuracy: float, draws: int) -> tuple[float, float]:
     for seed in range(draws):
         generator = np.random.default_rng(seed)
         here, there = correlated(generator, 19, accuracy), correlated(generator, 19, accuracy)
-        layers = [correlated(generator, 1, accuracy)[0] for _ in range(5)]
+        layers = [correlated(generator, 1, accuracy)[0] for _ in range(LAYERS)]
         reference = np.mean(layers, axis=0)
         found.append(
             [

@@ -132,11 +132,11 @@ def main() -> None:
         single, double = rate(np.float32), rate(np.float64)
         for fold in folds[: asked.folds]:
             start = time.process_time()
-            strengths, losses = probe.choose_strengths(samples, labels, fold.inner[:1])
+            strengths, quality = probe.choose_strengths(samples, labels, fold.inner[:1])
             spent["inner"] += time.process_time() - start
             done["inner"] = total() - done["outer"]
             start = time.process_time()
-            probe._fit_fold(samples, labels, fold.outer, strengths, losses)
+            probe._fit_fold(samples, labels, fold.outer, strengths, quality)
             spent["outer"] += time.process_time() - start
             done["outer"] = total() - done["inner"]
     seconds = spent["inner"] + spent["outer"]

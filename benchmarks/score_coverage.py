@@ -23,6 +23,7 @@ from threadpoolctl import threadpool_limits
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.estimates.balanced import balanced_sums
 from probe_kit.statistics.estimates.shares import Accuracy, Share
+from probe_kit.statistics.folds import fold_numbers
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site
 from probe_kit.train.data.samples import Samples
 
@@ -47,11 +48,8 @@ def draw(groups: int, kind: str, accuracy: float, alike: float, seed: int) -> tu
     common = generator.standard_normal(groups)[group_of]
     features[:, 0] = np.sqrt(1 - alike) * features[:, 0] + side * (np.sqrt(alike) * common + ndtri(accuracy))
     folds = nested_folds(labels, group_of, seed)
-    fold_of = np.zeros(labels.size, np.int64)
-    for number, fold in enumerate(folds):
-        fold_of[fold.outer.test] = number
     probe = probe_site(Samples.pooled(features), labels, np.empty((labels.size, 0), np.bool_), folds)
-    sums = balanced_sums(probe.decisions[None, :], labels, fold_of, group_of)
+    sums = balanced_sums(probe.decisions[None, :], labels, fold_numbers([fold.outer for fold in folds]), group_of)
     names = np.arange(groups).astype(str)
     limits = [of(names, sums.sums[0], sums.sizes).interval() for of in (Accuracy, Share)]
     return float(sums.accuracies[0]), *((one.low, one.high) for one in limits)  # type: ignore[return-value]

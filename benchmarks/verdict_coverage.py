@@ -18,6 +18,7 @@ from functools import partial
 from itertools import product
 
 import numpy as np
+from coverage_worlds import neighbours
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
@@ -31,7 +32,7 @@ from probe_kit.statistics.estimates.crossfit import Stream, crossfit
 from probe_kit.statistics.estimates.mover import difference_interval, mean_interval
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most, findable, is_absent
-from probe_kit.statistics.folds import fold_of_groups, sums_by_group
+from probe_kit.statistics.folds import fold_numbers, fold_of_groups, sums_by_group
 from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.site_probe import nested_folds, probe_site
@@ -142,7 +143,7 @@ def unequal(draws: int, seed: int) -> Table:
 
 
 SITES = (1, 4, 19, 180)
-OF_GROUP, NEIGHBOURS = 0.3, 0.9
+OF_GROUP = 0.3
 
 
 def draw_right(
@@ -150,18 +151,12 @@ def draw_right(
 ) -> NDArray[np.bool_]:
     """(S, E) correctness of sites with (S,) accuracies above chance; neighbours and groups are alike."""
     of_group, own = (
-        _neighbours(generator.standard_normal((above.size, count)))
+        neighbours(generator.standard_normal((above.size, count)))
         for count in (int(group_of[-1]) + 1, group_of.size)
     )
     values = np.sqrt(OF_GROUP) * of_group[:, group_of] + np.sqrt(1 - OF_GROUP) * own
     right: NDArray[np.bool_] = values < ndtri(0.5 + above)[:, None]
     return right
-
-
-def _neighbours(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    for site in range(1, len(values)):
-        values[site] = NEIGHBOURS * values[site - 1] + np.sqrt(1 - NEIGHBOURS**2) * values[site]
-    return values
 
 
 def absent(draws: int, seed: int) -> Table:
@@ -274,9 +269,7 @@ def _probed(seed: int) -> NDArray[np.float64]:
     for share in MISSING:
         kept = ~labels | (drawn >= share)
         folds = nested_folds(labels[kept], groups[kept], seed=0)
-        fold_of = np.zeros(int(kept.sum()), np.int64)
-        for number, fold in enumerate(folds):
-            fold_of[fold.outer.test] = number
+        fold_of = fold_numbers([fold.outer for fold in folds])
         nothing = np.empty((fold_of.size, 0), np.bool_)
         probes = [probe_site(Samples.pooled(one[kept]), labels[kept], nothing, folds) for one in features]
         decisions, inner = (np.array([getattr(one, part) for one in probes]) for part in ("decisions", "inner"))

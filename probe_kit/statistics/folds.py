@@ -1,6 +1,6 @@
 """Cross-validation folds that keep items with a shared picture together."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from typing import TYPE_CHECKING, Literal
@@ -69,6 +69,14 @@ def stratified_folds(strata: ArrayLike, groups: ArrayLike, n_folds: int, seed: i
 def split_by_fold(fold_of: NDArray[np.integer], numbers: Iterable[int]) -> list[Fold]:
     """The splits of (E,) fold numbers, one for each of `numbers`."""
     return [Fold(np.flatnonzero(fold_of != number), np.flatnonzero(fold_of == number)) for number in numbers]
+
+
+def fold_numbers(folds: Sequence[Fold]) -> NDArray[np.int64]:
+    """Return (E,) the number of the fold that tests an episode; `split_by_fold` makes the folds of them again."""
+    fold_of = np.empty(folds[0].train.size + folds[0].test.size, np.int64)
+    for number, fold in enumerate(folds):
+        fold_of[fold.test] = number
+    return fold_of
 
 
 def fold_of_groups(fold_of: ArrayLike, groups: ArrayLike) -> NDArray[np.intp]:

@@ -29,15 +29,12 @@ def student_interval(
 
 def unbounded_student_interval(values: NDArray[np.floating], groups: ArrayLike) -> tuple[float, float]:
     """The same of (E,) values without bounds: of no width where all groups agree, infinite for a single group."""
-    from scipy.special import stdtrit  # type: ignore[import-untyped]
-
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     if names.size == 1:
         return -inf, inf
     mean, sizes = float(values.mean()), np.bincount(group_of)
     rest = np.bincount(group_of, values) - mean * sizes
-    error = sqrt(float(rest @ rest) * names.size / (names.size - 1)) / values.size
-    spread = float(stdtrit(names.size - 1, 1 - SIGNIFICANCE / 2)) * error
+    spread = _reach(rest, values.size)
     return mean - spread, mean + spread
 
 
@@ -53,8 +50,6 @@ def explained_interval(
     symmetric in log q. widening: factor of the standard error, SHARED_TRAINING for held-out scores of several
     folds. Minus infinity to 1 for a single group.
     """
-    from scipy.special import stdtrit
-
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     if names.size == 1:
         return -inf, 1.0
@@ -64,8 +59,18 @@ def explained_interval(
         return 1.0, 1.0
     relative = deviations / varying if varying > 0 else np.ones(scores.size)
     rest = np.bincount(group_of, (1 - scores) - missing * relative)
-    error = sqrt(float(rest @ rest) * names.size / (names.size - 1)) / scores.size
-    reach = float(stdtrit(names.size - 1, 1 - SIGNIFICANCE / 2)) * error * widening / missing
+    reach = _reach(rest, scores.size) * widening / missing
     low, high = 1 - missing * exp(min(reach, 100.0)), 1 - missing * exp(-reach)
     # The subtractions round: around a score of -5e-17, the limits of groups that all agree would both be 0.
     return min(low, explained), max(high, explained)
+
+
+def _reach(rest: NDArray[np.floating], count: int) -> float:
+    """Student's quantile times the standard error of a mean over `count` episodes of G groups.
+
+    rest: (G,) sums over the episodes of a group of what is left without the mean.
+    """
+    from scipy.special import stdtrit  # type: ignore[import-untyped]
+
+    error = sqrt(float(rest @ rest) * rest.size / (rest.size - 1)) / count
+    return float(stdtrit(rest.size - 1, 1 - SIGNIFICANCE / 2)) * error

@@ -214,10 +214,8 @@ def table(
 
     With --partial the command exits with 1 if anything is missing that the study would play.
     """
-    from probe_kit.retention.formats.latex import latex_table
-    from probe_kit.retention.formats.terminal import responsive_table
     from probe_kit.study import load_study, make_table
-    from probe_kit.study.tables.formats import markdown_text, table_csv, table_json
+    from probe_kit.study.tables.formats import table_json
 
     study = load_study(file)
     if html is not None:
@@ -242,12 +240,12 @@ def table(
         print_json(found[name] if name else found)
     elif style == "csv":
         for own in made.values():
-            print_text(table_csv(own).rstrip("\n"))
+            print_text(own.to_csv().rstrip("\n"))
     elif style == "table":
         for own in made.values():
-            out.print(responsive_table(own.text))
+            out.print(own.to_rich())
     else:
-        texts = (latex_table(own.text) if style == "latex" else markdown_text(own) for own in made.values())
+        texts = (own.to_latex() if style == "latex" else own.to_markdown() for own in made.values())
         print_text("\n\n".join(text.rstrip("\n") for text in texts))
     if not name and style not in ("json", "csv"):
         tests = sum(own.n_tests for own in made.values())

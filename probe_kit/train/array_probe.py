@@ -131,38 +131,38 @@ def probe(
         order = np.random.default_rng(derive_seed("array order", seed)).permutation(count)
     labels = _column(y, count, "y")
     columns: dict[str, list[Any]] = {"episode_id": names, "y": [labels[row] for row in order]}
-    own = names if groups is None else list(map(str, _column(groups, count, "groups")))
-    columns["group_id"] = [own[row] for row in order]
+    group_of = names if groups is None else list(map(str, _column(groups, count, "groups")))
+    columns["group_id"] = [group_of[row] for row in order]
     if strata is not None:
         texts = list(map(str, _column(strata, count, "strata")))
         columns["strata"] = [texts[row] for row in order]
     table = pd.DataFrame(columns)
     episodes = table[["episode_id", "group_id"]].assign(category="all")
+    networks = {"arrays": sites}
+    if untrained is not None:
+        networks["untrained"] = _sites(untrained, "untrained", count)
+    of_controls = {
+        name: _matrix(array, f"controls[{name!r}]", count)[order] for name, array in (controls or {}).items()
+    }
     with tempfile.TemporaryDirectory(prefix="probe-kit-") as folder:
-        runs = [
-            ArrayRun(
-                Path(folder) / name,
-                model=name,
+        runs = {
+            model: ArrayRun(
+                Path(folder) / model,
+                model=model,
                 suite="arrays@1#0",
                 episodes=episodes,
-                features={(Site(STREAM, layer), VIEW): array[order] for layer, array in enumerate(given.values())},
-                control_features={
-                    name: _matrix(array, f"controls[{name!r}]", count)[order]
-                    for name, array in (controls or {}).items()
-                },
+                features={(Site(STREAM, layer), VIEW): array[order] for layer, array in enumerate(own.values())},
+                control_features=of_controls if model == "arrays" else {},
             )
-            for name, given in (
-                ("arrays", sites),
-                *([] if untrained is None else [("untrained", _sites(untrained, "untrained", count))]),
-            )
-        ]
+            for model, own in networks.items()
+        }
         results = train_probes(
-            runs[0],
+            runs["arrays"],
             labels=Labels.read(table, "y", task, exchange_within=None if strata is None else "strata"),
             views=(VIEW,),
             permutations=permutations,
             controls=tuple(_names(controls)),  # type: ignore[arg-type]
-            untrained=runs[1] if len(runs) > 1 else None,
+            untrained=runs.get("untrained"),
             seed=seed,
             jobs=jobs,
         )

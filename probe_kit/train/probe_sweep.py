@@ -355,16 +355,13 @@ def _curve(
     run: RunReader, problem: CategoryProblem, category: str, view: str, probes: Mapping[Key, Probed]
 ) -> ProbeCurve:
     found = {site: probe[category] for (name, site), probe in probes.items() if name == view}
-    fold_of = np.empty(problem.labels.size, dtype=np.int64)
-    for number, fold in enumerate(problem.folds):
-        fold_of[fold.outer.test] = number
     return ProbeCurve(
         sites=tuple(found),
         labels=problem.labels,
         episodes=problem.episodes,
         items=problem.items,
         groups=problem.groups,
-        fold_of=fold_of,
+        fold_of=problem.fold_of,
         decisions=np.stack([probe.decisions for probe in found.values()]),
         strengths=np.stack([probe.strengths for probe in found.values()]),
         null=np.stack([probe.null for probe in found.values()]),

@@ -16,7 +16,7 @@ FORMAT = 6  # raise when settings have other fields or would give other numbers
 class ProbeSettings:
     """Everything that decides the numbers; its hash is the results' key.
 
-    seed_text: of the run, see `seed_text_of`; intervals are drawn by it.
+    seed_text: of the run, see `seed_text_of`; scores on equal groups of one are paired.
     """
 
     model: str

@@ -1,5 +1,7 @@
 """Checkpoints of one training: the step is read or refused, and the table holds the numbers of the runs."""
 
+import csv
+import io
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -74,6 +76,11 @@ def test_a_row_has_the_numbers_of_its_run_and_drift_is_that_from_the_first_step(
     )
     shape = [one for one in made.numbers if one["category"] == "shape"]
     assert [one["retention"] for one in shape] == [None, None], "no signal, nothing to retain"
+    cells = list(csv.DictReader(io.StringIO(made.to_csv())))
+    assert [float(cells[0][f"backbone_ci_{end}"]) for end in ("low", "high")] == pytest.approx(
+        color[0]["backbone_ci"]
+    )
+    assert (cells[0]["drift_ci_low"], cells[0]["drift_ci_high"]) == ("", ""), "the first step drifts from nothing"
     drawn = draw_training_steps(made, ())
     labels = [axes.get_ylabel() for axes in drawn.axes if axes.get_visible()]
     assert labels == ["success (%)", "backbone (%)", "retention", "drift of the backbone (points)"]

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import TooFewGroupsError
-from probe_kit.statistics.folds import assign_folds, grouped_folds
+from probe_kit.statistics.folds import assign_folds, fold_numbers, grouped_folds, split_by_fold
 
 GROUPS = np.repeat(np.arange(30), [2, 4, 6] * 10)
 LABELS = np.tile([True, False], 60)
@@ -28,6 +28,13 @@ def test_a_scarce_class_is_spread_over_the_folds() -> None:
     labels = np.arange(100) < 10
     fold_of = assign_folds(labels, np.arange(100), 5, seed=1)
     assert [int(labels[fold_of == fold].sum()) for fold in range(5)] == [2, 2, 2, 2, 2]
+
+
+def test_numbers_of_folds_make_the_same_folds_again() -> None:
+    folds = grouped_folds(LABELS, GROUPS, 5, seed=0)
+    for one, again in zip(folds, split_by_fold(fold_numbers(folds), range(5)), strict=True):
+        np.testing.assert_array_equal(one.train, again.train)
+        np.testing.assert_array_equal(one.test, again.test)
 
 
 def test_the_same_seed_gives_the_same_folds_and_another_seed_others() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.statistics.estimates.balanced import GroupSums
-from probe_kit.statistics.estimates.crossfit import Stream
+from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
 from probe_kit.statistics.folds import sums_by_group
 
 
@@ -20,3 +20,8 @@ def stream_of(scores: GroupSums, layers: ArrayLike, iterations: ArrayLike | None
     fold_of = np.arange(scores.n_groups) % 5
     inner = np.where(fold_of == np.arange(5)[:, None], 0.0, scores.sums[:, None, :])
     return Stream.of(scores, inner, fold_of, layers, iterations)
+
+
+def fitted(*streams: Stream, suite: str = "suite@1") -> CrossFit:
+    """The scores of streams on groups that are named by number."""
+    return crossfit(streams, [f"g{number:03d}" for number in range(streams[0].fold_of.size)], suite)

@@ -103,6 +103,18 @@ def test_the_order_of_samples_has_no_meaning_unless_it_is_said_to(planted: NDArr
     assert not ordered.scores.loc["0", "p_fwe"] < 0.05
 
 
+@pytest.mark.parametrize("name", ["step", "state", "action", "instruction", "pixels"])
+def test_a_control_that_is_called_like_a_built_in_one_is_the_array_that_was_passed(
+    planted: NDArray[np.float64], name: str
+) -> None:
+    words = noise(1, N, 3) + 2 * Y[:, None]
+    named, other = (
+        pk.probe(planted[1], Y, GROUPS, controls={one: words}, permutations=0).results.controls.scores[0]
+        for one in (name, "words")
+    )
+    assert named.score == other.score > 0.9
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

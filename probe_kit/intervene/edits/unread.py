@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from probe_kit.hooks.contract.interventions import Interventions
-from probe_kit.intervene.edits.sites import RESIDUAL, parse_pattern
+from probe_kit.intervene.edits.sites import RESIDUAL, PlaceName, parse_pattern
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Stream
@@ -24,11 +24,10 @@ def unread_places(
         parts = parse_pattern(pattern)
         if parts is None or parts["stream"] not in interventions.unread or parts["stream"] not in streams:
             continue
-        last, quantity = streams[parts["stream"]].layers - 1, parts["quantity"] or RESIDUAL
+        last, quantity = streams[parts["stream"]].layers - 1, parts["quantity"] or ""
         reaches_end = parts["layer"] == "*" or int(parts["layer"] or 0) == last
-        if quantity == RESIDUAL and reaches_end:
-            named = RESIDUAL if parts["quantity"] else ""
-            places.append(".".join(filter(None, (parts["stream"], f"{last:02d}", named))))
+        if quantity in ("", RESIDUAL) and reaches_end:
+            places.append(str(PlaceName(parts["stream"], last, quantity)))
         elif quantity == FINAL_NORM:
             places.append(pattern)
     return tuple(dict.fromkeys(places))

@@ -148,8 +148,7 @@ class ConceptErasure(Intervention):
         for place, role, category, own in collect_token_features(session, items_of(session.run, self), wanted):
             with passed_over.fitting(place, role):
                 self._fit(cells.setdefault((place, role), _FittedErasers()), place, role, category, own)
-        left = {cell: fitted for cell, fitted in cells.items() if not passed_over.holds(*cell)}
-        passed_over.check_some_left(list(left))
+        left = passed_over.left(cells)
         return [CleanRun(), *(erased for (place, role), cell in left.items() for erased in cell.at(place, role))]
 
     def certificate_entries(self, conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, Any]:

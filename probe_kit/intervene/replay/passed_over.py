@@ -1,6 +1,6 @@
 """Places of a wildcard at which an answer has no direction: they are passed over, by name."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from probe_kit.errors import NoDirectionError
@@ -14,11 +14,8 @@ class PassedOver:
     def __init__(self, session: ReplaySession, patterns: Sequence[str]) -> None:
         self._session = session
         self._named = resolve_all([one for one in patterns if names_one_place(one)], session.policy)
+        self._cells: set[tuple[SiteGroup, str]] = set()
         self._last: NoDirectionError | None = None
-
-    def holds(self, place: SiteGroup, role: str) -> bool:
-        """Whether this place was passed over already, for another category."""
-        return f"{place.name} {role}" in self._session.passed_over
 
     @contextmanager
     def fitting(self, place: SiteGroup, role: str) -> Iterator[None]:
@@ -28,10 +25,16 @@ class PassedOver:
         except NoDirectionError as error:
             if place.name in self._named:
                 raise
+            self._cells.add((place, role))
             self._last = error
             self._session.passed_over[f"{place.name} {role}"] = str(error)
 
-    def check_some_left(self, cells: Sequence[object]) -> None:
-        """Raise the last NoDirectionError if no place is left."""
-        if not cells and self._last is not None:
+    def left[T](self, fitted: Mapping[tuple[SiteGroup, str], T]) -> dict[tuple[SiteGroup, str], T]:
+        """Return what was fitted without places that a category passed over.
+
+        Raises the last NoDirectionError if no place is left.
+        """
+        left = {cell: own for cell, own in fitted.items() if cell not in self._cells}
+        if not left and self._last is not None:
             raise self._last
+        return left

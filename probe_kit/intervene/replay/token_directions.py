@@ -102,15 +102,14 @@ def fit_token_directions(
     from.
     """
     categories = tuple(dict.fromkeys(session.items[item].category for item in items))
-    pooled: dict[tuple[SiteGroup, str], DirectionBasis] = {}
     if ":" not in direction:
+        pooled: dict[tuple[SiteGroup, str], DirectionBasis] = {}
         for place, role in ((place, role) for place, roles in wanted.items() for role in roles):
             with passed_over.fitting(place, role):
                 pooled[place, role] = fit_directions(
                     session.run, place.only_site, role, direction, controls, seed, categories
                 )
-        passed_over.check_some_left(list(pooled))
-        return pooled
+        return passed_over.left(pooled)
     bases: dict[tuple[SiteGroup, str], dict[tuple[str, str], Vector]] = {}
     halves: dict[tuple[SiteGroup, str], dict[str, NDArray[np.float64]]] = {}
     for place, role, category, own in collect_token_features(session, items, wanted):
@@ -122,9 +121,10 @@ def fit_token_directions(
                     (name, episode): eraser.removed[0].astype(np.float32) for episode, eraser in of_episode.items()
                 }
             halves.setdefault((place, role), {}).update(half_differences_of(own, fits, direction))
-    left = {cell: found for cell, found in bases.items() if not passed_over.holds(*cell)}
-    passed_over.check_some_left(list(left))
-    return {cell: TokenDirections(found, halves[cell], control_names(controls)) for cell, found in left.items()}
+    return {
+        cell: TokenDirections(found, halves[cell], control_names(controls))
+        for cell, found in passed_over.left(bases).items()
+    }
 
 
 def half_differences_of(own: TokenFeatures, fits: Fits, direction: str) -> dict[str, NDArray[np.float64]]:

@@ -1,7 +1,7 @@
 """What an intervention did: a table, the verdicts, and the ways to write them down."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from probe_kit.errors import NoProbesError
 from probe_kit.intervene.edits.unread import unread_note
 from probe_kit.intervene.kinds.base import EffectLike, Measurement, TableContext, frame_of
 from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, stored_image_swaps
-from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict, classify_all, encoded_in
+from probe_kit.intervene.kinds.image_swap.verdict import Places, UseVerdict, classify_all, encoded_in
 from probe_kit.intervene.kinds.kind import Kind
 from probe_kit.intervene.kinds.reach import tiles_apart
 from probe_kit.intervene.kinds.registry import kind_of
@@ -207,21 +207,28 @@ def effects_of(run: RunReader, stored: StoredIntervention) -> InterventionResult
     )  # fmt: skip
     found = InterventionResult(run.label, run.random_weights, run.suite, measurement)
     shown = found.effects if kind_of(found.kind).has_verdict else ()
-    found.verdicts.update(verdicts_of(run, shown))
+    results, places = _newest_probes(run), stored_places(run)
+    found.verdicts.update(_verdicts(run, results, places, shown))
     if kind_of(found.kind).asks_where:
-        found.layers.update(which_layer(run, _newest_probes(run), list(stored.settings["categories"])))
+        found.layers.update(which_layer(run, results, places, list(stored.settings["categories"])))
     return found
 
 
-def verdicts_of(run: RunReader, shown: Sequence[ImageSwapEffect] = ()) -> dict[str, UseVerdict]:
-    """By category, from all interventions and the newest probes that are stored with a run.
+def verdicts_of(run: RunReader) -> dict[str, UseVerdict]:
+    """By category, from all interventions and the newest probes that are stored with a run."""
+    return _verdicts(run, _newest_probes(run), stored_places(run), ())
 
-    shown: the image swap that is to be classified, whatever else is stored of these categories.
-    """
-    results = _newest_probes(run)
+
+def _verdicts(
+    run: RunReader,
+    results: "ProbeResults | None",
+    places: Mapping[str, Places],
+    shown: Sequence[ImageSwapEffect],
+) -> dict[str, UseVerdict]:
+    """shown: the image swap that is to be classified, whatever else is stored of these categories."""
     found = {**stored_image_swaps(run), **{row.category: row for row in shown}}
     others = stored_other_readouts(run, found)
-    return classify_all(found, encoded_in(results), stored_places(run), stored_ties(run, results), others)
+    return classify_all(found, encoded_in(results), places, stored_ties(run, results), others)
 
 
 def _newest_probes(run: RunReader) -> "ProbeResults | None":

@@ -1,6 +1,6 @@
 """The layer to look at, in one line per category: where the answer passes, where it is read, what probes read."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from probe_kit.hooks.contract.sites import KV_STREAM
@@ -8,9 +8,9 @@ from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.edits.pooled_directions import MEAN_DIFFERENCE
 from probe_kit.intervene.edits.sites import ALL, list_places
 from probe_kit.intervene.edits.unread import unread_places
+from probe_kit.intervene.kinds.image_swap.verdict import Places
 from probe_kit.intervene.kinds.site_effects import PatchEffect
 from probe_kit.intervene.results.best_targets import best_cell
-from probe_kit.intervene.results.places import stored_places
 from probe_kit.intervene.results.site_maps import (
     BACKBONE,
     is_backbone_layer,
@@ -36,13 +36,15 @@ _TIES: dict[TieAtSite, str] = {
 }
 
 
-def which_layer(run: RunReader, results: "ProbeResults | None", categories: Sequence[str]) -> dict[str, str]:
+def which_layer(
+    run: RunReader, results: "ProbeResults | None", places: Mapping[str, Places], categories: Sequence[str]
+) -> dict[str, str]:
     """By category: where the answer passes, where it is read, and whether the probes' best site is read.
 
-    results: the newest probes, None without any. Of stored interchanges and joint places; what was not tested is
-    named with the command that tests it.
+    results: the newest probes, None without any. places: as `stored_places` gives them. Of stored interchanges and
+    joint places; what was not tested is named with the command that tests it.
     """
-    places, maps, along = stored_places(run), stored_site_effects(run), stored_subspace_effects(run)
+    maps, along = stored_site_effects(run), stored_subspace_effects(run)
     found = {}
     for name in categories:
         rows, own = maps.get(name, []), places.get(name)

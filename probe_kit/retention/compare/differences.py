@@ -111,25 +111,24 @@ class Difference:
 
 @dataclass(frozen=True)
 class Side:
-    """One side of a comparison: what it is called, the rows of its runs, and where it lies if it is one run."""
+    """One side of a comparison: what it is called, the rows of its runs, and where it lies if it is one run.
+
+    origins: what the model of each run grew from, by location; by default its weights.
+    """
 
     name: str
     drawn: Sequence[RowWithEstimates]
     run: str | None = None
+    origins: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class ComparedSides:
-    """The first side minus the second.
-
-    items: by category, what both have in common, as far as that is known. origins: what the model of each run grew
-    from, by location; by default its weights.
-    """
+    """The first side minus the second. items: by category, what both have in common, as far as that is known."""
 
     here: Side
     there: Side
     items: Mapping[str, CommonItems] = field(default_factory=dict)
-    origins: Mapping[str, str] = field(default_factory=dict)
 
     def counts(self, row: Difference) -> tuple[int | None, int | None]:
         """`n_items` and `of_items` of a row."""
@@ -166,11 +165,7 @@ def _compare_sides(pair: ComparedSides) -> list[Difference]:
     if not shared:  # one was not probed, or in other views: behaviour can still be compared
         mine, theirs, shared = _behaviour(mine), _behaviour(theirs), [None]
     outcomes = _outcomes(here.drawn), _outcomes(there.drawn)
-    found = [
-        row
-        for view in shared
-        for row in _compare((here, there), view, mine[view], theirs[view], outcomes, pair.origins)
-    ]
+    found = [row for view in shared for row in _compare((here, there), view, mine[view], theirs[view], outcomes)]
     mode = here.drawn[0].row.run.mode
     found = [replace(row, call=call, run=here.run, minus_run=there.run, mode=mode) for row in found]
     counts = [pair.counts(row) for row in found]
@@ -253,22 +248,17 @@ def _pooled(rows: Sequence[RowWithEstimates]) -> PooledScores | None:
 
 
 def _compare(
-    sides: tuple[Side, Side],
-    view: str | None,
-    here: Drawn,
-    there: Drawn,
-    outcomes: tuple[Outcomes, Outcomes],
-    origins: Mapping[str, str],
+    sides: tuple[Side, Side], view: str | None, here: Drawn, there: Drawn, outcomes: tuple[Outcomes, Outcomes]
 ) -> list[Difference]:
     gaps = {category: _Gap.of(here[category], there[category]) for category in here if category in there}
     gaps = {category: gap for category, gap in gaps.items() if gap.sr is not None or gap.accuracies}
     rows = [
-        _row(sides, [category], view, [gap], (here, there), _p(outcomes, [category], [gap]), origins)
+        _row(sides, [category], view, [gap], (here, there), _p(outcomes, [category], [gap]))
         for category, gap in gaps.items()
     ]
     if rows:
         common, found = list(gaps), list(gaps.values())
-        mean = _row(sides, common, view, found, (here, there), _p(outcomes, common, found), origins)
+        mean = _row(sides, common, view, found, (here, there), _p(outcomes, common, found))
         rows.append(replace(mean, category=MEAN, categories=tuple(common)))
     return rows
 
@@ -291,7 +281,6 @@ def _row(
     gaps: Sequence[_Gap],
     drawn: tuple[Drawn, Drawn],
     tested: tuple[float | None, int | None],
-    origins: Mapping[str, str],
 ) -> Difference:
     """Of one category, or of the mean of several."""
     rows = [[of_side[category] for category in categories] for of_side in drawn]
@@ -316,8 +305,8 @@ def _row(
         view,
         all(gap.paired for gap in gaps),
         **numbers,  # type: ignore[arg-type]
-        sr_models=_models(rows, _sr_of_model, origins, largest=1.0),
-        retention_models=None if ratio is None else _models(rows, _retention_of_model, origins),
+        sr_models=_models(sides, rows, _sr_of_model, largest=1.0),
+        retention_models=None if ratio is None else _models(sides, rows, _retention_of_model),
         p=tested[0],
         n_groups=tested[1],
     )
@@ -342,20 +331,23 @@ def _retention(gaps: Sequence[_Gap]) -> Ratio | None:
 
 
 def _models(
-    sides: Sequence[Sequence[Sequence[RowWithEstimates]]],
+    sides: tuple[Side, Side],
+    rows: Sequence[Sequence[Sequence[RowWithEstimates]]],
     value: Callable[[Sequence[RowWithEstimates]], float | None],
-    origins: Mapping[str, str],
     largest: float = inf,
 ) -> ModelTest | None:
     """Return the test of two sides with a value per origin of models.
 
-    sides: per category, the row of each run. origins: by location. largest: see `ModelTest`. None where a model
-    has no value, or is on both sides: its labels cannot be exchanged.
+    rows: of each side and per category, the row of each run. largest: see `ModelTest`. None where a model has no
+    value, or is on both sides: its labels cannot be exchanged.
     """
-    first, second = (_by_model(side, value) for side in sides)
+    first, second = (_by_model(own, value) for own in rows)
     if first is None or second is None or first.keys() & second.keys():
         return None
-    return ModelTest.of(_by_origin(first, sides[0], origins), _by_origin(second, sides[1], origins), largest)
+    here, there = sides
+    return ModelTest.of(
+        _by_origin(first, rows[0], here.origins), _by_origin(second, rows[1], there.origins), largest
+    )
 
 
 def _by_model(

@@ -5,9 +5,9 @@ Sister checkpoints resemble each other. Counted one by one they make p over mode
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from probe_kit.errors import UsageError
+from probe_kit.retention.compare.source_weights import card_of
 from probe_kit.train.data.run_reader import RunReader
 
 _STEP = re.compile(r"(?:^|.*(?:step|checkpoint|ckpt|iter|iteration)s?[-_=]?)0*(\d+)$", re.IGNORECASE)
@@ -18,8 +18,7 @@ _INNER = ("pretrained_model", "model", "params", "weights")
 
 def checkpoint_of(run: RunReader) -> str:
     """Return the checkpoint that a run's certificate names; empty where it names none."""
-    certificate: Mapping[str, Any] = getattr(run, "certificate", {})
-    return str(certificate.get("policy", {}).get("checkpoint", ""))
+    return str(card_of(run).get("checkpoint", ""))
 
 
 def split_checkpoint(checkpoint: str) -> tuple[str, int] | None:

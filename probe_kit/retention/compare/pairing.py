@@ -93,10 +93,9 @@ def compare_groups(
     for names in group_pairs(list(groups), against):
         runs = [run for name in names for run in groups[name]]
         items = {name: one for name, one in common_items(runs).items() if one.is_many}
-        sides = [Side(name, [one for one in drawn if one.row.group == name]) for name in names]
+        sides = [Side(name, [one for one in drawn if one.row.group == name], origins=grown) for name in names]
         notes += _left_out(" and ".join(names), items)
-        pair = _on_common_items((sides[0], sides[1]), items, runs, others_too=True)
-        pairs.append(replace(pair, origins=grown))
+        pairs.append(_on_common_items((sides[0], sides[1]), items, runs, others_too=True))
     return PairedRuns(pair_differences(pairs), tuple(notes))
 
 

@@ -14,7 +14,7 @@ def grew_from(policy: RunReader, vlm: RunReader) -> Relation:
     A family's name says which network it is and not which weights: another name is another source, the same name
     is no evidence. A card names its commit behind an @; the source of a family is known by repository only.
     """
-    grown, asked = _card(policy), _card(vlm)
+    grown, asked = card_of(policy), card_of(vlm)
     if grown.get("random_weights") or asked.get("random_weights"):
         return "no"
     source = grown.get("source_weights") or {}
@@ -27,8 +27,8 @@ def grew_from(policy: RunReader, vlm: RunReader) -> Relation:
     return "no" if None not in told_apart_by and len(set(told_apart_by)) == 2 else "unknown"
 
 
-def _card(run: RunReader) -> Mapping[str, Any]:
-    """What was really loaded; empty where a run has no certificate."""
+def card_of(run: RunReader) -> Mapping[str, Any]:
+    """Return what was really loaded; empty where a run has no certificate."""
     certificate: Mapping[str, Any] = getattr(run, "certificate", {})
     card: Mapping[str, Any] = certificate.get("policy") or {}
     return card

@@ -74,9 +74,7 @@ class Stream:
     @property
     def best(self) -> NDArray[np.intp]:
         """(F,) position of the site that is best in the inner folds of each outer fold, the first one on ties."""
-        quality = self.guide.sum(axis=2)
-        least = quality.max(axis=0) - _EQUAL * np.abs(quality).max(axis=0)
-        first: NDArray[np.intp] = (quality >= least).argmax(axis=0)
+        first: NDArray[np.intp] = _are_best(self.guide.sum(axis=2)).argmax(axis=0)
         return first
 
 
@@ -170,9 +168,15 @@ def _scored(stream: Stream) -> tuple[float, Matrix]:
 
 def _shared_choice(quality: Matrix) -> Matrix:
     """(S, R) shares of the sites in the choice of every resample: equal among those of the largest quality."""
-    best = quality >= quality.max(axis=0) - _EQUAL * np.abs(quality).max(axis=0)
+    best = _are_best(quality)
     shares: Matrix = best / best.sum(axis=0)
     return shares
+
+
+def _are_best(quality: Matrix) -> NDArray[np.bool_]:
+    """(S, R) whether no site has a larger quality, up to rounding."""
+    best: NDArray[np.bool_] = quality >= quality.max(axis=0) - _EQUAL * np.abs(quality).max(axis=0)
+    return best
 
 
 def _influence_on_choice(times: Matrix, scores: Matrix) -> Matrix:

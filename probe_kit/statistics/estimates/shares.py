@@ -143,6 +143,18 @@ def effective_groups(sizes: Matrix) -> float:
     return float(sizes.sum() ** 2 / (sizes @ sizes))
 
 
+def effective_episodes(
+    shares: ArrayLike, variances: ArrayLike, n_episodes: float
+) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
+    """Return shares s within [0, 1], min(s (1 − s) / v, E), and whether all groups agree; arrays of one shape.
+
+    The second is E over the design effect (Kish 1965). It says nothing where all groups agree.
+    """
+    s, v = np.broadcast_arrays(np.asarray(shares, np.float64).clip(0, 1), variances)
+    agree = (v <= NEGLIGIBLE_VARIANCE) | (s <= 0) | (s >= 1)
+    return s, np.minimum(s * (1 - s) / np.where(agree, 1.0, v), n_episodes), agree
+
+
 def group_shares(sums: Matrix, sizes: Matrix) -> tuple[Matrix, Matrix]:
     """Shares and their variances, groups as the unit; (S,) each from (S, G) sums and (G,) sizes.
 
@@ -174,9 +186,7 @@ def share_interval(
     """
     from scipy.special import betaincinv, stdtrit  # type: ignore[import-untyped]
 
-    s, v = np.broadcast_arrays(np.asarray(share, np.float64).clip(0, 1), variance)
-    agree = (v <= NEGLIGIBLE_VARIANCE) | (s <= 0) | (s >= 1)
-    counting = np.minimum(s * (1 - s) / np.where(agree, 1.0, v), n_episodes)
+    s, counting, agree = effective_episodes(share, variance, n_episodes)
     lost = stdtrit(max(n_episodes - 1, 1), 1 - tail) / stdtrit(df, 1 - tail)
     n = np.where(agree, n_groups, counting * lost**2)
     right, wrong = s * n, n - s * n
@@ -194,16 +204,13 @@ def wilson_interval(
 
     share, variance: the estimates s and their variances v with groups as the unit. n_groups: G, of unequal groups
     G* (`effective_groups`). n_episodes: E of them. df: degrees of freedom of the variance. tail: chance of either
-    side. The effective number of episodes is E over the design effect (Kish 1965): n = min(s (1 − s) / v, E), and
-    at least G. With t the quantile of Student's distribution the limits are
-    (s + t²/2n ± t √(s (1 − s)/n + t²/4n²)) / (1 + t²/n). Where all groups agree the variance knows nothing of
-    other groups: n is G, and t is the normal quantile. No accuracy is better known than there.
+    side. n is the number of `effective_episodes`, at least G. With t the quantile of Student's distribution the
+    limits are (s + t²/2n ± t √(s (1 − s)/n + t²/4n²)) / (1 + t²/n). Where all groups agree the variance knows
+    nothing of other groups: n is G, and t is the normal quantile. No accuracy is better known than there.
     """
     from scipy.special import stdtrit
 
-    s, v = np.broadcast_arrays(np.asarray(share, np.float64).clip(0, 1), variance)
-    agree = (v <= NEGLIGIBLE_VARIANCE) | (s <= 0) | (s >= 1)
-    counting = np.minimum(s * (1 - s) / np.where(agree, 1.0, v), n_episodes)
+    s, counting, agree = effective_episodes(share, variance, n_episodes)
     n = np.where(agree, n_groups, np.maximum(counting, n_groups))
     normal = NormalDist().inv_cdf(1 - tail) ** 2
     square = np.where(agree, normal, stdtrit(df, 1 - tail) ** 2)

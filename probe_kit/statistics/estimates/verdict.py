@@ -8,8 +8,7 @@ import numpy as np
 
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.statistics.estimates.balanced import GroupSums, Matrix
-from probe_kit.statistics.estimates.mover import NEGLIGIBLE_VARIANCE
-from probe_kit.statistics.estimates.shares import group_shares, share_interval
+from probe_kit.statistics.estimates.shares import effective_episodes, group_shares, share_interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 Verdict = Literal["shown", "not shown", "absent"]
@@ -46,10 +45,8 @@ def findable(sites: GroupSums, threshold: float) -> float:
     """
     if not threshold < 1:
         return inf
-    shares, variances = group_shares(sites.sums, sites.sizes)
-    spread = shares * (1 - shares)
-    some = (variances > NEGLIGIBLE_VARIANCE) & (spread > 0)
-    counting = np.minimum(spread[some] / variances[some], sites.n_episodes)
+    _, counting, agree = effective_episodes(*group_shares(sites.sums, sites.sizes), sites.n_episodes)
+    counting = counting[~agree]
     k = NormalDist().inv_cdf(POWER) ** 2 / float(np.median(counting) if counting.size else sites.n_episodes)
     half = (2 * threshold + k) / 2
     return (half + sqrt(max(0.0, half**2 - (1 + k) * threshold**2))) / (1 + k)

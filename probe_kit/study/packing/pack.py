@@ -16,7 +16,6 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import copy_run
-from probe_kit.retention.formats.latex import latex_table
 from probe_kit.study.archive import (
     PACK_FILE,
     RUNS,
@@ -29,7 +28,7 @@ from probe_kit.study.archive import (
     write_zip,
 )
 from probe_kit.study.reading import LoadedStudy
-from probe_kit.study.tables.formats import markdown_text, table_record
+from probe_kit.study.tables.formats import table_record
 from probe_kit.study.tables.make import make_table
 from probe_kit.study.tables.stored_runs import open_stored
 
@@ -109,6 +108,6 @@ def _write_tables(study: LoadedStudy, folder: Path, partial: bool) -> dict[str, 
             continue
         record = json.dumps(table_record(made), indent=1, ensure_ascii=False)
         (folder / f"{name}.json").write_text(record, encoding="utf-8")
-        (folder / f"{name}.md").write_text(markdown_text(made) + "\n", encoding="utf-8")
-        (folder / f"{name}.tex").write_text(latex_table(made.text), encoding="utf-8")
+        (folder / f"{name}.md").write_text(made.to_markdown() + "\n", encoding="utf-8")
+        (folder / f"{name}.tex").write_text(made.to_latex(), encoding="utf-8")
     return missing

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.formats.numbers_table import NumbersTable
 from probe_kit.retention.table import RetentionTable
 from probe_kit.suite.categories import category_of, in_order
 
@@ -12,14 +12,12 @@ Number = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class NamedTable:
+class NamedTable(NumbersTable):
     """text: what is printed. numbers: one object per number, with system, category, interval and n.
 
     is_partial: whether runs are missing that `study run` would play; the note names them.
     """
 
-    text: TextTable
-    numbers: tuple[Number, ...]
     is_partial: bool = False
 
     def with_note(self, sentences: Sequence[str]) -> "NamedTable":

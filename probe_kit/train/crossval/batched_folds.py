@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.statistics.folds import Fold
 from probe_kit.train.crossval.metrics import log_loss, log_losses
-from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerLosses, Matrix, NestedFold, select_c
+from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerQuality, Matrix, NestedFold, select_c
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.backend import Array, array_namespace, to_device_of, to_numpy
 from probe_kit.train.solver.design_matrix import StackedDesign
@@ -44,7 +44,7 @@ def cross_validate_together(
     loss, by_episode = (np.add.reduceat(part, begins, axis=1) for part in (loss, by_episode))
     chosen = select_c(loss)
     found = [
-        (STRENGTHS[chosen[number]], InnerLosses.of(loss[:, number], by_episode[:, number], chosen[number]))
+        (STRENGTHS[chosen[number]], InnerQuality.of(-loss[:, number], -by_episode[:, number], chosen[number]))
         for number in range(len(folds))
     ]
     outer = zip(_at_once([one.outer for one in folds], labels), _at_once(found, labels), strict=True)
@@ -97,8 +97,8 @@ class _Together:
                 by_episode[step, number, fold.test] = log_losses(decisions[:, 0], truth[:, 0])
         return loss, by_episode
 
-    def fitted(self, found: Sequence[tuple[Matrix, InnerLosses]]) -> list[FittedFold]:
-        """Of every fold, with its (K,) chosen strengths and the losses that chose them."""
+    def fitted(self, found: Sequence[tuple[Matrix, InnerQuality]]) -> list[FittedFold]:
+        """Of every fold, with its (K,) chosen strengths and the quality that chose them."""
         strengths = np.array([own for own, _ in found])
         of_columns = to_device_of(self.signs, strengths.reshape(-1))
         (weights,) = self.solver.path_of_signs(self.signs, [of_columns])

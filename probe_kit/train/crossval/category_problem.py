@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,7 +12,7 @@ from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.estimates.balanced import balanced_sums
 from probe_kit.statistics.estimates.shares import Accuracy
-from probe_kit.statistics.folds import fold_units, stratified_folds
+from probe_kit.statistics.folds import fold_numbers, fold_units, stratified_folds
 from probe_kit.statistics.label_permutations import exchange_groups, flip_groups, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.metrics import chance_level
@@ -48,6 +49,11 @@ class CategoryProblem:
     permuted_labels: NDArray[np.bool_]
     token_permutations: int
 
+    @cached_property
+    def fold_of(self) -> NDArray[np.int64]:
+        """(E,) outer fold that tests an episode."""
+        return fold_numbers([fold.outer for fold in self.folds])
+
     def probe(self, samples: Samples) -> SiteProbe:
         """Probe one site; `samples` are those of all the run's episodes."""
         drawn = self.permuted_labels if samples.pools else self.permuted_labels[:, : self.token_permutations]
@@ -62,10 +68,7 @@ class CategoryProblem:
 
         decisions: (E,) of one probe, or (K, E) of several, whose mean accuracy it is.
         """
-        fold_of = np.empty(self.labels.size, np.int64)
-        for number, fold in enumerate(self.folds):
-            fold_of[fold.outer.test] = number
-        sums = balanced_sums(np.atleast_2d(decisions), self.labels, fold_of, self.groups)
+        sums = balanced_sums(np.atleast_2d(decisions), self.labels, self.fold_of, self.groups)
         return Accuracy(np.unique(self.groups), sums.sums.mean(axis=0), sums.sizes)
 
 

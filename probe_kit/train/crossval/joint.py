@@ -15,7 +15,7 @@ from probe_kit.errors import TooFewGroupsError
 from probe_kit.train.crossval.joint_design import JointSite
 from probe_kit.train.crossval.joint_objective import JointProblems
 from probe_kit.train.crossval.metrics import log_loss, log_losses
-from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerLosses, Matrix, NestedFold, select_c
+from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerQuality, Matrix, NestedFold, select_c
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.backend import Array, array_namespace, to_numpy
 from probe_kit.train.solver.mixed_precision import solve
@@ -88,7 +88,7 @@ class _Columns:
     folds: Sequence[NestedFold]
 
     def fitted(self) -> list[FittedFold]:
-        chosen, starts, losses = self._chosen()
+        chosen, starts, quality = self._chosen()
         inner = len(self.site.sets.outer) - len(chosen)
         fold, column = (part.ravel() for part in np.indices(chosen.shape))
         problems = self._problems(inner + fold, column, STRENGTHS[chosen].ravel())
@@ -100,15 +100,15 @@ class _Columns:
                 decisions[number][:, nested.outer.test].T,
                 STRENGTHS[chosen[number]],
                 *first[number],
-                losses[number],
+                quality[number],
             )
             for number, nested in enumerate(self.folds)
         ]
 
-    def _chosen(self) -> tuple[NDArray[np.intp], Array, list[InnerLosses]]:
+    def _chosen(self) -> tuple[NDArray[np.intp], Array, list[InnerQuality]]:
         """(F, L) position of the chosen C by outer fold and column; (C, F, L, D + 1) weights to start from.
 
-        The weights are the mean of the inner folds'. Returns also the losses of every outer fold at its C.
+        The weights are the mean of the inner folds'. Returns also the inner quality of every outer fold.
         """
         sets = [(number, inner) for number, nested in enumerate(self.folds) for inner in nested.inner]
         of_fold = np.array([number for number, _ in sets])
@@ -123,11 +123,11 @@ class _Columns:
             starts.append([weights[of_fold == number].mean(axis=0) for number in range(len(self.folds))])
         xp = array_namespace(self.site.mean)
         chosen = select_c(loss)
-        losses = [
-            InnerLosses.of(loss[:, number], by_episode[:, number], chosen[number])
+        quality = [
+            InnerQuality.of(-loss[:, number], -by_episode[:, number], chosen[number])
             for number in range(len(self.folds))
         ]
-        return chosen, xp.stack([xp.stack(by_fold) for by_fold in starts]), losses
+        return chosen, xp.stack([xp.stack(by_fold) for by_fold in starts]), quality
 
     def _along_grid(self, sets: int) -> Iterator[tuple[Array, Matrix]]:
         """For each C, weights (S, L, D + 1) and decisions (S, L, E) of all inner folds, many at once."""
@@ -172,5 +172,5 @@ def _joined(parts: Sequence[FittedFold]) -> FittedFold:
     strengths = np.concatenate([part.strengths for part in parts])
     total = np.concatenate([part.inner.total for part in parts])
     first = parts[0]
-    inner = InnerLosses(total, first.inner.first)
+    inner = InnerQuality(total, first.inner.first)
     return FittedFold(decisions, strengths, first.weights, first.intercept, first.spread, inner)

@@ -49,28 +49,29 @@ def nested_folds(
 
 
 @dataclass(frozen=True)
-class InnerLosses:
-    """Log-losses of an outer fold's inner folds, each label column at the C that was chosen by them.
+class InnerQuality:
+    """Quality of an outer fold's inner predictions, each label column at the penalty that is best by it.
 
-    total: (K,) summed over the training episodes. first: (E,) the first column's by episode, 0 for the episodes
-    that the outer fold tests.
+    The larger the better: minus log-losses, minus squared errors, or shares of right classes. total: (K,) summed
+    over the training episodes. first: (E,) the first column's by episode, 0 for the episodes that the outer fold
+    tests.
     """
 
     total: Matrix
     first: Matrix
 
     @classmethod
-    def of(cls, loss: Matrix, by_episode: Matrix, chosen: NDArray[np.intp]) -> "InnerLosses":
-        """loss: (C, K) along the grid. by_episode: (C, E) of the first column. chosen: (K,) positions."""
-        return cls(np.take_along_axis(loss, chosen[None, :], 0)[0], by_episode[chosen[0]])
+    def of(cls, quality: Matrix, by_episode: Matrix, chosen: NDArray[np.intp]) -> "InnerQuality":
+        """quality: (C, K) along the grid. by_episode: (C, E) of the first column. chosen: (K,) positions."""
+        return cls(np.take_along_axis(quality, chosen[None, :], 0)[0], by_episode[chosen[0]])
 
 
 @dataclass(frozen=True)
 class FittedFold:
     """The probes of one outer fold.
 
-    decisions: (n, K) of its test episodes. strengths: (K,) the C chosen for each label column. inner: the inner
-    folds' losses at these C.
+    decisions: (n, K) of its test episodes. strengths: (K,) the C chosen for each label column. inner: the
+    quality of the inner folds' predictions at these C.
     weights (D,), intercept: the first column's probe on raw features, and the deviation (`spread`) of its
     training samples along them.
     """
@@ -80,11 +81,11 @@ class FittedFold:
     weights: Matrix
     intercept: float
     spread: float
-    inner: InnerLosses
+    inner: InnerQuality
 
     @classmethod
     def of(
-        cls, coordinates: Projection, weights: Array, decisions: Matrix, strengths: Matrix, inner: InnerLosses
+        cls, coordinates: Projection, weights: Array, decisions: Matrix, strengths: Matrix, inner: InnerQuality
     ) -> "FittedFold":
         """With the first column of `weights` (R, K), found in `coordinates`."""
         raw, intercept = coordinates.raw_weights(weights[:, 0])

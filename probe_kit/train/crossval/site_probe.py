@@ -14,7 +14,7 @@ from probe_kit.train.crossval.metrics import correctness, log_loss, log_losses
 from probe_kit.train.crossval.nested_folds import (
     STRENGTHS,
     FittedFold,
-    InnerLosses,
+    InnerQuality,
     Matrix,
     NestedFold,
     nested_folds,
@@ -80,7 +80,7 @@ def probe_site(
         intercepts=np.array([fold.intercept for fold in fitted]),
         spreads=np.array([fold.spread for fold in fitted]),
         null=correctness(decisions, columns)[:, 1:].mean(axis=0),
-        inner=-np.stack([fold.inner.first for fold in fitted]).astype(np.float32),
+        inner=np.stack([fold.inner.first for fold in fitted]).astype(np.float32),
     )
 
 
@@ -108,8 +108,10 @@ def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[Nest
     return [_fit_fold(samples, labels, f.outer, *choose_strengths(samples, labels, f.inner)) for f in folds]
 
 
-def choose_strengths(samples: Samples, labels: NDArray[np.bool_], folds: list[Fold]) -> tuple[Matrix, InnerLosses]:
-    """For each label column the C of the grid with the lowest held-out log-loss, and the losses there.
+def choose_strengths(
+    samples: Samples, labels: NDArray[np.bool_], folds: list[Fold]
+) -> tuple[Matrix, InnerQuality]:
+    """For each label column the C of the grid with the lowest held-out log-loss, and the quality there.
 
     The smaller C on ties.
     """
@@ -125,11 +127,11 @@ def choose_strengths(samples: Samples, labels: NDArray[np.bool_], folds: list[Fo
             loss[step] += log_loss(decisions, truth) * fold.test.size
             by_episode[step, fold.test] = log_losses(decisions[:, 0], truth[:, 0])
     chosen = select_c(loss)
-    return STRENGTHS[chosen], InnerLosses.of(loss, by_episode, chosen)
+    return STRENGTHS[chosen], InnerQuality.of(-loss, -by_episode, chosen)
 
 
 def _fit_fold(
-    samples: Samples, labels: NDArray[np.bool_], fold: Fold, strengths: Matrix, inner: InnerLosses
+    samples: Samples, labels: NDArray[np.bool_], fold: Fold, strengths: Matrix, inner: InnerQuality
 ) -> FittedFold:
     train = samples.of(fold.train)
     coordinates = Projection.fit(train.features)

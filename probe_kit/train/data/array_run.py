@@ -46,11 +46,12 @@ class ArrayRun:
     control_features: Mapping[str, NDArray[np.floating]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for (site, view), array in self.features.items():
+        arrays = {f"features of {site}, view {view!r},": array for (site, view), array in self.features.items()}
+        arrays |= {f"features of the control {name!r}": array for name, array in self.control_features.items()}
+        for what, array in arrays.items():
             if array.ndim != 2 or len(array) != len(self.episodes):
                 raise UsageError(
-                    f"features of {site}, view {view!r}, have shape {array.shape}; "
-                    f"expected ({len(self.episodes)}, D), one row per episode"
+                    f"{what} have shape {array.shape}; expected ({len(self.episodes)}, D), one row per episode"
                 )
 
     @property

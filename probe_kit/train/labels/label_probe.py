@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from probe_kit.statistics.folds import Fold
 from probe_kit.train.choices import Task
-from probe_kit.train.crossval.nested_folds import NestedFold
+from probe_kit.train.crossval.nested_folds import InnerQuality, NestedFold
 from probe_kit.train.crossval.site_probe import cross_validate
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.labels.task_scores import balanced_scores, explained_scores
@@ -54,7 +54,7 @@ def fit_label_probe(
     else:
         scores = balanced_scores(predictions, labels)
     above = np.stack([
-        one.above_permutations(place[1:], fold.outer.train) for one, fold in zip(inner, folds, strict=True)
+        _above_permutations(one, place[1:], fold.outer.train) for one, fold in zip(inner, folds, strict=True)
     ])  # fmt: skip
     return LabelProbe(predictions[:, 0], scores[:, 0], scores.mean(axis=0)[place[1:]], penalties, above)
 
@@ -70,26 +70,15 @@ def predict_once(
     return predictions[fold.outer.test, 0], float(penalties[0])
 
 
-@dataclass(frozen=True)
-class InnerQuality:
-    """Quality of an outer fold's inner predictions at the chosen penalties, the larger the better.
+def _above_permutations(inner: InnerQuality, columns: NDArray[np.intp], train: NDArray[np.intp]) -> Matrix:
+    """(n,) of the first column minus the mean over `columns`, of which every training sample bears a share.
 
-    total: (K,) of every label column, summed over its training samples. first: (n,) the first column's by sample;
-    0 for the samples that the outer fold tests.
+    Sites differ in what they reach with exchanged labels. Without permutations nothing is subtracted.
     """
-
-    total: Matrix
-    first: Matrix
-
-    def above_permutations(self, columns: NDArray[np.intp], train: NDArray[np.intp]) -> Matrix:
-        """(n,) `first` minus the mean over `columns`, of which every one of the training samples bears a share.
-
-        Sites differ in what they reach with exchanged labels. Without permutations nothing is subtracted.
-        """
-        found = self.first.copy()
-        if columns.size:
-            found[train] -= self.total[columns].mean() / train.size
-        return found
+    found = inner.first.copy()
+    if columns.size:
+        found[train] -= inner.total[columns].mean() / train.size
+    return found
 
 
 Fitted = tuple[Matrix, Matrix, list[InnerQuality]]
@@ -120,7 +109,7 @@ def _logistic(features: NDArray[np.floating], labels: Matrix, folds: list[Nested
         share = truth[fold.outer.train].mean(axis=0)
         predictions[fold.outer.test] = fitted.decisions > np.log(share / (1 - share))
         penalties.append(1 / fitted.strengths[0])
-        inner.append(InnerQuality(-fitted.inner.total, -fitted.inner.first))
+        inner.append(fitted.inner)
     return predictions, np.array(penalties), inner
 
 
@@ -174,8 +163,7 @@ def _nested(
             columns = np.flatnonzero(chosen == step)
             predictions[np.ix_(fold.outer.test, columns)] = predicted[:, columns]
         penalties.append(PENALTIES[chosen[0]])
-        total = np.take_along_axis(quality, chosen[None, :], 0)[0]
-        qualities.append(InnerQuality(total, by_sample[chosen[0]]))
+        qualities.append(InnerQuality.of(quality, by_sample, chosen))
     return predictions, np.array(penalties), qualities
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.folds import OUTER_FOLDS, stratified_folds
+from probe_kit.statistics.folds import OUTER_FOLDS, fold_numbers, stratified_folds
 from probe_kit.statistics.label_permutations import exchange_blocks, movable_share, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import Task
@@ -49,10 +49,7 @@ class LabelProblem:
     @cached_property
     def fold_of(self) -> NDArray[np.int64]:
         """(n,) outer fold that tests a sample."""
-        fold_of = np.empty(len(self.columns), np.int64)
-        for number, fold in enumerate(self.folds):
-            fold_of[fold.outer.test] = number
-        return fold_of
+        return fold_numbers([fold.outer for fold in self.folds])
 
     @property
     def smallest_p(self) -> float:

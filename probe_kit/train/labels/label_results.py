@@ -18,7 +18,7 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.student import explained_interval
 from probe_kit.train.choices import Task
 from probe_kit.train.labels.label_settings import LabelSettings
-from probe_kit.train.labels.task_scores import balanced_scores, class_weights, fold_spearman, squared_deviations
+from probe_kit.train.labels.task_scores import class_weights, fold_spearman, squared_deviations
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -210,9 +210,7 @@ class LabelResults:
         found: Matrix = np.empty(scores.size)
         for step in self.steps:
             at_step = self.places == step
-            truth = self.labels[at_step][:, None]
-            right = (scores[at_step] > 0)[:, None]
-            found[at_step] = balanced_scores(np.where(right, truth, truth + 1), truth)[:, 0]
+            found[at_step] = (scores[at_step] > 0) * class_weights(self.labels[at_step])
         return found
 
     def by_step(self, scores: Matrix) -> Matrix:

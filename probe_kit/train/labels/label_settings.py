@@ -10,7 +10,7 @@ from probe_kit.train.settings import LABEL_FORMAT, key_of
 class LabelSettings:
     """Everything that decides the numbers; its hash is the results' key, in one namespace with other probes.
 
-    seed_text: of the run, see `seed_text_of`; intervals are drawn by it.
+    seed_text: of the run, see `seed_text_of`; scores on equal groups of one are paired.
     label: sha256 of the label column. grouping: sha256 of the groups and strata of its samples. episodes: sha256
     of the ids of the run's episodes. categories: those whose episodes are probed together; empty for all.
     align_to: column of the event where windows begin, `#` and a part of its hash; empty for the first inference.

@@ -16,16 +16,17 @@ Matrix = NDArray[np.float64]
 
 def balanced_scores(predicted: Matrix, truth: Matrix) -> Matrix:
     """(n, K) scores of predicted classes (n, K); every column of truth (n, K) has each class as often."""
-    classes, counts = np.unique(truth[:, 0], return_counts=True)
-    share = (counts / len(truth))[np.searchsorted(classes, truth)]
-    scores: Matrix = (predicted == truth) / (classes.size * share)
+    scores: Matrix = (predicted == truth) * class_weights(truth)
     return scores
 
 
 def class_weights(labels: NDArray[np.floating]) -> Matrix:
-    """Return the (n,) weights 1 / (K π) of coded labels (n,), with K classes and the label's share π."""
-    classes, class_of, counts = np.unique(labels, return_inverse=True, return_counts=True)
-    weights: Matrix = (1 / (classes.size * (counts / labels.size)))[class_of]
+    """Return the weights 1 / (K π) of coded labels (n,), with K classes and the label's share π.
+
+    Also of (n, K) columns, each of which has each class as often.
+    """
+    classes, counts = np.unique(labels.reshape(len(labels), -1)[:, 0], return_counts=True)
+    weights: Matrix = (1 / (classes.size * (counts / len(labels))))[np.searchsorted(classes, labels)]
     return weights
 
 

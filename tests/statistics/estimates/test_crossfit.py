@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from probe_kit.errors import TooFewGroupsError, UsageError
 from probe_kit.statistics.estimates.balanced import GroupSums
-from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit, smoothing
-from tests.support.inner_qualities import stream_of
+from probe_kit.statistics.estimates.crossfit import Stream, crossfit, smoothing
+from tests.support.inner_qualities import fitted, stream_of
 
 LAYERS, ITERATIONS = np.tile(np.arange(4), 3), np.repeat(np.arange(3), 4)
 FOLDS = 5
@@ -27,14 +27,6 @@ def backbone(seed: int, top: float = 0.2, groups: int = 30) -> Stream:
 
 def expert(seed: int, top: float = 0.1, groups: int = 30) -> Stream:
     return stream_of(drawn(seed, np.full(12, 0.5 + top), groups), LAYERS, ITERATIONS)
-
-
-def names(groups: int) -> list[str]:
-    return [f"g{number:03d}" for number in range(groups)]
-
-
-def fitted(*streams: Stream, suite: str = "suite@1") -> CrossFit:
-    return crossfit(streams, names(streams[0].fold_of.size), suite)
 
 
 def test_a_site_that_stands_out_is_always_chosen_and_scored_by_the_outer_folds() -> None:

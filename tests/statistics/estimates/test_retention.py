@@ -5,15 +5,11 @@ from hypothesis import strategies as st
 from scipy.stats import t
 
 from probe_kit.statistics.estimates.balanced import GroupSums
-from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
+from probe_kit.statistics.estimates.crossfit import Stream
 from probe_kit.statistics.estimates.mover import NO_LIMITS, difference_interval
 from probe_kit.statistics.estimates.retention import Ratio, retention, retention_difference
 from probe_kit.statistics.estimates.scores import Scores
-from tests.support.inner_qualities import stream_of
-
-
-def fitted(*streams: Stream) -> CrossFit:
-    return crossfit(streams, [f"g{number:03d}" for number in range(streams[0].fold_of.size)])
+from tests.support.inner_qualities import fitted, stream_of
 
 
 def stream(seed: int, share: float, groups: int = 40, sites: int = 8) -> Stream:

@@ -4,13 +4,9 @@ from scipy.stats import t
 
 from probe_kit.errors import UsageError
 from probe_kit.statistics.estimates.balanced import GroupSums
-from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
+from probe_kit.statistics.estimates.crossfit import Stream
 from probe_kit.statistics.estimates.scores import Scores, accuracy_interval, t_quantile
-from tests.support.inner_qualities import stream_of
-
-
-def fitted(*streams: Stream) -> CrossFit:
-    return crossfit(streams, [f"g{number:03d}" for number in range(streams[0].fold_of.size)])
+from tests.support.inner_qualities import fitted, stream_of
 
 
 def stream(share: float, groups: int, seed: int = 0) -> Stream:

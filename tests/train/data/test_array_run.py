@@ -29,6 +29,14 @@ def test_a_row_per_episode_is_required(planted_run: PlantedRun, tmp_path: Path) 
         ArrayRun(tmp_path, "mine", "suite@1#0", planted_run().episodes, features)
 
 
+def test_a_row_per_episode_is_required_of_controls_too(planted_run: PlantedRun, tmp_path: Path) -> None:
+    controls = {"words": np.zeros((3, 4))}
+    with pytest.raises(
+        UsageError, match=r"features of the control 'words' have shape \(3, 4\); expected \(80, D\)"
+    ):
+        ArrayRun(tmp_path, "mine", "suite@1#0", planted_run().episodes, {}, control_features=controls)
+
+
 def test_a_missing_site_is_an_error(planted_run: PlantedRun) -> None:
     with pytest.raises(UnknownSiteError, match=r"backbone\.09\.residual"):
         planted_run().column(Site("backbone", 9), "mean")

@@ -53,6 +53,8 @@ class ControlInputs:
 
     def features(self, name: Name) -> Features:
         """(n, D) features of a control but `random-features`. Raises UsageError where the run lacks them."""
+        if name in (own := control_features(self.run)):
+            return own[name][self.samples.rows].astype(np.float32)
         if name == "step":
             return step_features(self.samples, self._frames())
         if name == "state":
@@ -61,8 +63,6 @@ class ControlInputs:
             return state_features(self.run, self.samples)
         if name == "action":
             return self._recorded("action")[:, 0].astype(np.float32)
-        if name in (own := control_features(self.run)):
-            return own[name][self.samples.rows].astype(np.float32)
         if name == "instruction":
             return word_counts(self.run)[self.samples.rows]
         return self._pixels(THUMBNAIL)
@@ -107,7 +107,7 @@ class ControlInputs:
 
 
 def control_features(run: RunReader) -> "Mapping[str, NDArray[np.floating]]":
-    """(E, D) features of controls that a run of arrays brings, by name."""
+    """(E, D) features of controls that a run of arrays brings, by name; built-in ones of that name give way."""
     found: Mapping[str, NDArray[np.floating]] = getattr(run, "control_features", {})
     return found
 
@@ -171,20 +171,19 @@ def prepare_controls(
     missing. folder: of the run's suite, see `suite_of`. Raises UsageError for a control that was asked for and is
     unknown or not possible, and what `suite_of` raises.
     """
-    known = (*control_features(run), *(name for name in LABEL_CONTROLS if name not in control_features(run)))
+    own = control_features(run)
+    known = (*own, *(name for name in LABEL_CONTROLS if name not in own))
     if unknown := [name for name in names or () if name not in known]:
         raise UsageError(f"control {unknown[0]!r} of a label; expected some of {', '.join(known)}")
     wanted = names if names is not None else [name for name in known if name not in NOT_BY_DEFAULT]
     asked = [cast(Name, name) for name in known if name in wanted]
-    impossible = {
-        name: why for name, why in _impossible(run, samples).items() if name not in control_features(run)
-    }
+    impossible = {name: why for name, why in _impossible(run, samples).items() if name not in own}
     if names is not None and (wrong := [name for name in asked if name in impossible]):
         raise UsageError(f"the control {wrong[0]!r} is not possible: {impossible[wrong[0]]}. Leave it out")
     left_out: dict[str, str] = {name: impossible[name] for name in asked if name in impossible}
     chosen = [name for name in asked if name not in impossible]
     suite = None
-    if PICTURED.intersection(chosen).difference(control_features(run)) and getattr(run, "inputs", None) is None:
+    if PICTURED.intersection(chosen).difference(own) and getattr(run, "inputs", None) is None:
         try:
             suite = suite_of(run, folder)
         except SuiteNotFoundError as error:
