@@ -24,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
+from probe_kit.retention.estimators.stream_scores import Rate
 from probe_kit.statistics.estimates.crossfit import CrossFit
 from probe_kit.statistics.estimates.retention import retention
 from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
@@ -90,8 +91,9 @@ def held(intervals: Sequence[Interval], truth: float) -> str:
 def score_rows(found: Study) -> Iterator[tuple[str, ...]]:
     """A row per stream: truth, bias, spread over draws against the claimed, coverage."""
     scores = [Scores.of(fit) for fit in found.fits]
-    means = [Scores.mean([scores[at] for at in chosen]) for chosen in twelves(len(scores))]
     for row, stream in enumerate(STREAMS):
+        rates = [Rate(0.5 + float(fit.above[row]), accuracy_interval(fit, row)) for fit in found.fits]
+        means = [Rate.mean([rates[at] for at in chosen]) for chosen in twelves(len(rates))]
         truth, above = float(found.truth[row]), found.above[:, row]
         bias = "" if truth else f"{100 * above.mean():+.1f} ± {100 * above.std(ddof=1) / len(above) ** 0.5:.1f}"
         claimed = np.sqrt(np.mean([one.covariance[row, row] for one in scores]))
@@ -102,8 +104,8 @@ def score_rows(found: Study) -> Iterator[tuple[str, ...]]:
             bias,
             f"{100 * above.std(ddof=1):.1f}",
             f"{100 * claimed:.1f}",
-            held([accuracy_interval(fit, row) for fit in found.fits], 0.5 + truth),
-            held([one.accuracy_interval(row) for one in means], 0.5 + truth),
+            held([rate.interval for rate in rates], 0.5 + truth),
+            held([mean.interval for mean in means], 0.5 + truth),
         )
 
 

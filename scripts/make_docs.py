@@ -22,7 +22,6 @@ from probe_kit.demo.organisms import TRAINED, Finding, NamedProgress
 from probe_kit.demo.pipeline import FULL, QUICK, Demo, Size, compare_organisms, run_demo
 from probe_kit.retention.columns.sentences import verdict
 from probe_kit.retention.report import write_report
-from probe_kit.retention.rows.row import MEAN
 
 SAMPLE = "sample-report.html"
 SAMPLE_PICTURES = 80
@@ -53,8 +52,10 @@ def main() -> None:
 
 
 def _of_trained(made: Demo) -> list[Finding]:
-    rows = [row for row in made.table.rows if row.category != MEAN and row.run.mode == "acts"]
-    return [Finding(TRAINED.name, row.category, TRAINED.expected(row.category), verdict(row), row) for row in rows]
+    return [
+        Finding(TRAINED.name, row.category, TRAINED.expected(row.category), verdict(row), row)
+        for row in made.acted
+    ]
 
 
 def _compared(folder: Path, stage: NamedProgress) -> dict[str, Any]:

@@ -54,4 +54,5 @@ def print_demo(made: "Demo") -> None:
     out.print()
     out.print(made.table.to_rich())
     out.print()
+    out.print(made.finding())
     out.print(made.viewer(), soft_wrap=True)

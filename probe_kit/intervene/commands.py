@@ -109,7 +109,7 @@ def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "I
     if few:
         counts = ", ".join(f"{name} has {count}" for name, count in few.items())
         needed = groups_for_not_used()
-        say(marked("[yellow]note:[/] the verdict *not used* needs {} groups of items; {}", needed, counts))
+        say(marked("[yellow]note:[/] the verdict “not used” needs {} groups of items; {}", needed, counts))
     unread = () if was_stored else unread_sites(run, intervention)
     if unread:
         say(marked("[yellow]note:[/] {}", unread_note(unread)))

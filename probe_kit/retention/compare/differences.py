@@ -314,7 +314,7 @@ def _row(
 
 def _mean_rate(found: Sequence[Rate | None]) -> Rate | None:
     known = [rate for rate in found if rate is not None]
-    return Rate.mean([rate.value for rate in known], [rate.interval for rate in known]) if known else None
+    return Rate.mean(known) if known else None
 
 
 def _retention(gaps: Sequence[_Gap]) -> Ratio | None:

@@ -161,7 +161,7 @@ def _same_frames(here: "pd.DataFrame", there: "pd.DataFrame") -> bool | None:
 def _mean(pairs: Sequence[_Episodes], rows: Sequence[VlmVlaDifference], gaps: Sequence[Rate]) -> VlmVlaDifference:
     import pandas as pd
 
-    gap = Rate.mean([one.value for one in gaps], [one.interval for one in gaps])
+    gap = Rate.mean(gaps)
     paired = all(row.paired for row in rows)
     known = [row.of_items for row in rows if row.of_items is not None]
     return replace(

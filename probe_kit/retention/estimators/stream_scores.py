@@ -109,12 +109,13 @@ class Rate:
             sums, sizes = ([getattr(one, name) for one in shares] for name in ("sums", "sizes"))
             both = Share(first.groups, np.mean(sums, axis=0), np.mean(sizes, axis=0))
             return cls(both.value, both.interval(), both)
-        return cls.mean([one.value for one in shares], [one.interval() for one in shares])
+        return cls.mean([cls(share.value, share.interval()) for share in shares])
 
     @classmethod
-    def mean(cls, values: Sequence[float], intervals: Sequence[Interval]) -> "Rate":
-        """The mean of independent shares."""
-        return cls(float(np.mean(values)), mean_interval(values, intervals))
+    def mean(cls, rates: Sequence["Rate"]) -> "Rate":
+        """The mean of independent shares or accuracies. Raises UsageError without any."""
+        values = [rate.value for rate in rates]
+        return cls(float(np.mean(values)), mean_interval(values, [rate.interval for rate in rates]))
 
     def minus(self, other: "Rate") -> "Rate":
         """The difference, paired where both are of the same groups."""
@@ -133,10 +134,14 @@ class Rate:
 
 @dataclass(frozen=True)
 class PooledScores:
-    """Scores of one or more runs in one category. fit: their mean on common groups, None on other groups."""
+    """Scores of one or more runs in one category.
+
+    accuracies: of the chosen sites, in the order of `names`. fit: the runs' mean on common groups, None on others.
+    """
 
     names: tuple[str, ...]
     scores: Scores
+    accuracies: tuple[Rate, ...]
     fit: CrossFit | None
 
     @classmethod
@@ -147,18 +152,17 @@ class PooledScores:
             return None
         fits = [_only(run, names) for run in runs]
         if not all(fit.shares_groups_with(fits[0]) for fit in fits):
-            return cls(names, Scores.mean([Scores.of(fit) for fit in fits]), None)
+            means = tuple(map(Rate.mean, zip(*map(_rates, fits), strict=True)))
+            return cls(names, Scores.mean([Scores.of(fit) for fit in fits]), means, None)
         above, peaks, influence = (
             np.mean([getattr(fit, part) for fit in fits], axis=0) for part in ("above", "peaks", "influence")
         )
         fit = replace(fits[0], above=above, peaks=peaks, influence=influence)
-        return cls(names, Scores.of(fit), fit)
+        return cls(names, Scores.of(fit), _rates(fit), fit)
 
     def accuracy(self, name: str) -> Rate:
         """Accuracy of a stream's chosen site with its interval."""
-        row = self.names.index(name)
-        interval = self.scores.accuracy_interval(row) if self.fit is None else accuracy_interval(self.fit, row)
-        return Rate(CHANCE + float(self.scores.above[row]), interval)
+        return self.accuracies[self.names.index(name)]
 
     def shares_groups_with(self, other: "PooledScores") -> bool:
         """Whether both are of the same groups of one suite."""
@@ -187,6 +191,11 @@ class PooledScores:
         related = correlation_of(float(self.covariance_with(other)[row, column]), variances)
         gap = difference_interval(here.value, here.interval, there.value, there.interval, related)
         return Rate(here.value - there.value, gap)
+
+
+def _rates(fit: CrossFit) -> tuple[Rate, ...]:
+    """The accuracies of all streams."""
+    return tuple(Rate(CHANCE + float(above), accuracy_interval(fit, row)) for row, above in enumerate(fit.above))
 
 
 def _only(run: StreamScores, names: Sequence[str]) -> CrossFit:

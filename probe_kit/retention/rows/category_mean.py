@@ -69,10 +69,8 @@ def _probed(estimates: Sequence[RowEstimates]) -> list[StreamScores]:
 def _accuracy_limits(probed: Sequence[StreamScores], name: str) -> Limits | None:
     if not probed or name not in probed[0].names:
         return None
-    if len(probed) == 1:
-        return limits(probed[0].interval(name))
-    mean = Scores.mean([streams.scores for streams in probed])
-    return limits(mean.accuracy_interval(probed[0].names.index(name)))
+    accuracies = [Rate(streams.accuracy(name), streams.interval(name)) for streams in probed]
+    return limits(Rate.mean(accuracies).interval)
 
 
 _PARTS = ("success", "rules", "answers", "backbone", "action", "controls", "image_swap")
@@ -145,7 +143,7 @@ def _rate_limits(estimates: Sequence[RowEstimates], name: str) -> Limits | None:
     shares = [one.rates[name] for one in estimates if name in one.rates]
     if not shares:
         return None
-    return limits(Rate.mean([one.value for one in shares], [one.interval() for one in shares]).interval)
+    return limits(Rate.mean([Rate(share.value, share.interval()) for share in shares]).interval)
 
 
 def _mean(rows: Sequence[RetentionRow], path: str) -> Any:

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import sqrt
 
 import numpy as np
 
@@ -28,21 +27,20 @@ class Scores:
 
     @classmethod
     def mean(cls, parts: Sequence["Scores"]) -> "Scores":
-        """Means over categories that share no group: the covariances' sum over n², degrees of freedom added.
+        """Means over categories that share no group: the covariances' sum over n².
 
-        Raises UsageError without categories.
+        Degrees of freedom are (Σ v)² / Σ (v² / df), with v the sum of a category's variances (Satterthwaite, “An
+        approximate distribution of estimates of variance components”, Biometrics Bulletin 2, 1946): a category
+        that varies more than all others is known no better for them. Raises UsageError without categories.
         """
         if not parts:
             raise UsageError("the mean of no categories; expected at least one")
         above = np.mean([part.above for part in parts], axis=0)
         covariance = np.sum([part.covariance for part in parts], axis=0) / len(parts) ** 2
-        return cls(above, covariance, sum(part.df for part in parts))
-
-    def accuracy_interval(self, row: int) -> Interval:
-        """Student's 95 % interval of the accuracy, ½ + score, for means over categories; within 0 … 1."""
-        spread = t_quantile(self.df) * sqrt(self.covariance[row, row])
-        accuracy = CHANCE + float(self.above[row])
-        return Interval(max(0.0, accuracy - spread), min(1.0, accuracy + spread))
+        df = np.array([part.df for part in parts], np.float64)
+        spread = np.array([np.trace(part.covariance) for part in parts])
+        varies = spread.sum() > 0
+        return cls(above, covariance, float(spread.sum() ** 2 / (spread**2 / df).sum() if varies else df.sum()))
 
 
 def accuracy_interval(fit: CrossFit, row: int) -> Interval:

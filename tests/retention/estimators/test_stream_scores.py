@@ -95,7 +95,7 @@ def test_runs_on_other_groups_are_independent() -> None:
 
 def test_the_mean_of_one_rate_is_that_rate() -> None:
     one = Rate.pooled([share([2, 0, 1, 2] * 5)])
-    mean = Rate.mean([one.value], [one.interval])
+    mean = Rate.mean([one])
     assert (mean.value, *as_pair(mean.interval)) == pytest.approx((one.value, *as_pair(one.interval)))
 
 
@@ -133,6 +133,14 @@ def test_rates_of_other_groups_are_not_paired_and_their_difference_is_wider() ->
     paired, apart = one.minus(same), one.minus(other)
     assert paired.value == apart.value
     assert np.diff(as_pair(paired.interval))[0] < 0.7 * np.diff(as_pair(apart.interval))[0]
+
+
+def test_a_mean_is_known_no_better_than_one_of_its_parts_allows() -> None:
+    """Two that are known exactly: the interval of the third is a third as wide in their mean."""
+    known, open_ = Rate(1.0, Interval(1.0, 1.0)), Rate(0.5, Interval(0.19, 0.81))
+    assert as_pair(Rate.mean([known, known, open_]).interval) == pytest.approx(
+        (2.5 / 3 - 0.31 / 3, 2.5 / 3 + 0.31 / 3)
+    )
 
 
 def test_groups_of_two_suites_are_not_the_same(outcome_table: Outcomes) -> None:
@@ -224,8 +232,9 @@ def test_runs_on_other_groups_are_pooled_as_independent(scored: Callable[..., St
     V = (one.scores.covariance + other.scores.covariance) / 4
     np.testing.assert_allclose(found.scores.covariance, V)
     rate = found.accuracy("backbone")
-    spread = stats.t.ppf(0.975, 59 + 59) * sqrt(V[1, 1])
-    assert as_pair(rate.interval) == pytest.approx((0.9 - spread, min(1, 0.9 + spread)))
+    arms = np.array([np.abs(np.subtract(as_pair(run.interval("backbone")), 0.9)) for run in (one, other)])
+    below, above = np.sqrt((arms**2).sum(axis=0)) / 2
+    assert as_pair(rate.interval) == pytest.approx((0.9 - below, 0.9 + above))
     assert (found.covariance_with(pooled(one)) == 0).all()
 
 

@@ -14,7 +14,7 @@ def stream(share: float, groups: int, seed: int = 0) -> Stream:
     return stream_of(GroupSums(sums, np.full(groups, 4.0)), np.arange(6))
 
 
-def test_a_mean_over_categories_adds_variances_and_degrees_of_freedom() -> None:
+def test_a_mean_over_categories_adds_variances_and_has_satterthwaites_degrees_of_freedom() -> None:
     parts = [
         Scores(np.array([0.1, 0.2]), np.array([[0.01, 0.002], [0.002, 0.03]]), 11),
         Scores(np.array([0.3, 0.4]), np.array([[0.03, 0.006], [0.006, 0.05]]), 23),
@@ -22,7 +22,7 @@ def test_a_mean_over_categories_adds_variances_and_degrees_of_freedom() -> None:
     mean = Scores.mean(parts)
     np.testing.assert_allclose(mean.above, [0.2, 0.3])
     np.testing.assert_allclose(mean.covariance, [[0.01, 0.002], [0.002, 0.02]])
-    assert mean.df == 34
+    assert mean.df == pytest.approx(0.12**2 / (0.04**2 / 11 + 0.08**2 / 23))
 
 
 def test_the_mean_of_one_category_is_that_category() -> None:
@@ -33,11 +33,11 @@ def test_the_mean_of_one_category_is_that_category() -> None:
     assert mean.df == one.df == 19
 
 
-def test_a_mean_accuracy_has_students_interval_within_zero_and_one() -> None:
-    scores = Scores(np.array([0.2, 0.49]), np.diag([0.0004, 0.01]), 30)
-    found = scores.accuracy_interval(0)
-    assert (found.low, found.high) == pytest.approx(t(30, 0.7, 0.02).interval(0.95))
-    assert scores.accuracy_interval(1).high == 1.0
+def test_a_category_that_varies_most_is_known_no_better_for_the_others() -> None:
+    loose, tight = (Scores(np.zeros(2), np.eye(2) * variance, 5) for variance in (0.01, 1e-6))
+    assert Scores.mean([loose, tight, tight]).df == pytest.approx(5, rel=1e-3)
+    assert Scores.mean([loose, loose, loose]).df == pytest.approx(15)
+    assert Scores.mean([Scores(np.zeros(2), np.zeros((2, 2)), 5)] * 2).df == 10
 
 
 def test_a_perfect_site_is_known_as_well_as_its_groups_allow() -> None:

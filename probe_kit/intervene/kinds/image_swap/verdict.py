@@ -286,7 +286,7 @@ def _open(found: ImageSwapEffect) -> str:
             "opposite directions, or the items are too few"
         )
     needed = groups_for_not_used()
-    too_few = f"; *not used* needs {needed} groups of items, there are {found.n_groups}"
+    too_few = f"; “not used” needs {needed} groups of items, there are {found.n_groups}"
     return f"{_measured(found)}{too_few * (found.n_groups < needed)}"
 
 
