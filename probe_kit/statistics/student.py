@@ -58,7 +58,7 @@ def explained_interval(
     if missing <= 0:
         return 1.0, 1.0
     relative = deviations / varying if varying > 0 else np.ones(scores.size)
-    rest = np.bincount(group_of, (1 - scores) - missing * relative)
+    rest = np.asarray(np.bincount(group_of, (1 - scores) - missing * relative), dtype=np.float64)
     reach = _reach(rest, scores.size) * widening / missing
     low, high = 1 - missing * exp(min(reach, 100.0)), 1 - missing * exp(-reach)
     # The subtractions round: around a score of -5e-17, the limits of groups that all agree would both be 0.

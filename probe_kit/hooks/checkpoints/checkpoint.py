@@ -24,7 +24,7 @@ _CONFIGURATIONS = ("*config*.json", "dims.json", "*.yaml", "*.yml")
 PATTERNS = ("*.json", "*.safetensors", "*.model", "*.txt", "*.jinja")
 SMALL_FILES = ("*.json", "*.model", "*.txt", "*.jinja", "adapter_model.safetensors")
 """Those of them that hold no weights, but for an adapter's."""
-_COMMIT_DIGITS = 40
+COMMIT_DIGITS = 40
 """Of a commit's full name."""
 RUN_WEIGHTS = "checkpoints/latest-checkpoint.pt"
 """Where a folder of a training run of Prismatic keeps its weights."""
@@ -84,7 +84,7 @@ def _snapshot(named: HubName) -> Path | None:
     """The cache's folder of a revision's commit, by which it is called; None where it has none."""
     cache, commit = _cache_of(named.repository), named.revision or "main"
     snapshots = cache / "snapshots"
-    if len(commit) != _COMMIT_DIGITS or not (snapshots / commit).is_dir():
+    if len(commit) != COMMIT_DIGITS or not (snapshots / commit).is_dir():
         ref = cache / "refs" / commit
         commit = read_regular_text(ref).strip() if ref.is_file() else ""
     return snapshots / commit if commit and (snapshots / commit).is_dir() else None

@@ -56,7 +56,8 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
         tensor = torch.from_numpy(square).permute(2, 0, 1)
         target, crop = list(self.image_target_size or ()), list(self.image_crop_size or ())
         cut = functional.center_crop(functional.resize(tensor, target), crop)
-        return functional.resize(cut, target)
+        resized: Tensor = functional.resize(cut, target)
+        return resized
 
     def _by_area(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Resized, cut, and resized again."""
