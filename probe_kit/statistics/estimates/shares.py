@@ -146,9 +146,9 @@ def effective_groups(sizes: Matrix) -> float:
 def effective_episodes(
     shares: ArrayLike, variances: ArrayLike, n_episodes: float
 ) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
-    The second is E over the design effect (Kish 1965). It has no meaning where all groups agree.
+    """Return shares s within [0, 1], min(s (1 − s) / v, E), and whether all groups agree; arrays of one shape.
 
-    The second is E over the design effect (Kish 1965). It says nothing where all groups agree.
+    The second is E over the design effect (Kish 1965). It has no meaning where all groups agree.
     """
     s, v = np.broadcast_arrays(np.asarray(shares, np.float64).clip(0, 1), variances)
     agree = (v <= NEGLIGIBLE_VARIANCE) | (s <= 0) | (s >= 1)
