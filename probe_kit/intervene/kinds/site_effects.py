@@ -39,7 +39,7 @@ class PatchEffect(EffectRow):
 
     net: share of episodes whose action flips to the target side, minus those that flip away from it; net_left,
     net_right: the same by target side. coefficient: of steering, else empty. effect: share of what the whole image
-    swap does to where the action goes, with its 95 % interval by groups; None if that does nothing, so that a
+    swap does to where the action goes, toward the target side, with its 95 % interval by groups; None if that does nothing, so that a
     share would be a ratio of noise. mean_displacement, control_displacement: metres toward the target side, of the
     edit and of its matched controls. t, p, p_fwe: of the displacement beyond the controls', one-sided, by sign
     flips of whole groups, of an interchange in the direction of the swap itself; p_fwe against the largest t of
@@ -62,6 +62,17 @@ class PatchEffect(EffectRow):
         """Whether it carries half of the effect, beyond chance among all that was tried."""
         enough = self.effect is not None and self.effect >= LOCALISATION_SHARE
         return enough and self.p_fwe is not None and self.p_fwe < SIGNIFICANCE
+
+    @property
+    def moves_action(self) -> bool:
+        """Whether it moves the action to the target side beyond chance, and by the smallest reach of a policy."""
+        beyond = self.p_fwe is not None and self.p_fwe < SIGNIFICANCE
+        return beyond and self.mean_displacement >= SMALLEST_REACH
+
+    @property
+    def is_dose(self) -> bool:
+        """Whether it is a steering by more than nothing."""
+        return self.coefficient not in ("", "0")
 
     @property
     def is_by_construction(self) -> bool:
@@ -113,7 +124,8 @@ def steering_notes(rows: Sequence[PatchEffect], _: Measurement) -> list[str]:
 
 def _unmoved_by_one_vector(rows: Sequence[PatchEffect]) -> list[str]:
     """Categories in which steering along a direction of the tokens' mean moves no action by a smallest reach."""
-    pooled = [row for row in rows if row.coefficient not in ("", "0") and ":" not in row.direction]
+    edits = [row for row in rows if row.is_dose and not row.is_control]
+    pooled = [row for row in edits if ":" not in row.direction]
     moved = {row.category for row in pooled if abs(row.mean_displacement) >= SMALLEST_REACH}
     return [name for name in dict.fromkeys(row.category for row in pooled) if name not in moved]
 
@@ -140,7 +152,8 @@ def _of_category(
     found = []
     for at, (row, name, test) in enumerate(zip(rows, names, tests, strict=True)):
         flips = _flips(push, clean, outcomes.displacement[row])
-        share = share_of_swap(outcomes, outcomes.displacement[row] - clean, seed_text)
+        # The swap moves actions to the wrong side; steering to another side is compared with its size.
+        share = share_of_swap(outcomes, -outcomes.correct_sign * displacements[at], seed_text)
         columns: dict[str, Any] = common_columns(outcomes, row, name)
         found.append(
             PatchEffect(

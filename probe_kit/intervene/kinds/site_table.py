@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from probe_kit.intervene.kinds.base import TableContext, by_category, count_edits
+from probe_kit.intervene.kinds.reach import SMALLEST_REACH
 from probe_kit.intervene.kinds.site_effects import PatchEffect
-from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite.categories import category_of
 
 if TYPE_CHECKING:
@@ -55,16 +55,18 @@ def site_sentences(rows: Sequence[PatchEffect], _: TableContext) -> list[str]:
 
 
 def _finding(rows: Sequence[PatchEffect]) -> str:
-    if all(row.effect is None for row in rows):
-        moved = [row for row in rows if row.p_fwe is not None and row.p_fwe < SIGNIFICANCE]
-        moved = sorted(moved, key=lambda row: -row.mean_displacement)
+    edits = [row for row in rows if row.coefficient != "0"]
+    if all(row.effect is None for row in edits):
+        moved = sorted((row for row in edits if row.moves_action), key=lambda row: -row.mean_displacement)
         named = [f"{row.name} {100 * row.mean_displacement:+.1f} cm" for row in moved]
         return (
-            f"edits that move the action to the target side beyond their controls: {count_edits(named, len(rows))}"
+            f"edits that move the action at least {100 * SMALLEST_REACH:g} cm to the target side, beyond their "
+            f"controls: {count_edits(named, len(edits))}"
         )
-    found = sorted((row for row in rows if row.is_localised), key=lambda row: -(row.effect or 0.0))
+    found = sorted((row for row in edits if row.is_localised), key=lambda row: -(row.effect or 0.0))
     named = [f"{row.name} {row.effect:.2f}" for row in found]
-    return f"edits that carry half of the image swap's effect: {count_edits(named, len(rows))}"
+    verb = "have" if any(row.is_dose for row in edits) else "carry"
+    return f"edits that {verb} half of the image swap's effect: {count_edits(named, len(edits))}"
 
 
 def _cells(row: PatchEffect) -> "tuple[Cell, ...]":

@@ -1,6 +1,7 @@
 """The sentence of each kind of intervention about a category."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 import pytest
@@ -84,7 +85,9 @@ def patch(place: str, effect: float | None, p: float, centimetres: float = 3.0) 
     )  # fmt: skip
 
 
-CARRY, MOVE = "edits that carry half of the image swap's effect", "edits that move the action to the target side"
+CARRY = "edits that carry half of the image swap's effect"
+MOVE = "edits that move the action at least 2 cm to the target side, beyond their controls"
+HAVE = "edits that have half of the image swap's effect"
 
 
 @pytest.mark.parametrize(
@@ -97,12 +100,17 @@ CARRY, MOVE = "edits that carry half of the image swap's effect", "edits that mo
         ([patch("backbone.01", 0.2, 0.001)], f"{CARRY}: none of 1."),
         (
             [patch("backbone.01", None, 0.001), patch("backbone.02", None, 0.2)],
-            f"{MOVE} beyond their controls: 1 of 2 (backbone.01 image +3.0 cm).",
+            f"{MOVE}: 1 of 2 (backbone.01 image +3.0 cm).",
         ),
-        ([patch("backbone.01", None, 0.5)], f"{MOVE} beyond their controls: none of 1."),
+        ([patch("backbone.01", None, 0.5)], f"{MOVE}: none of 1."),
+        ([patch("backbone.01", None, 0.001, 0.004)], f"{MOVE}: none of 1."),
         (
             [patch(f"kv.{at:02d}", 0.9, 0.001) for at in range(5)],
             f"{CARRY}: 5 of 5 (kv.00 image 0.90, kv.01 image 0.90, kv.02 image 0.90 and 2 more).",
+        ),
+        (
+            [replace(patch("backbone.02", share, 0.001), coefficient=dose) for dose, share in (("0", 0.0), ("2", 0.9))],
+            f"{HAVE}: 1 of 1 (backbone.02 image coefficient 2 0.90).",
         ),
     ],
 )

@@ -1,15 +1,16 @@
 """What passes where: shares of the effect, tests over all places, controls."""
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from probe_kit.intervene import ConditionOutcomes, PatchEffect, classify_use
-from probe_kit.intervene.kinds.base import ConditionName
+from probe_kit.intervene.kinds.base import ConditionName, Measurement
 from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
 from probe_kit.intervene.kinds.image_swap.verdict import Places
-from probe_kit.intervene.kinds.site_effects import patch_effects
+from probe_kit.intervene.kinds.site_effects import patch_effects, steering_notes, target_sign
 from probe_kit.intervene.results.site_maps import localised_sites
 from tests.intervene.answers import follower, habit, outcomes_of
 
@@ -52,6 +53,28 @@ def test_what_carries_it_in_every_policy_locates_nothing() -> None:
     rows = rows_of(with_changes((plain, exchanged), **{f"{place}__all": exchanged for place in places}))
     assert all(row.is_localised for row in rows.values())
     assert localised_sites(list(rows.values())) == ("backbone.01", "kv.00")
+
+
+@pytest.mark.parametrize("target_side", ["wrong", "left", "right", "correct"])
+def test_a_steering_is_a_share_of_the_swap_whichever_side_it_pushes_to(target_side: str) -> None:
+    plain, exchanged = follower(48)
+    made = with_changes((plain, exchanged), a__image__mean_difference__2=exchanged)
+    # Every action moves by half of the swap's 0.2 m, toward the side that is pushed to.
+    pushed = made.of("clean") + 0.1 * target_sign(made, target_side)
+    displacement = np.vstack([made.displacement[:2], pushed])
+    (row,) = patch_effects(replace(made, displacement=displacement), SUITE, target_side)
+    assert row.effect == pytest.approx(0.5)
+    assert row.mean_displacement == pytest.approx(0.1)
+
+
+def test_the_note_about_one_vector_is_of_steering_along_one_and_not_of_its_controls() -> None:
+    plain, exchanged = follower(48)
+    still = {f"a__image__{name}__2": plain for name in ("mean_difference:1", "control_1")}
+    along_tokens = patch_effects(with_changes((plain, exchanged), **still), SUITE)
+    assert steering_notes(along_tokens, cast("Measurement", None)) == []
+    in_all = patch_effects(with_changes((plain, exchanged), a__image__mean_difference__2=plain), SUITE)
+    (note,) = steering_notes(in_all, cast("Measurement", None))
+    assert note.startswith("color: one vector that is added to every token moves no action")
 
 
 def test_shares_of_nothing_are_not_given() -> None:

@@ -128,6 +128,7 @@ def test_steering_by_nothing_changes_nothing_and_controls_move_as_far(
     assert control["change"] == pytest.approx(own["change"], rel=1e-4)
     assert own["largest_change"] == pytest.approx(own["change"], rel=0.5)
     assert {row.coefficient for row in effects.effects} == {"0", "2"}
+    assert "image_swap" in effects.outcomes.conditions, "the effect is a share of the swap"
 
 
 # -- along what ----------------------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ from probe_kit.intervene.replay.conditions import (
     Condition,
     ConditionContext,
     ConditionResult,
+    ImagesSwapped,
     Intervention,
 )
 from probe_kit.intervene.replay.image_tokens import TILES, role_tokens
@@ -103,7 +104,9 @@ class Steering(Intervention):
         }  # fmt: skip
 
     def conditions(self, session: ReplaySession) -> Sequence[Condition]:
-        """Clean, then every place at every coefficient, with its controls.
+        """Clean, images swapped, then every place at every coefficient, with its controls.
+
+        The swap is the unit of the effect: a steering is a share of what it does.
 
         Raises UnknownSiteError, and NoDirectionError for a named place without a direction.
         """
@@ -112,7 +115,7 @@ class Steering(Intervention):
         fitted = fit_token_directions(
             session, items, wanted, self.direction, self.controls, self.seed, PassedOver(session, self.sites)
         )
-        conditions: list[Condition] = [CleanRun()]
+        conditions: list[Condition] = [CleanRun(), ImagesSwapped()]
         for (place, _), axes in fitted.items():
             conditions.append(Steered(place, self.role, self.direction, 0.0, self.target_side, axes))
             conditions += [
