@@ -46,9 +46,9 @@ def show_stages(
     policy = open_run(runs[1]).in_wording(wording)
     try:
         results = load_results(policy, key)
-    except NoProbesError:
+    except NoProbesError as error:
         if view is not None:
-            raise UsageError(f"--views {view}: {runs[1]} has no probes. Run `probe-kit train {runs[1]}`") from None
+            raise UsageError(f"--views {view}: {error}") from None
         results = None
     joined = match_runs(vlm, policy, results, view)
     if as_json:

@@ -9,16 +9,23 @@ from probe_kit.retention.columns.text import difference_interval, number, percen
 from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.origins import checkpoint_of, split_checkpoint
 from probe_kit.retention.formats.numbers_table import NumbersTable
-from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
 
 STEP = "step"
-_NOTE = (
-    "step: of the training; success: the cube ends on the correct picture; drift: the backbone's accuracy minus "
-    "that of the first step, paired by items where both ran the same; each with its 95 % interval"
-)
+_COLUMNS = {
+    "category": "",
+    "step": "step: of the training",
+    "success %": "success: the cube ends on the correct picture",
+    "backbone %": "backbone: accuracy of probes in the backbone",
+    "action %": "action: the same at the action's sites",
+    "retention": "retention: share of the backbone's signal left in the action",
+    "drift of the backbone, points": "drift: the backbone's accuracy minus that of the first step, paired by "
+    "items where both ran the same",
+}
+"""The meaning of each column, which the note gives of those that are shown."""
 
 
 def training_step(run: RunReader) -> int:
@@ -70,29 +77,36 @@ def step_table(table: RetentionTable, steps: Mapping[str, int]) -> NumbersTable:
     first: dict[str, str | None] = {}
     rows = [row for row in table.all_rows if first.setdefault(row.run.location, row.view) == row.view]
     drifts = {(gap.run, gap.category): gap for gap in table.differences if gap.view in (*first.values(), None)}
-    names = list(dict.fromkeys(row.category for row in rows))
+    names = sorted(dict.fromkeys(row.category for row in rows), key=lambda name: name == MEAN)
     ordered = sorted(rows, key=lambda row: (names.index(row.category), steps[row.run.location]))
     numbers = [_numbers(row, steps, drifts) for row in ordered]
-    columns = (
-        "category",
-        "step",
-        "success %",
-        "backbone %",
-        "action %",
-        "retention",
-        "drift of the backbone, points",
-    )
+    columns = tuple(_COLUMNS)
     cells = tuple(_cells(one) for one in numbers)
-    shown = [at for at in range(len(columns)) if at < 2 or any(line[at] != "–" for line in cells)]
-    view = next((row.view for row in rows if row.view is not None), None)
+    shown = [at for at in range(len(columns)) if at < 2 or any(line[at] not in ("–", "n/a") for line in cells)]
+    means = [row for row in ordered if row.category == MEAN]
+    views = {steps[row.run.location]: row.view for row in means if row.view is not None}
+    notes = [
+        *(_COLUMNS[columns[at]] for at in shown if _COLUMNS[columns[at]]),
+        "each with its 95 % interval",
+        _by_step("view", {step: str(view) for step, view in views.items()}),
+        _by_step("mean over", {steps[row.run.location]: ", ".join(map(spell, row.categories)) for row in means}),
+    ]
     text = TextTable(
         "Training steps",
-        _NOTE + ("" if view is None else f"; view {view}"),
+        "; ".join(filter(None, notes)),
         tuple(columns[at] for at in shown),
         tuple(tuple(line[at] for at in shown) for line in cells),
         names=2,
     )
     return NumbersTable(text, tuple(numbers))
+
+
+def _by_step(name: str, values: Mapping[int, str]) -> str:
+    """Return `name` with the value that all steps share, or with the value of each step."""
+    if len(set(values.values())) > 1:
+        each = ", ".join(f"{value} (step {step})" for step, value in values.items())
+        return f"{name} {each}"
+    return f"{name} {next(iter(values.values()))}" if values else ""
 
 
 def _numbers(

@@ -18,6 +18,7 @@ from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.store import how_to_probe
 from probe_kit.view.frozen_probes import FrozenProbes, Values, count_inferences
 
 UNREAD = "unread"
@@ -164,7 +165,7 @@ def view_runs(runs: Sequence[Run], probes_of: Run | None = None) -> list[ViewedR
 def _with_lender(viewed: Sequence[ViewedRun], probes_of: Run) -> list[ViewedRun]:
     lender = ViewedRun("probes", probes_of.in_wording())
     if lender.own_results is None:
-        raise UsageError(f"{probes_of.location} has no probes. Run `probe-kit train {probes_of.location}`")
+        raise UsageError(f"{probes_of.location} has no probes. {how_to_probe(probes_of)}")
     bare = [one for one in viewed if one.own_results is None and one.run.streams]
     fitting = {one.key for one in bare if _difference(one.run, lender) is None}
     if bare and not fitting:

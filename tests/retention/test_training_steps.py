@@ -74,6 +74,10 @@ def test_a_row_has_the_numbers_of_its_run_and_drift_is_that_from_the_first_step(
     assert color[1]["drift"] == pytest.approx(color[1]["backbone"] - color[0]["backbone"]), (
         "the later minus the first"
     )
+    assert made.text.note.endswith(
+        "drift: the backbone's accuracy minus that of the first step, paired by items where "
+        "both ran the same; each with its 95 % interval; view mean; mean over color, shape"
+    )
     shape = [one for one in made.numbers if one["category"] == "shape"]
     assert [one["retention"] for one in shape] == [None, None], "no signal, nothing to retain"
     cells = list(csv.DictReader(io.StringIO(made.to_csv())))
@@ -84,3 +88,22 @@ def test_a_row_has_the_numbers_of_its_run_and_drift_is_that_from_the_first_step(
     drawn = draw_training_steps(made, ())
     labels = [axes.get_ylabel() for axes in drawn.axes if axes.get_visible()]
     assert labels == ["success (%)", "backbone (%)", "retention", "drift of the backbone (points)"]
+
+
+def test_a_mean_over_other_categories_stands_last_and_is_named_and_absent_columns_are_not_explained(
+    probed_run: Callable[..., ArrayRun],
+) -> None:
+    early = probed_run({"color": NONE}, "early")
+    late = probed_run({"color": SIGNAL, "shape": NONE}, "late")
+    made = step_table(retention_table([early, late]), {str(early.location): 500, str(late.location): 2000})
+    assert [one["category"] for one in made.numbers] == ["color", "color", "shape", "mean", "mean"]
+    assert made.text.note.endswith("mean over color (step 500), color, shape (step 2000)")
+    bare = step_table(
+        retention_table([early, late], keys=["", ""]), {str(early.location): 500, str(late.location): 2000}
+    )
+    assert made.text.columns[3:] == ("backbone %", "action %", "retention", "drift of the backbone, points")
+    assert bare.text.columns == ("category", "step", "success %")
+    assert bare.text.note == (
+        "step: of the training; success: the cube ends on the correct picture; each with its 95 % interval; "
+        "mean over color (step 500), color, shape (step 2000)"
+    )

@@ -66,6 +66,25 @@ def test_a_table_without_probes_says_in_one_line_what_is_missing(probed_run: Pro
     assert retention_table([probed]).notes == ()
 
 
+def test_a_run_of_too_few_groups_is_not_sent_to_train_which_refuses_it(probed_run: ProbedRun) -> None:
+    probed = probed_run({"color": SIGNAL, "shape": SIGNAL})
+    episodes = probed.episodes.copy()
+    for lacking, said in (
+        (
+            {"color"},
+            "color has 2. Extract more items. `probe-kit train PLACE --categories shape` probes the others.",
+        ),
+        ({"color", "shape"}, "color has 2, shape has 2. Extract more items."),
+    ):
+        numbers = episodes["item_id"].astype("category").cat.codes
+        kinds = numbers.where(~episodes["category"].isin(lacking), numbers % 2)
+        groups = kinds.astype(str) + episodes["category"]
+        few = replace(probed, path=probed.path.parent / "few", episodes=episodes.assign(group_id=groups))
+        (note,) = retention_table([few]).notes
+        place = said.replace("PLACE", str(few.path))
+        assert note.endswith(f"Probes need 5 independent groups of items: {place}")
+
+
 MIXTURES = {
     "permutations": (50, "label permutations 99 (one) against 50 (other)"),
     "seed": (3, "seeds 0 (one) against 3 (other)"),

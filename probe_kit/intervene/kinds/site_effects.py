@@ -39,11 +39,11 @@ class PatchEffect(EffectRow):
 
     net: share of episodes whose action flips to the target side, minus those that flip away from it; net_left,
     net_right: the same by target side. coefficient: of steering, else empty. effect: share of what the whole image
-    swap does to where the action goes, toward the target side, with its 95 % interval by groups; None if that does nothing, so that a
-    share would be a ratio of noise. mean_displacement, control_displacement: metres toward the target side, of the
-    edit and of its matched controls. t, p, p_fwe: of the displacement beyond the controls', one-sided, by sign
-    flips of whole groups, of an interchange in the direction of the swap itself; p_fwe against the largest t of
-    all edits of the category.
+    swap does to where the action goes, toward the target side, with its 95 % interval by groups; None if the swap
+    does nothing, so that a share would be a ratio of noise. mean_displacement, control_displacement: metres toward
+    the target side, of the edit and of its matched controls. t, p, p_fwe: of the displacement beyond the
+    controls', one-sided, by sign flips of whole groups, of an interchange in the direction of the swap itself;
+    p_fwe against the largest t of all edits of the category.
     """
 
     coefficient: str

@@ -83,7 +83,7 @@ def _best_site(
     along: Sequence[PatchEffect],
 ) -> str:
     if results is None:
-        return "no probes (probe-kit train)"
+        return "no probes are stored"
     view, scores = results.settings.views[0], results.scores
     own = scores[(scores["stream"] == BACKBONE) & (scores["view"] == view) & (scores["category"] == category)]
     if own.empty:

@@ -149,7 +149,7 @@ def conclusion(row: RetentionRow) -> str:
     is_later = use is not None and use.is_bounded and use.is_of_first_chunk and knows(row)
     parts = [_finding(row) if use is None else _used(row, use), _LATER * is_later]
     if not _is_probed(row):
-        parts.append("The backbone was not probed: run `probe-kit train`.")
+        parts.append("The backbone was not probed.")
     return " ".join(filter(None, parts))
 
 

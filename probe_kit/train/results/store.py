@@ -28,6 +28,7 @@ from probe_kit.extract.store.format.bundles import (
 from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.store.locations.location import Location
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
 from probe_kit.train.choices import Target
 from probe_kit.train.data.captured_call import captured_calls, restrict_to_call
 from probe_kit.train.data.run_reader import RunReader
@@ -128,9 +129,23 @@ def _why_none(run: RunReader, target: Target, stored: int) -> str:
     if not run.streams:
         return f"{run.location} has no activations to probe: of {run.model!r} no stream was stored."
     others = f" (of {stored} stored, none: other episodes or another target)" if stored else ""
+    return f"{run.location} has no probes for target {target!r} on its episodes{others}. {how_to_probe(run)}"
+
+
+def how_to_probe(run: RunReader) -> str:
+    """Return a sentence that says how a run gets probes: the command, or that it has too few groups of items."""
+    command, episodes = f"probe-kit train {run.location}", run.episodes
+    if not {"category", "group_id"} <= set(episodes):
+        return f"Run `{command}`."
+    counts = episodes.groupby("category", sort=False)["group_id"].nunique()
+    few = [f"{name} has {count}" for name, count in counts.items() if count < GROUPS_FOR_PROBES]
+    enough = [str(name) for name, count in counts.items() if count >= GROUPS_FOR_PROBES]
+    if not few:
+        return f"Run `{command}`."
+    others = f" `{command} --categories {','.join(enough)}` probes the others." if enough else ""
     return (
-        f"{run.location} has no probes for target {target!r} on its episodes{others}. "
-        f"Run `probe-kit train {run.location}`."
+        f"Probes need {GROUPS_FOR_PROBES} independent groups of items: {', '.join(few)}. Extract more items."
+        f"{others}"
     )
 
 

@@ -65,7 +65,7 @@ const labelOf = (run, part) => run.streams.find((s) => s.part === part)?.label ?
 const categoryOf = (run, name) => run.categories.find((c) => c.name === name);
 const titleOf = (run, name) => categoryOf(run, name)?.title ?? name;
 const probed = (run) => run.categories.filter((c) => c.best.backbone || c.best.action).map((c) => c.name);
-const noProbes = (run) => (run.streams.length ? html`This run has no probes of the correct side. <code>probe-kit train RUN</code> fits them.` : "This run holds no activations, so that nothing can be probed.");
+const noProbes = (run) => (run.streams.length ? html`This run has no probes of the correct side. <code>probe-kit train RUN</code> fits them where a category has five independent groups of items.` : "This run holds no activations, so that nothing can be probed.");
 const siteNamed = (run, name) => run.sites.findIndex((s) => s.name === name);
 /* The site that is shown: the chosen one, or the best of the action or of the backbone, whichever has signal first. */
 function siteOf(run, place, category) {

@@ -109,7 +109,10 @@ HAVE = "edits that have half of the image swap's effect"
             f"{CARRY}: 5 of 5 (kv.00 image 0.90, kv.01 image 0.90, kv.02 image 0.90 and 2 more).",
         ),
         (
-            [replace(patch("backbone.02", share, 0.001), coefficient=dose) for dose, share in (("0", 0.0), ("2", 0.9))],
+            [
+                replace(patch("backbone.02", share, 0.001), coefficient=dose)
+                for dose, share in (("0", 0.0), ("2", 0.9))
+            ],
             f"{HAVE}: 1 of 1 (backbone.02 image coefficient 2 0.90).",
         ),
     ],
