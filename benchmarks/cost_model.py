@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from math import ceil
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hooks.contract.views import view_names
 from probe_kit.hooks.registry import known_families
+from probe_kit.runs.layout import StoredStream
 
 FAMILIES = ("pi0", "openvla")
 ACTIONS = SceneSpec.preset("act2answer").max_steps

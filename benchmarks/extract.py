@@ -19,18 +19,19 @@ import numpy as np
 import zarr
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract import Extraction, ExtractSettings, open_run, prepare, seal
+from probe_kit.extract import Extraction, ExtractSettings, prepare
 from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
-from probe_kit.extract.run_layout import CODECS, StoredStream
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Observation
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.models.embedded import pi0_tiny
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.lerobot.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi0
+from probe_kit.runs import open_run, seal
+from probe_kit.runs.layout import CODECS, StoredStream
+from probe_kit.runs.store import locate
+from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite, build_suite
 
 LAYERS, VIEWS, TOKENS = 19, ("mean", "last", "mean:language", "mean:image"), 816

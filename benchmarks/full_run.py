@@ -21,13 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract import Run, open_run, seal
 from probe_kit.extract.plan import Plan, PlannedEpisode, make_plan
 from probe_kit.extract.rollout.stage import Ending, Stage
-from probe_kit.extract.run_layout import COMMITS, StoredStream
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
-from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
+from probe_kit.runs import Run, open_run, seal
+from probe_kit.runs.layout import COMMITS, StoredStream
+from probe_kit.runs.store import locate
+from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite, build_suite
 from probe_kit.suite.generators import GENERATORS
 from probe_kit.train import train_probes

@@ -24,21 +24,21 @@ from unittest.mock import patch
 import google_crc32c
 import numpy as np
 
-from probe_kit.extract import open_run, seal, verify_run
 from probe_kit.extract.plan import Plan, PlannedEpisode, make_plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
-from probe_kit.extract.run_layout import DATA, StoredStream
-from probe_kit.extract.store.format.commits import commit_key, write_commit
-from probe_kit.extract.store.format.hashes import HASH
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.seconds import NOT_MEASURED, write_seconds
-from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
+from probe_kit.runs import open_run, seal, verify_run
+from probe_kit.runs.commits import commit_key, write_commit
+from probe_kit.runs.layout import DATA, StoredStream
+from probe_kit.runs.records import HASH
+from probe_kit.runs.seconds import NOT_MEASURED, write_seconds
+from probe_kit.runs.store import locate
+from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite, build_suite
 
 BACKBONE = StoredStream("backbone", 19, 512, None, 816, ("mean", "last", "mean:language", "mean:image"))
 EXPERT = StoredStream("expert", 19, 64, 10, 51, ("mean", "mean:action"))
-RECORDING = "probe_kit.extract.store.format.recording"
+RECORDING = "probe_kit.runs.recording"
 Seconds = tuple[float, float]
 
 

@@ -25,7 +25,6 @@ from probe_kit.demo.organisms import (
 )
 from probe_kit.demo.pipeline import FULL
 from probe_kit.errors import CaptureChangedActionError
-from probe_kit.extract import Run
 from probe_kit.intervene import (
     ClosedLoop,
     Interchange,
@@ -36,6 +35,7 @@ from probe_kit.intervene import (
     run_intervention,
 )
 from probe_kit.intervene.replay.conditions import Intervention
+from probe_kit.runs import Run
 from probe_kit.suite import Suite, build_suite
 
 ABSENT = "counting"

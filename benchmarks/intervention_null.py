@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Policy, load_policy
 from probe_kit.intervene import ConditionOutcomes, ImageSwap, Interchange, ReplaySession, ReplaySource
 from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
@@ -28,6 +28,7 @@ from probe_kit.intervene.kinds.site_effects import patch_effects
 from probe_kit.intervene.replay.conditions import ReplayBatch, replay
 from probe_kit.intervene.replay.session import ReplayInput, open_session
 from probe_kit.intervene.runner import outcomes_of
+from probe_kit.runs import Run
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite import Suite, build_suite
 

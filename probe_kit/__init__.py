@@ -5,7 +5,7 @@
     results = pk.train_probes(run)
     print(pk.retention_table([run]).to_markdown())
 
-Data flows one way: suite → env → hooks → extract → train → intervene → retention.
+Data flows one way: suite → env → hooks → runs → extract → train → intervene → retention.
 """
 
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ from probe_kit.version import __version__ as __version__
 if TYPE_CHECKING:
     from probe_kit.env import Act2AnswerEnv, SceneSpec
     from probe_kit.errors import ProbeKitError
-    from probe_kit.extract import EnvSource, ExtractSettings, LeRobotSource, Run, extract_run, open_run
+    from probe_kit.extract import EnvSource, ExtractSettings, LeRobotSource, extract_run
     from probe_kit.hooks import Site, capture, load_policy
     from probe_kit.intervene import (
         AttentionReadout,
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
         layer_curve,
     )
     from probe_kit.retention.report import write_report
+    from probe_kit.runs import Run, open_run
     from probe_kit.suite import Suite, build_suite, default_suite, load_suite
     from probe_kit.train import Labels, load_results, probe, train_probes
 
@@ -111,7 +112,7 @@ __getattr__, __dir__ = lazy_names(
         "LeRobotSource": "extract",
         "ModelDepthDisplay": "retention.displays",
         "ProbeKitError": "errors",
-        "Run": "extract",
+        "Run": "runs",
         "SceneSpec": "env",
         "Site": "hooks",
         "ReplaySource": "intervene",
@@ -126,7 +127,7 @@ __getattr__, __dir__ = lazy_names(
         "load_policy": "hooks",
         "load_results": "train",
         "load_suite": "suite",
-        "open_run": "extract",
+        "open_run": "runs",
         "patching": "intervene.patching:",
         "probe": "train",
         "retention_table": "retention",

@@ -40,7 +40,7 @@ from probe_kit.train.power_commands import power
 from probe_kit.view.commands import RUNS_BY_NAME, view
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
+    from probe_kit.runs import Run
 
 PANELS = {
     "Start": ("demo", "doctor", "models"),

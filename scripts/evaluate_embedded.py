@@ -13,12 +13,13 @@ import typer
 from probe_kit._terminal.console import counter, progress
 from probe_kit.demo.organisms import TRAINED, VLM
 from probe_kit.env import SceneSpec
-from probe_kit.extract import AskSettings, ExtractSettings, Run, ask_run, extract_run
+from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.extract.vqa.templates import TEMPLATES
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.columns.sentences import verdict
 from probe_kit.retention.rows.row import MEAN
+from probe_kit.runs import Run
 from probe_kit.suite import Suite, build_suite
 
 CATEGORIES = ("color", "shape", "state", "traffic", "counting")

@@ -15,9 +15,9 @@ import pytest
 from tests.support.made_once import made_once, shared_folder
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
     from probe_kit.hooks import Observation
     from probe_kit.hooks.families.pi0.adapter import Pi0
+    from probe_kit.runs import Run
     from probe_kit.suite import Suite
 
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -247,7 +247,8 @@ def little_runs(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) 
 def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory) -> "Run":
     """A real run of pi0-tiny's untrained network with all tokens: 48 episodes of four actions."""
     from probe_kit.env import SceneSpec
-    from probe_kit.extract import ExtractSettings, extract_run, open_run
+    from probe_kit.extract import ExtractSettings, extract_run
+    from probe_kit.runs import open_run
 
     settings = ExtractSettings(
         "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4), tokens="all"
@@ -258,7 +259,7 @@ def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory)
 @pytest.fixture(scope="session")
 def shown_run(tmp_path_factory: pytest.TempPathFactory) -> "Run":
     """A run on recordings without a model, twelve episodes of four frames; see `tests.support.recorded_run`."""
-    from probe_kit.extract import open_run
+    from probe_kit.runs import open_run
     from tests.support.recorded_run import write_recorded_run
 
     def make(folder: Path) -> None:

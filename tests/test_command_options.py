@@ -20,7 +20,16 @@ from probe_kit.env.scoring.rules import RULES
 from probe_kit.env.spec import PRESETS
 from probe_kit.extract.command_options import Size, Sizes
 from probe_kit.extract.protocols import SCENES
-from probe_kit.extract.run_layout import (
+from probe_kit.extract.settings import SCENE_OPTIONS, AskSettings, ExtractSettings
+from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
+from probe_kit.hooks.contract.interventions import Readout
+from probe_kit.hooks.contract.protocol import ROTATIONS, ProtocolName
+from probe_kit.hooks.family import Dtype
+from probe_kit.intervene.kinds.registry import KINDS
+from probe_kit.retention.behaviour.vlm_answers import SCORES
+from probe_kit.retention.choices import AnswerScore, Family, Section, TableFormat
+from probe_kit.runs.export.export import FORMATS
+from probe_kit.runs.layout import (
     AskTokens,
     Codec,
     ExportFormat,
@@ -30,15 +39,6 @@ from probe_kit.extract.run_layout import (
     Tokens,
     VideoChoice,
 )
-from probe_kit.extract.settings import SCENE_OPTIONS, AskSettings, ExtractSettings
-from probe_kit.extract.store.exports.export import FORMATS
-from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
-from probe_kit.hooks.contract.interventions import Readout
-from probe_kit.hooks.contract.protocol import ROTATIONS, ProtocolName
-from probe_kit.hooks.family import Dtype
-from probe_kit.intervene.kinds.registry import KINDS
-from probe_kit.retention.behaviour.vlm_answers import SCORES
-from probe_kit.retention.choices import AnswerScore, Family, Section, TableFormat
 from probe_kit.scene_names import ArmName, Rendering, RuleName, SceneName
 from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
 from probe_kit.suite.converters.conversion import EVERY_SOURCE

@@ -20,23 +20,20 @@ FOLDERS = {
     "env": BASE | {"suite"},
     "models": BASE | {"suite"},
     "hooks": BASE | {"models"},
-    "extract": BASE | {"suite", "env", "hooks"},
-    "train": BASE | {"suite", "hooks", "extract", "statistics"},
-    "intervene": BASE | {"suite", "env", "hooks", "extract", "train", "statistics"},
-    "retention": BASE | {"suite", "env", "hooks", "extract", "train", "intervene", "statistics"},
-    "view": BASE | {"suite", "env", "hooks", "extract", "train", "intervene", "retention", "statistics"},
-    "study": BASE | {"suite", "env", "hooks", "extract", "train", "intervene", "retention", "statistics"},
+    "runs": BASE | {"suite", "env", "hooks"},
+    "extract": BASE | {"suite", "env", "hooks", "runs"},
+    "train": BASE | {"suite", "hooks", "runs", "statistics"},
+    "intervene": BASE | {"suite", "env", "hooks", "runs", "extract", "train", "statistics"},
+    "retention": BASE | {"suite", "env", "hooks", "runs", "extract", "train", "intervene", "statistics"},
+    "view": BASE | {"suite", "env", "hooks", "runs", "extract", "train", "intervene", "retention", "statistics"},
+    "study": BASE | {"suite", "env", "hooks", "runs", "extract", "train", "intervene", "retention", "statistics"},
 }
 """What a folder may import; what is not named here, such as `cli` and `demo`, stands on top."""
 
-MOST_FILES = {"retention.displays": 20}
-"""Files beside subfolders; 15 where a folder is not named."""
-MOST_LEVELS = 12
+MOST_LEVELS = 13
 
 READS_ONLY = (
-    "probe_kit.extract",
-    "probe_kit.extract.store",
-    "probe_kit.extract.run_layout",
+    "probe_kit.runs",
     "probe_kit.hooks.contract.sites",
     "probe_kit.hooks.contract.views",
     "probe_kit.env.scoring.outcome",
@@ -55,13 +52,11 @@ def test_no_package_imports_one_that_comes_after_it() -> None:
 
 
 @pytest.mark.parametrize("folder", sorted(packages(GRAPH)))
-def test_no_two_children_of_a_folder_import_each_other_and_it_stays_small(folder: str) -> None:
-    """A newcomer reads a folder from the bottom up: at most 15 files on at most 12 levels."""
+def test_no_two_children_of_a_folder_import_each_other(folder: str) -> None:
+    """A newcomer reads a folder from the bottom up, on at most 13 levels."""
     inside = children(GRAPH, folder)
     assert circles(inside) == []
     assert levels(inside) <= MOST_LEVELS
-    files = list(PACKAGE.parent.joinpath(*folder.split(".")).glob("*.py"))
-    assert len(files) <= MOST_FILES.get(folder.removeprefix("probe_kit."), 15)
 
 
 @pytest.mark.parametrize("room", ["train", "retention"])
@@ -71,10 +66,12 @@ def test_what_reads_runs_knows_neither_models_nor_simulators(room: str) -> None:
         for module, imported in GRAPH.items()
         if module.startswith(f"probe_kit.{room}")
         for other in imported
-        if other.startswith(("probe_kit.extract", "probe_kit.hooks", "probe_kit.env", "probe_kit.models"))
+        if other.startswith(
+            ("probe_kit.extract", "probe_kit.runs", "probe_kit.hooks", "probe_kit.env", "probe_kit.models")
+        )
     }
     assert seen
-    strange = {other for other in seen if other not in READS_ONLY and not other.startswith(READS_ONLY[1] + ".")}
+    strange = {other for other in seen if other not in READS_ONLY and not other.startswith(READS_ONLY[0] + ".")}
     assert not strange
 
 

@@ -10,9 +10,9 @@ import pytest
 from nbformat import NotebookNode
 
 from notebooks.execute import FOLDER, executed, kernel, notebooks
-from probe_kit.extract import compare_actions, open_run
 from probe_kit.intervene import stored_site_effects
 from probe_kit.retention import retention_table
+from probe_kit.runs import compare_actions, open_run
 from probe_kit.train import load_label_results, load_results
 
 NAMES = (

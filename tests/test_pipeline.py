@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import zarr
 
-from probe_kit.extract import Run, open_run
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention import retention_table
+from probe_kit.runs import Run, open_run
 from probe_kit.train import train_probes
 from tests.support.rehashing import rehash
 

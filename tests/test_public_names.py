@@ -12,8 +12,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PUBLIC = (
     "probe_kit", "probe_kit.suite", "probe_kit.env", "probe_kit.hooks", "probe_kit.hooks.testing",
-    "probe_kit.extract", "probe_kit.train", "probe_kit.intervene", "probe_kit.intervene.patching",
-    "probe_kit.retention",
+    "probe_kit.runs", "probe_kit.extract", "probe_kit.train", "probe_kit.intervene",
+    "probe_kit.intervene.patching", "probe_kit.retention",
     "probe_kit.retention.displays", "probe_kit.retention.report", "probe_kit.suite.converters",
     "probe_kit.errors",
 )  # fmt: skip

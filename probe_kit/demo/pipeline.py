@@ -11,13 +11,13 @@ from rich.text import Text
 from probe_kit._system.drafts import write_whole
 from probe_kit._terminal.console import marked
 from probe_kit.demo.organisms import TRAINED, VLM, Finding, NamedProgress, answered, compare, probed
-from probe_kit.extract import Run
-from probe_kit.extract.run_layout import VIDEOS
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.sentences import verdict
 from probe_kit.retention.displays import layer_curve
 from probe_kit.retention.report import write_report
 from probe_kit.retention.rows.row import MEAN, RetentionRow
+from probe_kit.runs import Run
+from probe_kit.runs.layout import VIDEOS
 from probe_kit.suite import Suite, build_suite
 from probe_kit.suite.categories import category_of
 

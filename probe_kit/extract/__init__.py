@@ -1,4 +1,4 @@
-"""Runs: planning, extraction and reading. Reading needs neither a simulator nor a model."""
+"""Extraction: sources, settings, and the play of a model that makes a run."""
 
 from typing import TYPE_CHECKING
 
@@ -11,44 +11,23 @@ if TYPE_CHECKING:
     from probe_kit.extract.own_environments.source_contract import check_environment
     from probe_kit.extract.recordings.lerobot_source import LeRobotSource
     from probe_kit.extract.settings import AskSettings, ExtractSettings
-    from probe_kit.extract.store.copying import copy_run
-    from probe_kit.extract.store.exports.export import export_run
-    from probe_kit.extract.store.integrity.audit import Audit, verify_run
-    from probe_kit.extract.store.label import label_run
-    from probe_kit.extract.store.locations.locate import locate
-    from probe_kit.extract.store.locations.location import Location
-    from probe_kit.extract.store.recorded.action_errors import ActionErrors, compare_actions
-    from probe_kit.extract.store.run import Run, open_run
-    from probe_kit.extract.store.sealing import seal
     from probe_kit.extract.vqa.templates import TEMPLATES
 
 __all__ = [
     "TEMPLATES",
-    "ActionErrors",
     "AskSettings",
-    "Audit",
     "EnvEpisode",
     "EnvSource",
     "ExtractSettings",
     "Extraction",
     "LeRobotSource",
-    "Location",
     "OwnEnvironment",
-    "Run",
     "Step",
     "ask_run",
     "check_environment",
-    "compare_actions",
-    "copy_run",
-    "export_run",
     "extract_run",
-    "label_run",
-    "locate",
-    "open_run",
     "prepare",
     "prepare_asks",
-    "seal",
-    "verify_run",
 ]
 
 __getattr__, __dir__ = lazy_names(
@@ -64,21 +43,9 @@ __getattr__, __dir__ = lazy_names(
         "Step": "own_environments.contract",
         "check_environment": "own_environments.source_contract",
         "LeRobotSource": "recordings.lerobot_source",
-        "ActionErrors": "store.recorded.action_errors",
-        "compare_actions": "store.recorded.action_errors",
-        "copy_run": "store.copying",
-        "export_run": "store.exports.export",
         "ask_run": "extraction",
         "extract_run": "extraction",
         "prepare": "extraction",
         "prepare_asks": "extraction",
-        "Location": "store.locations.location",
-        "locate": "store.locations.locate",
-        "Run": "store.run",
-        "open_run": "store.run",
-        "label_run": "store.label",
-        "seal": "store.sealing",
-        "Audit": "store.integrity.audit",
-        "verify_run": "store.integrity.audit",
     },
 )

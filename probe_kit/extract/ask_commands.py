@@ -10,7 +10,7 @@ from probe_kit.extract import command_options as own
 from probe_kit.extract.commands import print_plan, print_sufficiency
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
+    from probe_kit.runs import Run
 
 
 def ask(
@@ -56,7 +56,7 @@ def ask(
     chosen = own.settings_of(locals())
     from probe_kit.extract.extraction import prepare_asks
     from probe_kit.extract.settings import AskSettings
-    from probe_kit.extract.store.locations.locate import locate
+    from probe_kit.runs.store import locate
 
     wanted = AskSettings.per_prompt_and_size(chosen.pop("prompt"), chosen.pop("picture_size"), **chosen)
     places = [None if out_folder is None else f"{out_folder.rstrip('/')}/{one.short_name}" for one in wanted]

@@ -10,10 +10,10 @@ import typer
 from probe_kit._terminal.console import whole_number
 from probe_kit._terminal.options import Names, choices, further_option, read_size, some_of, speed_option
 from probe_kit.errors import UsageError
-from probe_kit.extract.run_layout import AskTokens, Codec, FrameChoice, LaterViews, Tokens, VideoChoice
 from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.hooks import family as hook_family
 from probe_kit.hooks.contract.protocol import ProtocolName, Rotation
+from probe_kit.runs.layout import AskTokens, Codec, FrameChoice, LaterViews, Tokens, VideoChoice
 from probe_kit.scene_names import ArmName, Rendering
 from probe_kit.suite.ladder import WORDINGS
 

@@ -13,11 +13,12 @@ from probe_kit.extract.recordings import options as recorded
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
-    from probe_kit.extract import Extraction, Run
+    from probe_kit.extract import Extraction
     from probe_kit.extract.own_environments.environment_plan import EnvironmentPlan
     from probe_kit.extract.recordings.recorded_plan import RecordedPlan
     from probe_kit.extract.settings import RunSettings
-    from probe_kit.extract.store.locations.location import Location
+    from probe_kit.runs import Run
+    from probe_kit.runs.store import Location
     from probe_kit.suite.ladder import Wording
 
 
@@ -95,7 +96,7 @@ def extract(
     """
     chosen = own.settings_of(locals())
     from probe_kit.extract import ExtractSettings, prepare
-    from probe_kit.extract.store.locations.locate import locate
+    from probe_kit.runs.store import locate
 
     settings = ExtractSettings.from_options(**chosen)
     with err.status(f"loading {'recordings' if dataset else 'environment' if env else 'suite'} and model"):
@@ -116,8 +117,8 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     from rich.table import Table
 
     from probe_kit.extract.needs import space_needed
-    from probe_kit.extract.store.growth import growth_at
-    from probe_kit.extract.store.locations.disk import in_units
+    from probe_kit.runs.disk import in_units
+    from probe_kit.runs.growth import growth_at
 
     plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()
     growth = growth_at(location, plan.to_json()["episodes"])
@@ -171,7 +172,7 @@ def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> 
     """Raise DiskSpaceError for more than 64 GB, unless that was agreed to."""
     from probe_kit.errors import DiskSpaceError
     from probe_kit.extract.needs import space_needed
-    from probe_kit.extract.store.locations.disk import in_units
+    from probe_kit.runs.disk import in_units
 
     needed = sum(space_needed(extraction.further_plan(location), extraction.settings).values())
     if needed > LARGE and not agreed:
@@ -307,7 +308,7 @@ def _has_groups_for_probes(run: "Run") -> bool:
 
 
 def _print_outcomes(run: "Run") -> None:
-    from probe_kit.extract.run_layout import AT_END, ONCE
+    from probe_kit.runs.layout import AT_END, ONCE
 
     counts = run.episodes["outcome"].value_counts()
     text = ", ".join(f"{name} {count}" for name, count in counts.items())

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any
 from probe_kit._system.installing import install_command
 from probe_kit.errors import DiskSpaceError, MissingExtraError, UsageError
 from probe_kit.extract.plan import plan_episodes, plan_rows, suite_name
-from probe_kit.extract.run_layout import RUN_FILE
-from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, check_other_settings
-from probe_kit.extract.store.growth import further_rows
+from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
 from probe_kit.extract.vqa.phrases import phrases
 from probe_kit.hashing import canonical_json
+from probe_kit.runs.growth import check_other_settings, further_rows
+from probe_kit.runs.layout import RUN_FILE
 
 if TYPE_CHECKING:
-    from probe_kit.extract.store.locations.location import Location
+    from probe_kit.runs.store import Location
     from probe_kit.suite import Suite
 
 _OF_THE_CHECKPOINT = ("dtype", "execute", "random_weights", "weights_seed")
@@ -72,7 +72,7 @@ def check_place(settings: RunSettings, suite: "Suite", location: "Location") -> 
     Raises UsageError, DiskSpaceError for a read-only disk, SettingsMismatchError, or RunDamagedError if what lies
     there was changed.
     """
-    from probe_kit.extract.store.format.root import read_root
+    from probe_kit.runs.root import read_root
 
     check_writable(location)
     with location.in_words():

@@ -12,29 +12,27 @@ from probe_kit.extract.needs import space_needed
 from probe_kit.extract.plan import RowPlan
 from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_answer_model
 from probe_kit.extract.rollout.events import Done, Event
-from probe_kit.extract.run_layout import RUN_FILE
 from probe_kit.extract.settings import (
     AskSettings,
     ExtractSettings,
     RunSettings,
-    check_other_settings,
     run_label,
 )
-from probe_kit.extract.store.format.commits import failure_key
-from probe_kit.extract.store.format.root import read_root
-from probe_kit.extract.store.growth import further_rows
-from probe_kit.extract.store.label import label_run
-from probe_kit.extract.store.locations.disk import check_if_full
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.locations.location import Location
-from probe_kit.extract.store.run import Run, open_run
-from probe_kit.extract.store.sealing import seal
-from probe_kit.extract.store.writer import RunWriter
 from probe_kit.extract.workers.local import run_here
 from probe_kit.extract.workers.processes import run_in_processes
 from probe_kit.extract.workers.ray import run_on_ray
 from probe_kit.extract.workers.scheduler import Scheduler
 from probe_kit.hashing import canonical_json
+from probe_kit.runs.commits import failure_key
+from probe_kit.runs.disk import check_if_full
+from probe_kit.runs.growth import check_other_settings, further_rows
+from probe_kit.runs.label import label_run
+from probe_kit.runs.layout import RUN_FILE
+from probe_kit.runs.root import read_root
+from probe_kit.runs.run import Run, open_run
+from probe_kit.runs.sealing import seal
+from probe_kit.runs.store import Location, locate
+from probe_kit.runs.writer import RunWriter
 
 if TYPE_CHECKING:
     from probe_kit.hooks import AnswerModel, Policy
@@ -97,7 +95,7 @@ class Extraction(Prepared):
         added = {row["episode_id"] for row in rows}
         return self.plan.only(one for one in self.plan.episodes if one.episode_id in added)
 
-    def _play(self, writer: RunWriter, remaining: list[int], progress: Progress | None) -> None:
+    def _play(self, writer: RunWriter[RowPlan], remaining: list[int], progress: Progress | None) -> None:
         scheduler = Scheduler(remaining)
         total = len(self.plan.episodes)
 
@@ -120,7 +118,7 @@ class Extraction(Prepared):
             seal(writer.location)
             raise self._failure(scheduler, writer)
 
-    def _failure(self, scheduler: Scheduler, writer: RunWriter) -> EpisodesFailedError:
+    def _failure(self, scheduler: Scheduler, writer: RunWriter[RowPlan]) -> EpisodesFailedError:
         error = EpisodesFailedError(
             f"{len(scheduler.given_up)} episodes failed twice and were given up; {len(scheduler.done)} others "
             "were finished and are kept. The same command tries them again; --partial reads the run without them"

@@ -33,7 +33,7 @@ def models(
         _print_words(name, run, as_json)
         return
     if run is not None:
-        from probe_kit.extract import open_run
+        from probe_kit.runs import open_run
 
         print_json(open_run(run, allow_partial=True).certificate)
         return

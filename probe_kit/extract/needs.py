@@ -8,10 +8,10 @@ import numpy as np
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import RowPlan
-from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import RunSettings
 from probe_kit.hooks.contract.views import view_names
 from probe_kit.hooks.family import DTYPES
+from probe_kit.runs.layout import StoredStream
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Family, Model
@@ -144,8 +144,8 @@ def weights_needed(
     is asked: a download is counted from the index of the weights in the cache, else estimated from the number of
     parameters, whose stored precision is not known.
     """
-    from probe_kit.extract.store.locations.disk import in_units
     from probe_kit.hooks.registry import get_family
+    from probe_kit.runs.disk import in_units
 
     family = get_family(model)
     if family is None or family.weights_bytes(options) is None:

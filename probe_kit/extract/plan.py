@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import Any, Protocol, Self
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.run_layout import LaterViews, StoredStream
 from probe_kit.hashing import derive_seed, sha256_json
+from probe_kit.runs.layout import LaterViews, StoredStream
 from probe_kit.suite import Episode, Suite
 from probe_kit.suite.ladder import Wording, in_words
 

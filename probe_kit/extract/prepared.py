@@ -47,13 +47,13 @@ from probe_kit.extract.rollout.settings_checks import (
     check_misfit,
     check_unreachable,
 )
-from probe_kit.extract.run_layout import RUN_FILE, StoredStream
 from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
-from probe_kit.extract.store.locations.location import Location
-from probe_kit.extract.store.provenance import provenance_here
-from probe_kit.extract.store.writer import RunWriter
 from probe_kit.extract.vqa.phrases import phrases
 from probe_kit.hashing import sha256_json
+from probe_kit.runs.layout import RUN_FILE, StoredStream
+from probe_kit.runs.provenance import provenance_here
+from probe_kit.runs.store import Location
+from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite, default_suite, load_suite
 from probe_kit.suite.build import ITEMS, default_folder
 from probe_kit.suite.validation.sufficiency import Smallest
@@ -97,7 +97,7 @@ class Prepared:
         decoder = {} if self.plan.decoder is None else {"decoder": self.plan.decoder}
         return provenance_here(self.settings.device, dtype) | decoder
 
-    def writer(self, location: Location) -> RunWriter:
+    def writer(self, location: Location) -> RunWriter[RowPlan]:
         """A writer of the run at `location`, which it begins or continues.
 
         Raises SettingsMismatchError if other settings are there.

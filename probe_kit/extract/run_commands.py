@@ -8,7 +8,7 @@ import typer
 
 from probe_kit._terminal.console import err, out, print_json, say
 from probe_kit._terminal.options import LISTED, AsJson, Names, Partial, RunFolder
-from probe_kit.extract.run_layout import ExportFormat, SaeDtype
+from probe_kit.runs.layout import ExportFormat, SaeDtype
 
 app = typer.Typer(help="Inspect, verify, copy and export runs.", no_args_is_help=True)
 DAMAGED = 1
@@ -25,7 +25,7 @@ def verify(
     as_json: AsJson = False,
 ) -> None:
     """Check a run against its stored hashes; exit with 1 if anything is missing or changed."""
-    from probe_kit.extract import seal, verify_run
+    from probe_kit.runs import seal, verify_run
 
     if build:
         say("sealed" if seal(run) else "nothing to seal")
@@ -61,7 +61,7 @@ def copy(
     partial: Partial = False,
 ) -> None:
     """Copy a run without its activations: outcomes, probes, interventions and certificates."""
-    from probe_kit.extract import copy_run
+    from probe_kit.runs import copy_run
 
     with err.status("copying"):
         out.print(str(copy_run(run, out_folder, pictures, partial).location), soft_wrap=True)
@@ -102,8 +102,8 @@ def export(
     partial: Partial = False,
 ) -> None:
     """Write a run for other tools: to a file, and its sha256 beside it, or to a folder."""
-    from probe_kit.extract import export_run
-    from probe_kit.extract.store.locations.locate import locate
+    from probe_kit.runs import export_run
+    from probe_kit.runs.store import locate
 
     location = locate(run)
     target = out_file or location.beside(f"{location.name}.{style}")

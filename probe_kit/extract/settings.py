@@ -6,11 +6,19 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, get_args
 
 from probe_kit.env import SceneSpec
-from probe_kit.errors import SettingsMismatchError, UsageError
+from probe_kit.errors import UsageError
 from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.protocols import has_network, protocol_identity, protocol_row, scene_of
 from probe_kit.extract.recordings.lerobot_source import LeRobotSource
-from probe_kit.extract.run_layout import (
+from probe_kit.extract.vqa.phrases import Picture, Query
+from probe_kit.extract.vqa.templates import P1, Template, find_template
+from probe_kit.hashing import sha256_json
+from probe_kit.hooks.capturing.edits import Edit, Vectors
+from probe_kit.hooks.checkpoints.checkpoint import is_on_hub
+from probe_kit.hooks.contract.options import read_pairs
+from probe_kit.hooks.contract.protocol import PLAIN, ROTATIONS, Rotation
+from probe_kit.runs.label import check_label
+from probe_kit.runs.layout import (
     MOST_FRAMES,
     AskTokens,
     Codec,
@@ -19,13 +27,6 @@ from probe_kit.extract.run_layout import (
     Tokens,
     VideoChoice,
 )
-from probe_kit.extract.vqa.phrases import Picture, Query
-from probe_kit.extract.vqa.templates import P1, Template, find_template
-from probe_kit.hashing import sha256_json
-from probe_kit.hooks.capturing.edits import Edit, Vectors
-from probe_kit.hooks.checkpoints.checkpoint import is_on_hub
-from probe_kit.hooks.contract.options import read_pairs
-from probe_kit.hooks.contract.protocol import PLAIN, ROTATIONS, Rotation
 from probe_kit.scene_names import SceneName
 from probe_kit.suite.ladder import Wording, check_wordings
 
@@ -57,7 +58,6 @@ _MOST = {
     "workers": 1024,
     "env_workers": 1024,
 }
-LONGEST_LABEL = 200
 LARGEST = 1_000_000
 _MACHINE = {
     "allow_mixed",
@@ -520,12 +520,6 @@ def _check_no_scene(given: Mapping[str, Any], source: str) -> None:
         raise UsageError(f"{options} does not apply with {source}; remove it")
 
 
-def check_label(label: str) -> None:
-    """Raise UsageError unless tables can call a run so."""
-    if not (label.isprintable() and 0 < len(label) <= LONGEST_LABEL):
-        raise UsageError(f"label is {label[:LONGEST_LABEL]!r}; expected 1 to {LONGEST_LABEL} printable characters")
-
-
 def _short(checkpoint: str) -> str:
     """The last part of a checkpoint's name; a revision may have slashes of its own."""
     name, at, revision = checkpoint.partition("@")
@@ -552,26 +546,3 @@ def run_label(settings: RunSettings) -> str:
     if settings.random_weights and settings.weights_seed:
         parts.append(f"twin {settings.weights_seed}")
     return " · ".join([*parts, *settings.marks()])
-
-
-def check_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: str) -> None:
-    """Raise SettingsMismatchError naming the settings that differ between a stored run and this request."""
-    was, now = flat_settings(stored), flat_settings(asked)
-    different = [key for key in sorted(was | now) if was.get(key) != now.get(key)]
-    if different:
-        lines = [f"  {key}: stored {was.get(key)!r}, asked {now.get(key)!r}" for key in different]
-        raise SettingsMismatchError(
-            f"{where} holds a run with other settings:\n" + "\n".join(lines) + "\n"
-            "Choose another --out, or repeat the stored settings to continue it"
-        )
-
-
-def flat_settings(value: Any, prefix: str = "") -> dict[str, Any]:
-    """Settings by their path, such as `scene.light_level`."""
-    if not isinstance(value, Mapping):
-        return {prefix: value}
-    return {
-        key: leaf
-        for name, child in value.items()
-        for key, leaf in flat_settings(child, f"{prefix}.{name}" if prefix else str(name)).items()
-    }

@@ -15,10 +15,10 @@ from probe_kit.intervene import command_options as own
 from probe_kit.intervene.kinds.registry import KINDS, intervention_of
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
     from probe_kit.intervene.replay.conditions import Intervention
     from probe_kit.intervene.replay.session import ReplaySource
     from probe_kit.intervene.results.results import InterventionResult
+    from probe_kit.runs import Run
 
 
 class KindHelp(PanelledHelp):
@@ -74,9 +74,9 @@ def intervene(
     probe-kit intervene runs/mine
     probe-kit intervene runs/mine --kind interchange --sites "backbone.*"
     """
-    from probe_kit.extract import open_run
     from probe_kit.hooks.contract.options import read_pairs
     from probe_kit.intervene import ReplaySource
+    from probe_kit.runs import open_run
 
     opened = open_run(run, allow_partial=partial).in_wording(wording)
     of_every_kind = {"categories": categories, "items": items, "readout": readout}

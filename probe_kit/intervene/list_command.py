@@ -10,7 +10,7 @@ from probe_kit._terminal.options import AsJson
 from probe_kit._terminal.plain_text import terminal_safe
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
+    from probe_kit.runs import Run
 
 _COLUMNS = ("run", "model", "suite", "episodes", "correct %", "probes", "interventions")
 
@@ -24,8 +24,8 @@ def list_runs(
     `probe-kit view FOLDER` opens them all. A run that cannot be read is named with the reason.
     """
     from probe_kit.errors import ProbeKitError
-    from probe_kit.extract import open_run
-    from probe_kit.extract.store.locations.run_folders import find_runs
+    from probe_kit.runs import open_run
+    from probe_kit.runs.run_folders import find_runs
 
     lines: list[dict[str, Any]] = []
     for path in find_runs(folder):

@@ -7,10 +7,6 @@ import numpy as np
 
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import CaptureChangedActionError
-from probe_kit.extract.run_layout import INTERVENTIONS
-from probe_kit.extract.store.format.bundles import tidy_bundle
-from probe_kit.extract.store.format.resume_pieces import Pieces
-from probe_kit.extract.store.run import Run
 from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS
 from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.edits.sites import check_roles_have_tokens, resolve_sites
@@ -26,6 +22,10 @@ from probe_kit.intervene.replay.session import Progress, ReplaySession, ReplaySo
 from probe_kit.intervene.results.results import InterventionResult, effects_csv, load_effects
 from probe_kit.intervene.store.answers import ConditionOutcomes, is_stored, save
 from probe_kit.intervene.store.settings import PER_STEP, check_run_fits, items_of, key_of, settings_of
+from probe_kit.runs.layout import INTERVENTIONS
+from probe_kit.runs.results import tidy_bundle
+from probe_kit.runs.resume_pieces import Pieces
+from probe_kit.runs.run import Run
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -243,6 +243,6 @@ def _ledgers(conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, d
 
 
 def _provenance(session: ReplaySession) -> dict[str, Any]:
-    from probe_kit.extract.store.provenance import provenance_here
+    from probe_kit.runs.provenance import provenance_here
 
     return provenance_here(session.policy.card.device, session.policy.card.dtype)

@@ -37,9 +37,9 @@ def show(
     recorded action has an error of 1. `--json` prints every episode too; `probe-kit labels RUN` writes the
     error of every frame. An unfinished run needs --partial for it.
     """
-    from probe_kit.extract import label_run, open_run
     from probe_kit.extract.source_commands.action_error_table import show_action_errors
     from probe_kit.intervene.results.inventory import listed_interventions, unfinished_interventions
+    from probe_kit.runs import label_run, open_run
     from probe_kit.train.commands import facts_table
     from probe_kit.train.results.inventory import inventory
     from probe_kit.train.results.store import how_to_probe

@@ -68,12 +68,12 @@ def retention(
     """
     given = locals()
     from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
-    from probe_kit.extract import open_run
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
     from probe_kit.retention.rows.outcome_rules import check_epsilons
     from probe_kit.retention.stages_command import show_stages
     from probe_kit.retention.training_steps import read_steps
+    from probe_kit.runs import open_run
 
     if stages:
         _check_only(given, WITH_STAGES)
@@ -205,9 +205,9 @@ def _show_labels(
     details: bool,
 ) -> None:
     """The retention of labels of one's own, whose columns are given."""
-    from probe_kit.extract import open_run
     from probe_kit.retention.label_commands import show_label_retention
     from probe_kit.retention.labels.table import label_retention_table
+    from probe_kit.runs import open_run
 
     if not runs:
         raise UsageError("give run folders whose probes of a label are stored")

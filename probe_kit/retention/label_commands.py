@@ -55,6 +55,6 @@ def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = F
 
 def say_report(written: Path) -> None:
     """Say where a report is, and how large."""
-    from probe_kit.extract.store.locations.disk import in_units
+    from probe_kit.runs.disk import in_units
 
     say(f"report: {written} ({in_units(written.stat().st_size)})")

@@ -29,10 +29,10 @@ def show_stages(
     frames. views: at most one, of the policy run's probes; None for the first. key: of its probe results.
     Raises UsageError for other runs or views, and what `match_runs` raises.
     """
-    from probe_kit.extract import open_run
     from probe_kit.retention.behaviour.vlm_answers import scored
     from probe_kit.retention.columns.known_used_table import rich_known_used
     from probe_kit.retention.compare.known_used import match_runs
+    from probe_kit.runs import open_run
     from probe_kit.train import load_results
 
     if len(runs) != 2:

@@ -8,7 +8,6 @@ from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
 from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
-from probe_kit.extract.store.recorded.scene_only import check_scene_run
 from probe_kit.retention.behaviour.mixed_settings import chosen_wordings, mixed_episodes, mixed_settings
 from probe_kit.retention.behaviour.run_labels import distinct_labels
 from probe_kit.retention.behaviour.success_rate import capture_only
@@ -28,6 +27,7 @@ from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_ro
 from probe_kit.retention.rows.category_mean import mean_row
 from probe_kit.retention.rows.outcome_rules import can_be_judged, check_epsilons, under_rule
 from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.runs.scene_only import check_scene_run
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults

@@ -19,10 +19,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.extract.rollout.events import traceback_of
-from probe_kit.extract.settings import flat_settings
-from probe_kit.extract.store.format.hashes import HASH, as_record, read_record
-from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hashing import sha256_text
+from probe_kit.runs.growth import flat_settings
+from probe_kit.runs.records import HASH, as_record, read_record
+from probe_kit.runs.store import locate
 from probe_kit.study.cells import Cell, folder_of, key_of
 
 FOLDER = "ledger"

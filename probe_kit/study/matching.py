@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract.protocols import protocol_identity
-from probe_kit.extract.settings import ExtractSettings, flat_settings
+from probe_kit.extract.settings import ExtractSettings
 from probe_kit.hashing import canonical_json
 from probe_kit.hooks.checkpoints.checkpoint import COMMIT_DIGITS, is_on_hub, without_revision
+from probe_kit.runs.growth import flat_settings
 from probe_kit.study.cells import Cell
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
+    from probe_kit.runs import Run
 
 _OF_LOADED_MODEL = {"dtype", "weights_sha256", "execute", "captured_calls", "policy", "begun", "zeros_for"}
 """Settings of a run that the loaded model decides where the file leaves them open."""

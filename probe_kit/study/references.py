@@ -8,9 +8,9 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract.store.locations.locate import SCHEMES
 from probe_kit.hooks.contract.options import check_options
 from probe_kit.hooks.registry import family_names, find_family
+from probe_kit.runs.store import SCHEMES
 from probe_kit.study.expansion import SCRIPTED, acts, answers, excludes, is_known, members
 from probe_kit.study.mistakes import Mistake, each_unknown
 from probe_kit.study.planned_suite import PlannedSuite, slug, slugs

@@ -5,10 +5,10 @@ from unicodedata import category
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-from probe_kit.extract.run_layout import AskTokens, LaterViews
 from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.hooks.contract.protocol import ProtocolName
 from probe_kit.hooks.family import Dtype
+from probe_kit.runs.layout import AskTokens, LaterViews
 from probe_kit.scene_names import ArmName, Rendering, SceneName
 from probe_kit.train.choices import Baseline, Target
 

@@ -13,7 +13,7 @@ from probe_kit.train import command_options as own
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from probe_kit.extract import Run
+    from probe_kit.runs import Run
     from probe_kit.train import Baseline, ProbeResults, RunReader, Target
     from probe_kit.train.results.inventory import Inventory, StoredProbes
 
@@ -54,7 +54,7 @@ def train(
     are loaded, not fitted again. To decode a label of your own, give its table and column:
     `probe-kit train RUN --labels labels.csv --target drawer --task classes`.
     """
-    from probe_kit.extract import open_run
+    from probe_kit.runs import open_run
     from probe_kit.train.label_commands import (
         ColumnOptions,
         TransferOptions,

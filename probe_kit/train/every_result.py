@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from functools import partial
 
-from probe_kit.extract.store.run import Run
+from probe_kit.runs.run import Run
 from probe_kit.train.labels.label_store import is_of_label, load_label_results
 from probe_kit.train.results.inventory import stored_probes
 from probe_kit.train.results.probe_results import ProbeResults

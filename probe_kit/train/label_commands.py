@@ -32,7 +32,7 @@ def labels(
     """
     from probe_kit._system.csv_text import csv_of_frame
     from probe_kit._system.drafts import draft_of
-    from probe_kit.extract import open_run
+    from probe_kit.runs import open_run
     from probe_kit.train.labels.builtin_columns import label_frame, why_no_sim
 
     if out_file.exists():

@@ -9,7 +9,7 @@ import numpy as np
 
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
-from probe_kit.extract.store.recorded.scene_only import check_scene_run
+from probe_kit.runs.scene_only import check_scene_run
 from probe_kit.statistics.folds import FoldUnit, sums_by_group
 from probe_kit.train.choices import Baseline, Incomplete, LabelControl, Target
 from probe_kit.train.controls.fit_controls import add_baselines, add_untrained, check_untrained, prepare_baselines

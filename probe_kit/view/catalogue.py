@@ -5,10 +5,10 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from probe_kit.extract import Run
-from probe_kit.extract.store.thumbnails import read_sheet
 from probe_kit.hashing import sha256_json
 from probe_kit.retention.columns.glossary import VIEWER_WORDS
+from probe_kit.runs import Run
+from probe_kit.runs.thumbnails import read_sheet
 from probe_kit.view.payloads.coding import failure_script, payload_script
 from probe_kit.view.payloads.episode_payload import episode_payload
 from probe_kit.view.payloads.episodes_payload import episodes_payload

@@ -13,7 +13,7 @@ from probe_kit.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from probe_kit.extract import Run
+    from probe_kit.runs import Run
 
 RUNS_BY_NAME: "list[Callable[[str], list[Run] | None]]" = []
 """What finds several runs by one name, or None for a name that it does not know; the command line adds studies."""
@@ -57,7 +57,7 @@ def view(
 
     A server on this machine shows unfinished runs too and follows their new episodes. Ctrl-C ends it.
     """
-    from probe_kit.extract import open_run
+    from probe_kit.runs import open_run
 
     lender = None if probes_of is None else open_run(probes_of, allow_partial=True)
     if export is None:
@@ -75,8 +75,8 @@ def view(
 
 def _opened(names: list[str], partial: bool) -> "list[Run]":
     """Return the runs of these names: a run, the runs below a folder, or those that `RUNS_BY_NAME` knows."""
-    from probe_kit.extract import open_run
-    from probe_kit.extract.store.locations.run_folders import find_runs, is_run
+    from probe_kit.runs import open_run
+    from probe_kit.runs.run_folders import find_runs, is_run
 
     found: list[Run] = []
     for name in names:

@@ -7,7 +7,7 @@ from pathlib import Path
 from probe_kit._system.bounded_files import open_regular
 from probe_kit._system.drafts import draft_of
 from probe_kit.errors import UnknownCategoryError, UsageError
-from probe_kit.extract import Run
+from probe_kit.runs import Run
 from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.page_files import page_files
 

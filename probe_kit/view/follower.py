@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from probe_kit.extract.run_layout import COMMITS, FAILED
+from probe_kit.runs.layout import COMMITS, FAILED
 from probe_kit.view.catalogue import Catalogue
 
 

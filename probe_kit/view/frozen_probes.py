@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.extract import Run
-from probe_kit.extract.run_layout import MEAN_VIEW
-from probe_kit.extract.store.format.arrays import decode_bfloat16
-from probe_kit.extract.store.format.rows import Rows
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.runs import Run
+from probe_kit.runs.arrays import decode_bfloat16
+from probe_kit.runs.layout import MEAN_VIEW
+from probe_kit.runs.rows import Rows
 from probe_kit.train.data.samples import is_token_view
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_directions import Direction, read_directions

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.extract import Run
-from probe_kit.extract.store.recorded.scene_only import check_scene_run
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.runs import Run
+from probe_kit.runs.scene_only import check_scene_run
 from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults

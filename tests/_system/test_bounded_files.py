@@ -122,7 +122,7 @@ UNBOUNDED = {
 ELSEWHERE = {
     "_system/bounded_yaml.py": "the reader itself",
     "_system/bounded_arrays.py": "the reader itself",
-    "extract/store/exports/matrices.py": "the matrix that it has just written",
+    "runs/export/matrices.py": "the matrix that it has just written",
     "_system/parquet_files.py": "the reader itself",
     "_system/machine.py": "files of the system",
     "doctor.py": "files of the system",
@@ -135,9 +135,9 @@ ELSEWHERE = {
     "suite/build.py": "files of the package",
     "view/page_files.py": "files of the package",
     "retention/report/render.py": "files of the package",
-    "extract/store/provenance.py": "files of the package",
+    "runs/provenance.py": "files of the package",
     "extract/rollout/worker.py": "the video that it has just written",
-    "extract/store/locations/folder.py": "objects of a run, by its own check of regular files",
+    "runs/folder.py": "objects of a run, by its own check of regular files",
 }
 
 

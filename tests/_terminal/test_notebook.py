@@ -11,9 +11,9 @@ from nbclient import NotebookClient
 from nbformat import NotebookNode
 
 from probe_kit._terminal.notebook import PROGRESS_MARK, facts_html, notebook_progress
-from probe_kit.extract import Run, open_run
 from probe_kit.hooks import capture, load_policy
 from probe_kit.hooks.testing import example_observations
+from probe_kit.runs import Run, open_run
 from probe_kit.train import ProbeResults, train_probes
 
 INLINE = "module://matplotlib_inline.backend_inline"

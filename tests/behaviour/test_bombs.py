@@ -26,10 +26,10 @@ from probe_kit._system import bounded_json
 from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit._system.bounded_json import load_gzipped_json, parse_json
 from probe_kit.errors import RunDamagedError, SuiteError, UsageError, WeightsError
-from probe_kit.extract import Run, open_run, verify_run
-from probe_kit.extract.store.format.arrays import open_array
-from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hooks.checkpoints.weights import read_pickle, read_weights
+from probe_kit.runs import Run, open_run, verify_run
+from probe_kit.runs.arrays import open_array
+from probe_kit.runs.store import locate
 from probe_kit.study import load_study
 from probe_kit.suite import Suite
 from probe_kit.suite.pictures import decode_bytes, rgb_of

@@ -8,9 +8,9 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
-from probe_kit.extract import open_run
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.writer import RunWriter
+from probe_kit.runs import open_run
+from probe_kit.runs.store import locate
+from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite
 from tests.support.little_run import little_plan, little_settings
 

@@ -12,10 +12,10 @@ from probe_kit._terminal.console import out
 from probe_kit.cli import app
 from probe_kit.demo.commands import print_demo
 from probe_kit.demo.pipeline import Demo
-from probe_kit.extract import open_run
 from probe_kit.intervene import load_effects
 from probe_kit.intervene.commands import print_result
 from probe_kit.retention import retention_table
+from probe_kit.runs import open_run
 
 WIDTHS = (80, 100, 120, 200)
 LAST = 40

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.extract import verify_run
+from probe_kit.runs import verify_run
 from probe_kit.suite import Suite
 from tests.support.reading import readings
 

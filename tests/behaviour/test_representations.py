@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from probe_kit.errors import ProbeKitError, RunDamagedError
-from probe_kit.extract import Run, open_run, verify_run
-from probe_kit.extract.store.format.commits import write_failure
-from probe_kit.extract.store.format.hashes import HASH, as_record, read_record
-from probe_kit.extract.store.thumbnails import read_thumbnail
 from probe_kit.intervene import stored_interventions
 from probe_kit.intervene.results.inventory import listed_interventions
+from probe_kit.runs import Run, open_run, verify_run
+from probe_kit.runs.commits import write_failure
+from probe_kit.runs.records import HASH, as_record, read_record
+from probe_kit.runs.thumbnails import read_thumbnail
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.results.inventory import inventory
 from tests.support.faults import Fault, Stored, applied

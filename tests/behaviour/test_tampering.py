@@ -14,15 +14,15 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import RunDamagedError, RunIncompleteError
-from probe_kit.extract import open_run, seal, verify_run
-from probe_kit.extract.store.format.commits import write_failure
-from probe_kit.extract.store.format.hashes import Sum, as_record
-from probe_kit.extract.store.integrity.orphans import known_keys
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.run import Run
-from probe_kit.extract.store.thumbnails import read_thumbnail, thumbnail_key
 from probe_kit.intervene import stored_image_swaps
 from probe_kit.retention import retention_table
+from probe_kit.runs import open_run, seal, verify_run
+from probe_kit.runs.commits import write_failure
+from probe_kit.runs.orphans import known_keys
+from probe_kit.runs.records import Sum, as_record
+from probe_kit.runs.run import Run
+from probe_kit.runs.store import locate
+from probe_kit.runs.thumbnails import read_thumbnail, thumbnail_key
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.results.resume import SweepCheckpoint

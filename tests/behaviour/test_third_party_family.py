@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from probe_kit.extract import Run
+from probe_kit.runs import Run
 from probe_kit.suite import Suite
 from tests.support.distributions import install
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract import verify_run
+from probe_kit.runs import verify_run
 from tests.support.reading import readings
 from tests.support.rehashing import write_record
 

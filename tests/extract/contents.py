@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-from probe_kit.extract import open_run
-from probe_kit.extract.run_layout import COLUMNS
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.locations.location import Location
+from probe_kit.runs import open_run
+from probe_kit.runs.layout import COLUMNS
+from probe_kit.runs.store import Location, locate
 
 
 def objects(run: str | Path | Location) -> dict[str, bytes]:

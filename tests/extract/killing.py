@@ -18,11 +18,9 @@ from zarr.storage import LocalStore
 from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
-from probe_kit.extract.run_layout import StoredStream
-from probe_kit.extract.store import sealing, writer
-from probe_kit.extract.store.format import commits
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.locations.location import Location
+from probe_kit.runs import commits, sealing, writer
+from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.store import Location, locate
 from probe_kit.suite import load_suite
 
 STREAMS = [

@@ -19,9 +19,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from little_run import certify, episode, little_plan, little_settings
 
-from probe_kit.extract import open_run, seal
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.writer import RunWriter
+from probe_kit.runs import open_run, seal
+from probe_kit.runs.store import locate
+from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import load_suite
 from probe_kit.train import train_probes
 

@@ -11,17 +11,7 @@ import torch
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import InstructionError, SettingsMismatchError, UsageError
-from probe_kit.extract import (
-    AskSettings,
-    ExtractSettings,
-    Run,
-    ask_run,
-    extract_run,
-    open_run,
-    prepare,
-    prepare_asks,
-    verify_run,
-)
+from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run, prepare, prepare_asks
 from probe_kit.extract.plan import plan_episodes
 from probe_kit.extract.prepared import load_answer_model
 from probe_kit.extract.rollout.answer_controller import AnswerController, AskTurn
@@ -30,6 +20,7 @@ from probe_kit.extract.rollout.examples import example_observations
 from probe_kit.extract.vqa.templates import P1, P2, SEEN, Template
 from probe_kit.hooks import AnswerModel, Prompt, Reading, Site
 from probe_kit.retention import success_rate
+from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.suite import Suite, load_suite
 from tests.support.position_models import PositionModel, always, likes
 from tests.support.prismatic_checkpoints import write_checkpoint

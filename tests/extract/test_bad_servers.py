@@ -15,12 +15,12 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import ProbeKitError, StoreError
-from probe_kit.extract import Run, open_run, seal, verify_run
-from probe_kit.extract.run_layout import COLUMNS
-from probe_kit.extract.store.locations import bucket as buckets
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.run import NotSealedWarning
 from probe_kit.hooks import Site
+from probe_kit.runs import Run, open_run, seal, verify_run
+from probe_kit.runs import bucket as buckets
+from probe_kit.runs.layout import COLUMNS
+from probe_kit.runs.run import NotSealedWarning
+from probe_kit.runs.store import locate
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
 from tests.extract.contents import objects

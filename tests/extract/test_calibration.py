@@ -9,9 +9,10 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
-from probe_kit.extract import ExtractSettings, calibration, extract_run, open_run, prepare
+from probe_kit.extract import ExtractSettings, calibration, extract_run, prepare
 from probe_kit.extract.calibration import choose, inference_times, largest_batch
 from probe_kit.extract.rollout.controllers import PolicyController
+from probe_kit.runs import open_run
 from probe_kit.suite import Suite
 
 SHORT = SceneSpec(max_steps=2)

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepare, verify_run
+from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.success_rate import success_rate
 from probe_kit.retention.compare.differences import ComparedSides, Side, pair_differences
@@ -19,6 +19,7 @@ from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.report import write_report
 from probe_kit.retention.rows.build import RowSettings, run_rows
+from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
 from tests.support.pi0_checkpoints import write_intact

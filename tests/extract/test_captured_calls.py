@@ -20,27 +20,18 @@ from probe_kit.errors import (
     UnknownSiteError,
     UsageError,
 )
-from probe_kit.extract import (
-    ExtractSettings,
-    Run,
-    copy_run,
-    export_run,
-    extract_run,
-    open_run,
-    prepare,
-    seal,
-    verify_run,
-)
+from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.plan import make_plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
-from probe_kit.extract.run_layout import LaterViews, StoredStream
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks import Site
 from probe_kit.retention import retention_table
 from probe_kit.retention.displays import collect_figures
 from probe_kit.retention.estimators.by_call import CallCurves
+from probe_kit.runs import Run, copy_run, export_run, open_run, seal, verify_run
+from probe_kit.runs.layout import LaterViews, StoredStream
+from probe_kit.runs.store import locate
+from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.results.by_call import load_results_by_call

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from probe_kit.errors import DiskSpaceError
-from probe_kit.extract import open_run, verify_run
-from probe_kit.extract.store.locations.locate import locate
+from probe_kit.runs import open_run, verify_run
+from probe_kit.runs.store import locate
 from probe_kit.suite import Suite, build_suite
 
 KILLING = Path(__file__).with_name("killing.py")

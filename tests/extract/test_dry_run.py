@@ -15,10 +15,10 @@ from probe_kit.extract import AskSettings, ExtractSettings, prepare
 from probe_kit.extract.extraction import prepare_asks
 from probe_kit.extract.needs import weights_needed
 from probe_kit.extract.plan import Plan
-from probe_kit.extract.store.locations.disk import in_units
 from probe_kit.hooks import load_model
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.registry import own_families
+from probe_kit.runs.disk import in_units
 from probe_kit.suite import Suite, build_suite, default_suite, load_suite
 from probe_kit.suite.validation.sufficiency import sufficiencies
 from tests.support.every_checkpoint import WRITERS

@@ -20,15 +20,16 @@ from probe_kit.errors import (
     SuiteError,
     UsageError,
 )
-from probe_kit.extract import Extraction, ExtractSettings, extract_run, open_run, prepare
+from probe_kit.extract import Extraction, ExtractSettings, extract_run, prepare
 from probe_kit.extract.rollout.stage import LocalStage
 from probe_kit.extract.rollout.stage_process import ProcessStage
-from probe_kit.extract.store.certificates import write_certificate
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.provenance import provenance_here
 from probe_kit.extract.workers.ray import RayActor
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.runs import open_run
+from probe_kit.runs.certificates import write_certificate
+from probe_kit.runs.provenance import provenance_here
+from probe_kit.runs.store import locate
 from probe_kit.suite import Suite, build_suite
 
 SHORT = SceneSpec(max_steps=2)

@@ -20,10 +20,11 @@ from probe_kit.errors import (
     UnknownModelError,
     UsageError,
 )
-from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
+from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.prepared import load_acting_policy
 from probe_kit.hooks import Site, Tap
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.runs import open_run
 from probe_kit.suite import Suite, build_suite
 
 SHORT = SceneSpec(max_steps=2)
@@ -102,7 +103,7 @@ def test_a_crash_while_the_folder_was_made_leaves_nothing_in_the_way(
     two_items: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = ExtractSettings("expert", suite=two_items.folder, scene=SHORT)
-    monkeypatch.setattr("probe_kit.extract.store.writer.create_arrays", _crash)
+    monkeypatch.setattr("probe_kit.runs.writer.create_arrays", _crash)
     with pytest.raises(CrashError):
         extract_run(settings, tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -11,17 +11,8 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError
-from probe_kit.extract import (
-    AskSettings,
-    ExtractSettings,
-    Run,
-    ask_run,
-    extract_run,
-    label_run,
-    open_run,
-    prepare,
-    verify_run,
-)
+from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run, prepare
+from probe_kit.runs import Run, label_run, open_run, verify_run
 from probe_kit.suite import Suite
 
 pytestmark = pytest.mark.slow

@@ -10,10 +10,10 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, extract_run, prepare
-from probe_kit.extract.run_layout import RUN_FILE
-from probe_kit.extract.store.locations.folder import Folder
 from probe_kit.extract.workers.processes import MORE, serve
 from probe_kit.extract.workers.ray import RayActor
+from probe_kit.runs.folder import Folder
+from probe_kit.runs.layout import RUN_FILE
 from probe_kit.suite import Suite
 
 EPISODES = [0, 1]

@@ -11,13 +11,13 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import RunDamagedError, SettingsMismatchError, UsageError
-from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, prepare, verify_run
-from probe_kit.extract.store import provenance
-from probe_kit.extract.store.format.hashes import HASH
-from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.hashing import sha256_json
 from probe_kit.retention import retention_table
 from probe_kit.retention.report import report_html
+from probe_kit.runs import Run, open_run, provenance, verify_run
+from probe_kit.runs.records import HASH
+from probe_kit.runs.store import locate
 from probe_kit.suite import Suite, build_suite
 
 SHORT = SceneSpec(max_steps=2)

@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from probe_kit.extract import open_run, verify_run
-from probe_kit.extract.run_layout import COLUMNS
-from probe_kit.extract.store.locations.locate import locate
+from probe_kit.runs import open_run, verify_run
+from probe_kit.runs.layout import COLUMNS
+from probe_kit.runs.store import locate
 from probe_kit.suite import Suite, build_suite
 
 NURSERY = Path(__file__).with_name("nursery.py")

@@ -8,9 +8,10 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError, UsageError
-from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Site
 from probe_kit.retention import retention_table
+from probe_kit.runs import Run
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from tests.support import internvla_checkpoints, xiaomi_checkpoints

@@ -13,10 +13,11 @@ import pytest
 from probe_kit._system.installing import install_command
 from probe_kit.env import SceneSpec
 from probe_kit.errors import MissingExtraError
-from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, verify_run
-from probe_kit.extract.run_layout import COMMITS
-from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.extract.workers.worker_errors import WorkerLostWarning
+from probe_kit.runs import Run, open_run, verify_run
+from probe_kit.runs.layout import COMMITS
+from probe_kit.runs.store import locate
 from probe_kit.suite import build_suite
 from tests.extract.contents import objects
 from tests.extract.two_nodes import TwoNodes, two_nodes, wait_for

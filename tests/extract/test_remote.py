@@ -11,11 +11,11 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import RunDamagedError, RunNotFoundError, SettingsMismatchError, StoreError
-from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, seal, verify_run
-from probe_kit.extract.run_layout import COLUMNS
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.locations.location import Location
+from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Site
+from probe_kit.runs import Run, open_run, seal, verify_run
+from probe_kit.runs.layout import COLUMNS
+from probe_kit.runs.store import Location, locate
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import load_results, train_probes
 from tests.extract.contents import objects

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.locations.run_folders import find_runs, runs_in
+from probe_kit.runs.run_folders import find_runs, runs_in
 from probe_kit.view.commands import _opened
 
 

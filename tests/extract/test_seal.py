@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract import Run, open_run, seal
-from probe_kit.extract.store.run import NotSealedWarning
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs import Run, open_run, seal
+from probe_kit.runs.run import NotSealedWarning
 
 SITES = (Site("backbone", 2), Site("expert", 3, iteration=7))
 
@@ -72,7 +72,7 @@ def test_what_a_killed_seal_left_is_cleared_by_the_next_one(copy: Path, finished
 def test_a_slab_smaller_than_the_run_changes_nothing(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = tree(copy)
     shutil.rmtree(copy / "columns.zarr")
-    monkeypatch.setattr("probe_kit.extract.store.sealing.SLAB_BYTES", 3 * 48 * 96 * 4)
+    monkeypatch.setattr("probe_kit.runs.sealing.SLAB_BYTES", 3 * 48 * 96 * 4)
     seal(copy)
     assert tree(copy) == before
 
@@ -133,7 +133,7 @@ def test_the_gram_matrix_equals_the_one_computed_in_float64(recorded_run: Run) -
 def test_reading_a_run_needs_neither_torch_nor_simulator(recorded_run: Run) -> None:
     code = f"""
 import sys
-from probe_kit.extract import open_run
+from probe_kit.runs import open_run
 from probe_kit.hooks.contract.sites import Site
 run = open_run({str(recorded_run.path)!r})
 run.column(Site("backbone", 1)), run.tokens(Site("backbone", 1), "language"), run.gram(Site("backbone", 1))

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract import Run, open_run, seal, verify_run
-from probe_kit.extract.run_layout import COLUMNS
-from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hooks import Site
 from probe_kit.intervene.store.answers import find_stored
+from probe_kit.runs import Run, open_run, seal, verify_run
+from probe_kit.runs.layout import COLUMNS
+from probe_kit.runs.store import locate
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
 from probe_kit.train.results.store import read_probes

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import zarr
 
-from probe_kit.extract import open_run, verify_run
 from probe_kit.extract.plan import Plan
-from probe_kit.extract.store import writer as writers
-from probe_kit.extract.store.format.commits import commit_key
-from probe_kit.extract.store.format.resume_pieces import Pieces
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.writer import EpisodeRecord
+from probe_kit.runs import open_run, verify_run
+from probe_kit.runs import writer as writers
+from probe_kit.runs.commits import commit_key
+from probe_kit.runs.resume_pieces import Pieces
+from probe_kit.runs.store import locate
+from probe_kit.runs.writer import EpisodeRecord
 from probe_kit.suite import Suite
 from tests.support.little_run import episode, little_plan, little_writer
 

@@ -7,10 +7,11 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import InstructionError, UsageError
-from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
+from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.plan import plan_episodes
 from probe_kit.hooks import Site
 from probe_kit.retention import retention_table
+from probe_kit.runs import open_run
 from probe_kit.suite import build_suite
 from probe_kit.train.results.inventory import inventory
 

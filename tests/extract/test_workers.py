@@ -12,9 +12,10 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import EpisodesFailedError, RunIncompleteError, StageDiedError
-from probe_kit.extract import ExtractSettings, extract_run, open_run, prepare
+from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.rollout.stage_process import ProcessStage
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs import open_run
 from probe_kit.suite import Suite, build_suite
 
 SHORT = SceneSpec(max_steps=2)

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract import open_run
 from probe_kit.hooks.new_adapter import write_adapter
+from probe_kit.runs import open_run
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import load_results
 

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from probe_kit.extract import Run, open_run
 from probe_kit.intervene import ReplaySource
 from probe_kit.intervene.replay.session import ReplaySession, open_session
+from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite
 
 if TYPE_CHECKING:

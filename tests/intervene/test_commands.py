@@ -8,16 +8,16 @@ import pytest
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.extract import Run
 from probe_kit.intervene import ImageSwap
 from probe_kit.intervene.store.settings import settings_of
+from probe_kit.runs import Run
 from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
 
 
 @pytest.fixture
 def run(recorded_run: Run, tmp_path: Path) -> Run:
     """With a stored intervention whose answers are made up."""
-    from probe_kit.extract import open_run
+    from probe_kit.runs import open_run
 
     copy = open_run(shutil.copytree(recorded_run.path, tmp_path / "run"))
     outcomes = outcomes_of({"color": follower(24), "shape": habit(24)})

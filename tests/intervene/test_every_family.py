@@ -7,7 +7,7 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UnsupportedInterventionError
-from probe_kit.extract import ExtractSettings, Run, extract_run
+from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Policy
 from probe_kit.hooks.registry import find_family, own_families
 from probe_kit.intervene import (
@@ -25,6 +25,7 @@ from probe_kit.intervene import (
     run_intervention,
 )
 from probe_kit.intervene.replay.conditions import Intervention
+from probe_kit.runs import Run
 from probe_kit.suite import Suite
 from tests.support.acting_checkpoints import FAMILIES
 

@@ -21,9 +21,8 @@ from probe_kit.errors import (
     UnknownCategoryError,
     UsageError,
 )
-from probe_kit.extract import ExtractSettings, Run, open_run, verify_run
+from probe_kit.extract import ExtractSettings
 from probe_kit.extract.rollout.stage import Seen, Stage
-from probe_kit.extract.store.sources import RunSources
 from probe_kit.intervene import (
     ImageSwap,
     InstructionSwap,
@@ -37,6 +36,8 @@ from probe_kit.intervene.replay.rollout import planned_of
 from probe_kit.intervene.replay.session import ReplaySession, load_policy_of, open_session
 from probe_kit.intervene.runner import too_few_groups
 from probe_kit.retention import retention_table
+from probe_kit.runs import Run, open_run, verify_run
+from probe_kit.runs.sources import RunSources
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

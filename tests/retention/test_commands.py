@@ -9,9 +9,9 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
-from probe_kit.extract import open_run
 from probe_kit.retention import retention_table
 from probe_kit.retention.commands import _keys
+from probe_kit.runs import open_run
 from probe_kit.train import ArrayRun
 from probe_kit.train.results.inventory import inventory
 

@@ -17,8 +17,6 @@ import pytest
 from rich.console import Console
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
 from probe_kit.intervene.kinds.image_swap.verdict import Behaviour
 from probe_kit.intervene.store.settings import FORMAT
 from probe_kit.retention import RetentionTable, retention_table
@@ -33,6 +31,8 @@ from probe_kit.retention.report import report_html, write_report
 from probe_kit.retention.report.episodes import BLOCK, episode_grid
 from probe_kit.retention.report.provenance import citation
 from probe_kit.retention.report.summaries import _clear_words, read_run
+from probe_kit.runs.store import locate
+from probe_kit.runs.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
 from probe_kit.train import ArrayRun, load_results
 from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.store import save_results

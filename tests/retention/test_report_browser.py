@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.retention.report import write_report
+from probe_kit.runs.store import locate
+from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.train import ArrayRun
 
 pytestmark = [

@@ -15,11 +15,12 @@ from probe_kit.env import SceneSpec
 from probe_kit.env.scoring.rules import RULES
 from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.errors import NoTrajectoryError, UsageError
-from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
+from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.retention import FinalPositionsDisplay, OutcomeRulesDisplay, retention_table, success_rate
 from probe_kit.retention.displays import collect_figures
 from probe_kit.retention.report import report_html
 from probe_kit.retention.rows.outcome_rules import rule_sentence
+from probe_kit.runs import Run, open_run
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.suite import build_suite
 from probe_kit.train import ArrayRun

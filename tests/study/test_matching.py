@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from probe_kit.errors import SettingsMismatchError
-from probe_kit.extract import ExtractSettings, Run, open_run
-from probe_kit.extract.store.locations.locate import locate
+from probe_kit.extract import ExtractSettings
 from probe_kit.retention.compare.common_items import common_items
+from probe_kit.runs import Run, open_run
+from probe_kit.runs.store import locate
 from probe_kit.study.cells import Cell
 from probe_kit.study.matching import check_same_items, differences
 from probe_kit.study.planned_suite import planned_suite

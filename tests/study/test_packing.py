@@ -10,8 +10,8 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import NoTrajectoryError, RunDamagedError, UsageError
-from probe_kit.extract import copy_run, open_run, verify_run
 from probe_kit.retention import retention_table
+from probe_kit.runs import copy_run, open_run, verify_run
 from probe_kit.study import LoadedStudy, load_study, make_table, pack_study, plan_study
 from probe_kit.study.tables.formats import table_of_record, table_record
 

@@ -12,8 +12,8 @@ from random import Random
 from typing import Any
 
 from probe_kit.errors import ProbeKitError, RunNotFoundError
-from probe_kit.extract import verify_run
-from probe_kit.extract.store.integrity.audit import Audit
+from probe_kit.runs import verify_run
+from probe_kit.runs.verify import Audit
 from tests.support.reading import readings
 
 Change = Mapping[Path, bytes | None]

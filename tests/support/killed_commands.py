@@ -16,11 +16,11 @@ from pathlib import Path
 from random import Random
 from uuid import uuid4
 
-from probe_kit.extract import verify_run
-from probe_kit.extract.run_layout import CERTIFICATES, COMMITS
-from probe_kit.extract.run_layout import TIMES as TIMES_OF_EPISODES
-from probe_kit.extract.store.format.bundles import HEAD, PARTIAL
-from probe_kit.extract.store.format.bundles import TIMES as TIMES_OF_RESULTS
+from probe_kit.runs import verify_run
+from probe_kit.runs.layout import CERTIFICATES, COMMITS
+from probe_kit.runs.layout import TIMES as TIMES_OF_EPISODES
+from probe_kit.runs.results import HEAD, PARTIAL
+from probe_kit.runs.results import TIMES as TIMES_OF_RESULTS
 
 LONGEST_S = 900
 """Seconds that one command may take."""

@@ -9,17 +9,16 @@ from numpy.typing import NDArray
 
 from probe_kit.env.scoring.trajectory import CHANNELS
 from probe_kit.env.spec import SceneSpec
-from probe_kit.extract import Run, open_run, seal
 from probe_kit.extract.plan import Plan, make_plan
-from probe_kit.extract.run_layout import StoredStream
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.locations.location import Location
-from probe_kit.extract.store.seconds import Seconds
-from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
-from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.hashing import derive_seed
 from probe_kit.intervene import ConditionOutcomes, ImageSwap
 from probe_kit.intervene.store.settings import settings_of
+from probe_kit.runs import Run, open_run, seal
+from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.seconds import Seconds
+from probe_kit.runs.store import Location, locate
+from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from tests.intervene.answers import store_outcomes

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from probe_kit.extract import open_run
-from probe_kit.extract.store.run import NotSealedWarning, Run
-from probe_kit.extract.store.thumbnails import read_thumbnail
 from probe_kit.intervene import load_effects, stored_interventions
+from probe_kit.runs import open_run
+from probe_kit.runs.run import NotSealedWarning, Run
+from probe_kit.runs.thumbnails import read_thumbnail
 from probe_kit.train import load_results
 from probe_kit.train.results.inventory import inventory
 

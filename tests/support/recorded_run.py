@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from probe_kit.extract import Run, open_run, seal
 from probe_kit.extract.recordings.recorded_plan import SIDE, PlannedStretch, RecordedPlan
-from probe_kit.extract.run_layout import CAPTURE_ONLY, StoredStream
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
 from probe_kit.hashing import derive_seed
+from probe_kit.runs import Run, open_run, seal
+from probe_kit.runs.layout import CAPTURE_ONLY, StoredStream
+from probe_kit.runs.store import locate
+from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from tests.support.little_run import certify
 
 STREAMS = (StoredStream("backbone", 2, 6, None, 4, ("mean",), quantities=("residual",)),)

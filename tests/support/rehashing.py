@@ -8,9 +8,9 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from probe_kit.extract.store.format.arrays import at_extent, inner_chunks
-from probe_kit.extract.store.format.hashes import BLOCK_BYTES, HASH, Sum, as_record, block_digest
 from probe_kit.hashing import sha256_json
+from probe_kit.runs.arrays import at_extent, inner_chunks
+from probe_kit.runs.records import BLOCK_BYTES, HASH, Sum, as_record, block_digest
 
 
 def rehash(run: Path) -> None:

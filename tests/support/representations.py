@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from probe_kit.extract.store.format.hashes import HASH, as_json, as_record, digest
+from probe_kit.runs.records import HASH, as_json, as_record, digest
 
 Content = dict[str, Any]
 Way = Callable[[Content], bytes]

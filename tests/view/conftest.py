@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
 from probe_kit.env.scoring.trajectory import CHANNELS
-from probe_kit.extract import Run, label_run, open_run, seal
 from probe_kit.extract.plan import make_plan
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
-from probe_kit.extract.store.writer import EpisodeRecord, RunWriter
+from probe_kit.runs import Run, label_run, open_run, seal
+from probe_kit.runs.store import locate
+from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from probe_kit.view import write_viewer

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from probe_kit.extract import Run, open_run
-from probe_kit.extract.store.format.commits import write_failure
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.thumbnails import decode_frames, read_sheet, read_thumbnail
 from probe_kit.intervene.store.answers import stored_interventions
+from probe_kit.runs import Run, open_run
+from probe_kit.runs.commits import write_failure
+from probe_kit.runs.store import locate
+from probe_kit.runs.thumbnails import decode_frames, read_sheet, read_thumbnail
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
 from probe_kit.train.results.by_call import load_results_by_call

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UnknownCategoryError, UsageError
-from probe_kit.extract import open_run
+from probe_kit.runs import open_run
 from probe_kit.view import write_viewer
 from probe_kit.view.page_files import APP, page_files
 

@@ -8,9 +8,9 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
-from probe_kit.extract import Run, open_run
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.writer import RunWriter
+from probe_kit.runs import Run, open_run
+from probe_kit.runs.store import locate
+from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
 from probe_kit.view.catalogue import Catalogue

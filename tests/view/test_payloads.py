@@ -14,14 +14,14 @@ from probe_kit.env.scoring.events import EVENTS, Events
 from probe_kit.env.scoring.rules import RULES
 from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.errors import RunDamagedError, UsageError
-from probe_kit.extract import Run, open_run
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
-from probe_kit.extract.store.writer import RunWriter
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.kinds.image_swap.effects import stored_image_swaps
 from probe_kit.intervene.store.answers import stored_interventions
 from probe_kit.retention import retention_table
+from probe_kit.runs import Run, open_run
+from probe_kit.runs.store import locate
+from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
 from probe_kit.train.results.by_call import load_results_by_call

@@ -16,10 +16,9 @@ import pytest
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.extract import Run, open_run, seal
-from probe_kit.extract.store.format import commits
-from probe_kit.extract.store.format.root import Root
-from probe_kit.extract.store.locations.locate import locate
+from probe_kit.runs import Run, commits, open_run, seal
+from probe_kit.runs.root import Root
+from probe_kit.runs.store import locate
 from probe_kit.suite import Suite
 from probe_kit.view.catalogue import Catalogue
 from tests.support.little_run import episode, little_plan, little_writer

@@ -6,8 +6,8 @@ from typing import Any, Self
 
 from probe_kit.extract.own_environments.contract import EnvEpisode
 from probe_kit.extract.plan import RowPlan
-from probe_kit.extract.run_layout import ENVIRONMENT
 from probe_kit.hashing import derive_seed
+from probe_kit.runs.layout import ENVIRONMENT
 
 CATEGORY = "all"
 """Of every row: environments have no categories."""

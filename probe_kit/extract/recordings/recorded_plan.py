@@ -12,8 +12,8 @@ from probe_kit.extract.recordings.lerobot_folder import MOST_FRAMES, LeRobotFold
 from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
 from probe_kit.extract.recordings.lerobot_meta import IMAGE
 from probe_kit.extract.recordings.lerobot_source import ACTION, IMAGES, STATE, LeRobotSource, Pairs
-from probe_kit.extract.run_layout import OTHER_ACTIONS, RECORDED_EPISODES
 from probe_kit.hashing import derive_seed
+from probe_kit.runs.layout import OTHER_ACTIONS, RECORDED_EPISODES
 
 CATEGORY = "all"
 """Of every row: recordings have no categories."""

@@ -14,7 +14,6 @@ import numpy as np
 from probe_kit.errors import PolicyFailedError, UsageError
 from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
-from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import AskSettings
 from probe_kit.extract.vqa.letter_lens import letter_margins
 from probe_kit.extract.vqa.parsing import Said, read_answer
@@ -23,6 +22,7 @@ from probe_kit.extract.vqa.pictures import side_by_side
 from probe_kit.extract.vqa.scores import Choice, outcome_of, side_expected, side_said
 from probe_kit.extract.vqa.templates import Order, sides
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.layout import StoredStream
 from probe_kit.suite import Suite
 from probe_kit.suite.wording import side_words
 

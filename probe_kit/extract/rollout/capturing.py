@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import CaptureChangedActionError
-from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hooks.contract.views import view_names
+from probe_kit.runs.layout import StoredStream
 
 if TYPE_CHECKING:
     from torch import Tensor

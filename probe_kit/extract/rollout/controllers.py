@@ -13,13 +13,13 @@ from probe_kit.env.robot.controller import ACTION_SIZE
 from probe_kit.errors import PolicyFailedError, ProbeKitError
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
 from probe_kit.extract.rollout.executed_actions import executed_actions
-from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import Edit, Vectors
 from probe_kit.hooks.checkpoints.containment import begin_randomness, copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.protocol import PLAIN, Rotation
+from probe_kit.runs.layout import StoredStream
 
 if TYPE_CHECKING:
     from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from probe_kit.extract.run_layout import MEAN_VIEW, LaterViews, StoredStream
-from probe_kit.extract.store.format.arrays import NOT_A_NUMBER
+from probe_kit.runs.arrays import NOT_A_NUMBER
+from probe_kit.runs.layout import MEAN_VIEW, LaterViews, StoredStream
 
 if TYPE_CHECKING:
     import torch

@@ -14,11 +14,11 @@ from probe_kit.extract.rollout.controllers import ActingController, Turn, count_
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.events import traceback_of
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, StageRequest
-from probe_kit.extract.run_layout import LATER
-from probe_kit.extract.store.seconds import Seconds
-from probe_kit.extract.store.small_frames import SmallFrames
-from probe_kit.extract.store.writer import EpisodeRecord
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.layout import LATER
+from probe_kit.runs.seconds import Seconds
+from probe_kit.runs.small_frames import SmallFrames
+from probe_kit.runs.writer import EpisodeRecord
 
 
 @dataclass(frozen=True)

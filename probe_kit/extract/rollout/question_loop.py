@@ -10,9 +10,9 @@ from probe_kit.extract.rollout.controllers import count_lost_words
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Failure, Rollout
 from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Seen
-from probe_kit.extract.store.seconds import Seconds
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.runs.seconds import Seconds
 
 
 class _Chair:

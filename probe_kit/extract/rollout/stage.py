@@ -25,9 +25,9 @@ from probe_kit.errors import (
     StageDiedError,
 )
 from probe_kit.extract.plan import PlannedEpisode
-from probe_kit.extract.run_layout import CAPTURE_ONLY, FrameChoice
-from probe_kit.extract.store.small_frames import FILM_HEIGHT, SmallFrames, shrink
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.layout import CAPTURE_ONLY, FrameChoice
+from probe_kit.runs.small_frames import FILM_HEIGHT, SmallFrames, shrink
 from probe_kit.suite.items import Side
 
 # What one episode can get wrong by itself; everything else is wrong with the whole run and stops it.

@@ -7,7 +7,7 @@ from probe_kit._execution.child_process import Child
 from probe_kit.errors import ProbeKitError, StageDiedError
 from probe_kit.extract.rollout.events import add_traceback
 from probe_kit.extract.rollout.stage import Answer, Ending, Stage, StageKind, StageRequest, TimedStage
-from probe_kit.extract.run_layout import FrameChoice
+from probe_kit.runs.layout import FrameChoice
 
 
 class ProcessStage:

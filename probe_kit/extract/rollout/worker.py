@@ -14,7 +14,7 @@ from PIL import Image
 
 from probe_kit.env import save_gif
 from probe_kit.extract.own_environments.env_source import EnvSource
-from probe_kit.extract.plan import PlannedEpisode, PlannedRow
+from probe_kit.extract.plan import PlannedEpisode, PlannedRow, RowPlan
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import ActingController
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
@@ -25,11 +25,11 @@ from probe_kit.extract.rollout.question_loop import Asking
 from probe_kit.extract.rollout.recorded.recorded_stage import RecordedStage
 from probe_kit.extract.rollout.stage import AskableStage, LocalStage
 from probe_kit.extract.rollout.stage_process import ProcessStage
-from probe_kit.extract.run_layout import VIDEOS, stored_inputs_of
 from probe_kit.extract.settings import RunSettings
-from probe_kit.extract.store.sources import SOURCES, RunSources
-from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
-from probe_kit.extract.store.writer import RunWriter
+from probe_kit.runs.layout import VIDEOS, stored_inputs_of
+from probe_kit.runs.sources import SOURCES, RunSources
+from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.runs.writer import RunWriter
 
 # Buffers beyond those on stage: one is being written while another waits.
 SPARE_BUFFERS = 2
@@ -48,7 +48,7 @@ class Worker:
 
     def __init__(
         self,
-        writer: RunWriter,
+        writer: RunWriter[RowPlan],
         settings: RunSettings,
         controller: ActingController | AnswerController,
         episodes: int,

@@ -8,7 +8,7 @@ from probe_kit._terminal.plain_text import terminal_safe
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit.extract.store.recorded.action_errors import ActionErrors
+    from probe_kit.runs.action_errors import ActionErrors
 
 
 def show_action_errors(run: str, partial: bool, as_json: bool) -> None:
@@ -17,7 +17,7 @@ def show_action_errors(run: str, partial: bool, as_json: bool) -> None:
     Errors are in standard deviations of the recorded actions at the shown frames: the mean recorded action has an
     error of 1. as_json: print every episode too. Raises what `compare_actions` raises.
     """
-    from probe_kit.extract import compare_actions, open_run
+    from probe_kit.runs import compare_actions, open_run
 
     errors = compare_actions(open_run(run, allow_partial=partial))
     if as_json:

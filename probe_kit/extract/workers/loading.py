@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from probe_kit.extract.prepared import load
 from probe_kit.extract.rollout.worker import Worker
 from probe_kit.extract.settings import RunSettings
-from probe_kit.extract.store.locations.locate import locate
+from probe_kit.runs.store import locate
 
 
 @contextmanager

@@ -10,12 +10,12 @@ from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import ProbeKitError, WorkerDiedError
 from probe_kit.extract.rollout.events import Done, Event
 from probe_kit.extract.settings import RunSettings
-from probe_kit.extract.store.format.commits import commit_key, read_commit
-from probe_kit.extract.store.format.root import read_root
-from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.workers.loading import load_worker
 from probe_kit.extract.workers.scheduler import Scheduler
 from probe_kit.extract.workers.worker_errors import tell_lost
+from probe_kit.runs.commits import commit_key, read_commit
+from probe_kit.runs.root import read_root
+from probe_kit.runs.store import locate
 
 # Episodes per call, so that a worker always has something to simulate while it infers; fewer towards the end.
 EPISODES_PER_CALL = 8

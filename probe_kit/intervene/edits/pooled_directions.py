@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoDirectionError, UsageError
-from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import resolve_view
 from probe_kit.intervene.edits.linear_erasure import NO_DIRECTION
+from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import grouped_folds
 
 Vector = NDArray[np.float32]

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.run import Run
 from probe_kit.hooks.capturing.edit_engine import apply_patch
 from probe_kit.hooks.capturing.token_edits import Identity, TokenIndex
 from probe_kit.hooks.contract.sites import Site
@@ -52,6 +51,7 @@ from probe_kit.intervene.replay.token_features import (
 )
 from probe_kit.intervene.store.answers import CLEAN, ERASE, PROBE_ACCURACY, ConditionOutcomes
 from probe_kit.intervene.store.settings import FIRST_CHUNK, items_of
+from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold
 from probe_kit.statistics.paired_signs import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE

@@ -7,8 +7,8 @@ from probe_kit.errors import UsageError
 from probe_kit.intervene.kinds.kind import Kind
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
     from probe_kit.intervene.replay.conditions import Intervention
+    from probe_kit.runs import Run
 
 _ENTRIES = (
     Kind(

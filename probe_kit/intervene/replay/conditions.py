@@ -8,12 +8,12 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.extract.store.run import Run
 from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS, EditLog
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.intervene.replay.session import Chunk, ReplayInput, ReplaySession
 from probe_kit.intervene.store.answers import CLEAN, IMAGE_SWAP
 from probe_kit.intervene.store.settings import InterventionSettings
+from probe_kit.runs.run import Run
 
 
 @dataclass

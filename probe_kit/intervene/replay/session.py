@@ -21,8 +21,6 @@ from probe_kit.extract.plan import PlannedEpisode
 from probe_kit.extract.rollout.capturing import SMALL
 from probe_kit.extract.rollout.stage import Seen, Stage
 from probe_kit.extract.rollout.worker import torch_threads
-from probe_kit.extract.store.run import Run
-from probe_kit.extract.store.sources import RunSources
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.checkpoint import cached_folder
 from probe_kit.hooks.checkpoints.commits import pinned_commits
@@ -31,6 +29,8 @@ from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.family import SIZE
+from probe_kit.runs.run import Run
+from probe_kit.runs.sources import RunSources
 from probe_kit.suite.counterparts import counterparts_of
 from probe_kit.suite.items import Episode, Item, Layout, Side
 from probe_kit.train.data.run_suite import suite_of

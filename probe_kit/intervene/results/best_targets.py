@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.run import Run
 from probe_kit.intervene.edits.sites import ALL
 from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.closed_loop.intervention import ClosedLoop
@@ -12,6 +11,7 @@ from probe_kit.intervene.kinds.interchange.intervention import NONE
 from probe_kit.intervene.kinds.site_effects import PatchEffect
 from probe_kit.intervene.results.site_maps import is_backbone_layer, stored_site_effects
 from probe_kit.intervene.store.settings import InterventionSettings
+from probe_kit.runs.run import Run
 from probe_kit.train.data.run_reader import RunReader
 
 

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterator
 from functools import partial
 
-from probe_kit.extract.store.run import Run
 from probe_kit.intervene.results.results import effects_of
 from probe_kit.intervene.store.answers import StoredIntervention, read_interventions, stored_interventions
+from probe_kit.runs.run import Run
 
 
 def readers_of_results(run: Run) -> Iterator[Callable[[], object]]:

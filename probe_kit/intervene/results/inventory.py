@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from probe_kit.extract.run_layout import INTERVENTIONS
-from probe_kit.extract.store.format.bundles import PARTIAL, Bundle
-from probe_kit.extract.store.locations.location import Location
 from probe_kit.intervene.kinds.registry import KINDS
 from probe_kit.intervene.store.answers import read_interventions, stored_interventions
+from probe_kit.runs.layout import INTERVENTIONS
+from probe_kit.runs.results import PARTIAL, Bundle
+from probe_kit.runs.store import Location
 from probe_kit.train.data.run_reader import RunReader
 
 COMMON = frozenset(

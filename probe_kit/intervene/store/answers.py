@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 
 from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit.errors import NoInterventionsError
-from probe_kit.extract.run_layout import INTERVENTIONS
-from probe_kit.extract.store.format.bundles import (
+from probe_kit.intervene.store.settings import FORMAT, key_of
+from probe_kit.runs.layout import INTERVENTIONS
+from probe_kit.runs.records import as_json
+from probe_kit.runs.results import (
     HEAD,
     Bundle,
     complete_key,
@@ -28,9 +30,7 @@ from probe_kit.extract.store.format.bundles import (
     tidy_bundle,
     write_bundle,
 )
-from probe_kit.extract.store.format.hashes import as_json
-from probe_kit.extract.store.locations.location import Location
-from probe_kit.intervene.store.settings import FORMAT, key_of
+from probe_kit.runs.store import Location
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.store import stamp_of_run
 

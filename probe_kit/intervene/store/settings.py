@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 from probe_kit.errors import UnknownCategoryError, UsageError
-from probe_kit.extract.store.recorded.scene_only import check_scene_run
-from probe_kit.extract.store.run import Run
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.interventions import Readout
+from probe_kit.runs.run import Run
+from probe_kit.runs.scene_only import check_scene_run
 
 FORMAT = 2  # raise when stored numbers would be others
 FIRST_CHUNK: Readout = "first-chunk"

@@ -11,7 +11,7 @@ import numpy as np
 
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
-from probe_kit.extract.run_layout import CAPTURE_ONLY
+from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.significance import chance_margin
 from probe_kit.train.data.run_reader import check_several_wordings

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import OtherFramesError, UsageError
-from probe_kit.extract.store.recorded.scene_only import check_scene_run
 from probe_kit.hashing import derive_seed
 from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.retention import best_site
+from probe_kit.runs.scene_only import check_scene_run
 from probe_kit.statistics.multiple_testing import corrected
 from probe_kit.statistics.paired_tests import (
     clopper_pearson,

@@ -5,8 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from probe_kit.extract.run_layout import CAPTURE_ONLY
-from probe_kit.extract.store.thumbnails import read_thumbnail
+from probe_kit.runs.layout import CAPTURE_ONLY
+from probe_kit.runs.thumbnails import read_thumbnail
 from probe_kit.train.data.run_reader import RunReader
 
 PICTURES = 4000

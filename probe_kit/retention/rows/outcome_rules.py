@@ -54,7 +54,7 @@ class OutcomeRuleScores:
 
 
 class Judgeable(Protocol):
-    """A run that keeps trajectories; see `probe_kit.extract.Run`."""
+    """A run that keeps trajectories; see `probe_kit.runs.Run`."""
 
     episodes: "pd.DataFrame"
     settings: Mapping[str, Any]

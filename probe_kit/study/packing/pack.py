@@ -15,7 +15,7 @@ from probe_kit.errors import (
     SettingsMismatchError,
     UsageError,
 )
-from probe_kit.extract import copy_run
+from probe_kit.runs import copy_run
 from probe_kit.study.archive import (
     PACK_FILE,
     RUNS,

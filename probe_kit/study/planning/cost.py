@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from probe_kit.extract.needs import PlannedSizes, planned_sizes, space_of
-from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import ExtractSettings, RunSettings
 from probe_kit.hooks.registry import family_names
+from probe_kit.runs.layout import StoredStream
 from probe_kit.study.cells import Cell
 from probe_kit.study.ledger import Ledger, Speed
 

@@ -20,7 +20,7 @@ from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.tables.stored_runs import noted_run, open_matching
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
+    from probe_kit.runs import Run
 
 State = Literal["new", "partial", "whole", "damaged", "failed", "waiting", "skipped"]
 MOST_CHANGES = 3

@@ -41,7 +41,7 @@ def _totals(plan: "StudyPlan") -> list[str]:
 
 def _cost(plan: "StudyPlan") -> list[str]:
     """Hours, each with the source of its rate, and bytes, of what is missing."""
-    from probe_kit.extract.store.locations.disk import in_units
+    from probe_kit.runs.disk import in_units
 
     cost, lines = plan.cost, list[str]()
     for source in dict.fromkeys(cost.sources.values()):

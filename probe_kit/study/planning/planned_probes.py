@@ -13,7 +13,7 @@ from probe_kit.study.tables.stored_runs import of_blocks
 from probe_kit.train.results.store import is_stored
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
+    from probe_kit.runs import Run
 
 
 @dataclass(frozen=True)

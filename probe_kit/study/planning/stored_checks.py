@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from probe_kit.extract import verify_run
-from probe_kit.extract.run_layout import RUN_FILE
-from probe_kit.extract.store.locations.locate import locate
+from probe_kit.runs import verify_run
+from probe_kit.runs.layout import RUN_FILE
+from probe_kit.runs.store import locate
 from probe_kit.study.planning.plan import StudyPlan
 
 

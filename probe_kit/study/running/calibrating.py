@@ -8,8 +8,8 @@ from time import perf_counter
 from typing import Literal
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract import open_run
 from probe_kit.extract.settings import ExtractSettings, RunSettings
+from probe_kit.runs import open_run
 from probe_kit.study.cells import Cell
 from probe_kit.study.ledger import Failure, Ledger, Speed, now
 from probe_kit.study.planning.cost import bytes_per_episode, speed_name, units

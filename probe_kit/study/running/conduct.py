@@ -7,11 +7,11 @@ from pathlib import Path
 from probe_kit._system.optional_dependencies import require
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract import open_run, seal
 from probe_kit.extract.plan import plan_episodes
 from probe_kit.extract.prepared import as_protocol, check_run
 from probe_kit.extract.rollout.preflight import run_preflight
-from probe_kit.extract.store.locations.locate import locate
+from probe_kit.runs import open_run, seal
+from probe_kit.runs.store import locate
 from probe_kit.study.ledger import NOT_TRIED_AGAIN, Failure, Ledger
 from probe_kit.study.planning.cost import units
 from probe_kit.study.planning.plan import PlannedCell, StudyPlan, cells_by_model, given_up

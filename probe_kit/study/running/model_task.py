@@ -15,8 +15,8 @@ from probe_kit.study.ledger import Failure, Played, machine_name, now
 from probe_kit.study.running.reuse import find_equal_run
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
     from probe_kit.hooks import AnswerModel, Policy
+    from probe_kit.runs import Run
 
 STOPS_ALL = (DiskSpaceError, StoreError)
 """What is wrong with the place of all runs, and so stops the study."""

@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract import open_run
 from probe_kit.extract.extraction import Extraction
-from probe_kit.extract.run_layout import RUN_FILE
-from probe_kit.extract.store.format.root import read_root
-from probe_kit.extract.store.growth import further_rows
-from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hashing import canonical_json
+from probe_kit.runs import open_run
+from probe_kit.runs.growth import further_rows
+from probe_kit.runs.layout import RUN_FILE
+from probe_kit.runs.root import read_root
+from probe_kit.runs.store import locate
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
+    from probe_kit.runs import Run
 
 _DEPTHS = ("", "*/", "*/*/")
 """Below a folder, where runs are looked for: a study's own lie two folders down."""

@@ -9,12 +9,12 @@ from typing import Any
 
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import RunDamagedError, UsageError
-from probe_kit.extract.store.provenance import differences
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
 from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
 from probe_kit.retention.compare.vlm_vla import vlm_vla_differences
 from probe_kit.retention.table import RetentionTable
+from probe_kit.runs.provenance import differences
 from probe_kit.study.archive import TABLES, Pack
 from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.drift.measures import CategoryDrift, measure_drift

@@ -13,8 +13,8 @@ from probe_kit.errors import (
     SettingsMismatchError,
     UsageError,
 )
-from probe_kit.extract import open_run
-from probe_kit.extract.store.locations.locate import locate
+from probe_kit.runs import open_run
+from probe_kit.runs.store import locate
 from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.ledger import Entry, Ledger
 from probe_kit.study.matching import check_run_of_cell, check_same_items
@@ -25,8 +25,8 @@ from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import is_ours, is_stored, load_results, read_probes
 
 if TYPE_CHECKING:
-    from probe_kit.extract import Run
-    from probe_kit.extract.store.locations.location import Location
+    from probe_kit.runs import Run
+    from probe_kit.runs.store import Location
 
 
 @dataclass(frozen=True)

@@ -11,15 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UsageError
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.locations.location import Location
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.runs.store import Location, locate
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit.extract.store.format.rows import TokenBlock
+    from probe_kit.runs.rows import TokenBlock
 
 
 @dataclass(frozen=True)
@@ -107,7 +106,7 @@ class ArrayRun:
 
     def iter_token_blocks(self, site: Site, role: str | None = None) -> Iterator["TokenBlock"]:
         """All tokens of one site, as one block: they are in memory. Raises UnknownSiteError."""
-        from probe_kit.extract.store.format.rows import TokenBlock
+        from probe_kit.runs.rows import TokenBlock
 
         yield TokenBlock(0, *self.tokens(site, role))
 

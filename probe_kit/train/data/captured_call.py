@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.format.rows import TokenBlock
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.rows import TokenBlock
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.locations.summary import DescribedRun
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.summary import DescribedRun
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.recorded.action_errors import compare_actions, why_not_compared
+from probe_kit.runs.action_errors import compare_actions, why_not_compared
 from probe_kit.train.choices import Task
 from probe_kit.train.data.captured_call import captured_calls
 from probe_kit.train.data.run_reader import RunReader

@@ -12,9 +12,9 @@ import numpy as np
 from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
-from probe_kit.extract.run_layout import PROBES
-from probe_kit.extract.store.format.bundles import Bundle, complete_key, write_bundle
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.layout import PROBES
+from probe_kit.runs.results import Bundle, complete_key, write_bundle
 from probe_kit.train.choices import TARGETS
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.labels.label_results import LabelControls, LabelCurve, LabelResults

@@ -10,8 +10,8 @@ import numpy as np
 
 from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
-from probe_kit.extract.run_layout import RECORDED_EPISODES
 from probe_kit.hashing import sha256_json
+from probe_kit.runs.layout import RECORDED_EPISODES
 from probe_kit.train.choices import Task
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.labels.builtin_columns import builtin_column

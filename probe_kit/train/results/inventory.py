@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from probe_kit.errors import NoProbesError
-from probe_kit.extract.store.format.bundles import Bundle
+from probe_kit.runs.results import Bundle
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import episodes_sha256
 from probe_kit.train.results.resume import unfinished_sweeps

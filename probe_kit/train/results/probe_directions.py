@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.bounded_arrays import open_arrays
-from probe_kit.extract.store.format.bundles import Bundle
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.results import Bundle
 
 Place = tuple[str, str, Site]
 """A category, a view and a site."""

@@ -3,11 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from probe_kit.extract.run_layout import PROBES
-from probe_kit.extract.store.format.bundles import PARTIAL
-from probe_kit.extract.store.format.resume_pieces import Pieces
-from probe_kit.extract.store.locations.location import Location
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.layout import PROBES
+from probe_kit.runs.results import PARTIAL
+from probe_kit.runs.resume_pieces import Pieces
+from probe_kit.runs.store import Location
 from probe_kit.train.crossval.site_probe import SiteProbe
 
 

@@ -16,8 +16,9 @@ import numpy as np
 from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError
-from probe_kit.extract.run_layout import PROBE_DIRECTIONS, PROBES
-from probe_kit.extract.store.format.bundles import (
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.layout import PROBE_DIRECTIONS, PROBES
+from probe_kit.runs.results import (
     HEAD,
     Bundle,
     complete_key,
@@ -25,9 +26,7 @@ from probe_kit.extract.store.format.bundles import (
     tidy_bundle,
     write_bundle,
 )
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.locations.location import Location
-from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.store import Location, locate
 from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
 from probe_kit.train.choices import Target
 from probe_kit.train.data.captured_call import captured_calls, restrict_to_call

@@ -9,9 +9,9 @@ from probe_kit.env.scoring.events import EVENTS, Events
 from probe_kit.env.scoring.rules import RULES, judge, rule_of
 from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.run_layout import CAPTURE_ONLY, FRAME_COLUMNS
-from probe_kit.extract.store.thumbnails import read_sheet
 from probe_kit.retention.behaviour.vlm_answers import SCORES
+from probe_kit.runs.layout import CAPTURE_ONLY, FRAME_COLUMNS
+from probe_kit.runs.thumbnails import read_sheet
 from probe_kit.suite.pictures import picture_size
 from probe_kit.view.frozen_probes import toward
 from probe_kit.view.payloads.coding import pack_floats, pack_log_odds

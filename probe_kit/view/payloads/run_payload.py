@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from probe_kit.env.scoring.rules import RULES
-from probe_kit.extract.settings import flat_settings
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.columns.columns import (
     ACCURACY,
@@ -19,6 +18,7 @@ from probe_kit.retention.columns.columns import (
 )
 from probe_kit.retention.estimators.stream_scores import Limits
 from probe_kit.retention.rows.parts import StreamPart
+from probe_kit.runs.growth import flat_settings
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.suite.categories import category_of
 from probe_kit.view.payloads.coding import rounded

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import DiskSpaceError, OwnEnvironmentError, SettingsMismatchError, UsageError
-from probe_kit.extract import EnvSource, ExtractSettings, Run, open_run, prepare, verify_run
+from probe_kit.extract import EnvSource, ExtractSettings, prepare
 from probe_kit.extract.commands import check_size
-from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.retention import retention_table
+from probe_kit.runs import Run, open_run, verify_run
+from probe_kit.runs.store import locate
 from probe_kit.train import Labels, train_probes
 from probe_kit.train.labels.builtin_columns import label_frame
 from tests.support.made_once import made_once

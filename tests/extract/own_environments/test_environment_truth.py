@@ -12,9 +12,9 @@ from probe_kit.extract.own_environments.contract import SUCCESS
 from probe_kit.extract.own_environments.opening import checked_step, open_environment
 from probe_kit.extract.rollout.own_environments.environment_stage import EnvironmentStage, PlayedEnvironment
 from probe_kit.extract.rollout.stage import Ending
-from probe_kit.extract.run_layout import AT_END, ONCE
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.runs.layout import AT_END, ONCE
 from tests.extract.own_environments.test_contract import EPISODE, SEEN, planned
 from tests.support.reach_env import ReachEnv
 

@@ -17,15 +17,7 @@ from PIL import Image
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import RecordingError, SettingsMismatchError, UnitsError, UsageError
-from probe_kit.extract import (
-    ExtractSettings,
-    LeRobotSource,
-    Run,
-    compare_actions,
-    extract_run,
-    prepare,
-    verify_run,
-)
+from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run, prepare
 from probe_kit.extract.plan import Plan
 from probe_kit.extract.recordings.lerobot_folder import open_lerobot
 from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
@@ -33,6 +25,7 @@ from probe_kit.extract.recordings.recorded_plan import SIDE, RecordedPlan
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.runs import Run, compare_actions, verify_run
 from probe_kit.suite import Suite
 from tests.extract.recordings.conftest import STATE, observations
 from tests.support.lerobot_recordings import CAMERA, write_recording

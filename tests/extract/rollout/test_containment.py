@@ -21,12 +21,13 @@ import torch
 from probe_kit._terminal.plain_text import UNSAFE
 from probe_kit.env import SceneSpec
 from probe_kit.errors import CaptureChangedActionError, EpisodesFailedError, PolicyFailedError, UsageError
-from probe_kit.extract import ExtractSettings, Run, extract_run, open_run
+from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.extract.workers.worker_errors import WorkerLostWarning
 from probe_kit.hooks import Observation
 from probe_kit.hooks.checkpoints.containment import contained
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite, build_suite
 from tests.support.episode_tables import without_seconds
 

@@ -8,10 +8,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from probe_kit.extract.rollout import episode_buffers as staging
 from probe_kit.extract.rollout.capturing import Capturer, stored_streams
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, copy_aside
-from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hooks import Observation, Roles
 from probe_kit.hooks.contract.roles import _matrix
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.runs.layout import StoredStream
 
 STREAM = StoredStream("backbone", 2, 4, None, 5, ("mean", "last"), quantities=("residual",))
 ROLES = {"backbone": Roles.from_labels(["language"] * 5)}

@@ -14,11 +14,11 @@ import pytest
 
 from probe_kit.errors import UnknownModelError, WorkerDiedError
 from probe_kit.extract.rollout.events import Done, Event
-from probe_kit.extract.store.locations.locate import locate
 from probe_kit.extract.workers import ray as crew
 from probe_kit.extract.workers.ray import ClusterFullWarning, run_on_ray
 from probe_kit.extract.workers.scheduler import Scheduler
 from probe_kit.extract.workers.worker_errors import WorkerLostWarning
+from probe_kit.runs.store import locate
 from probe_kit.suite import Suite
 from tests.support.little_run import little_plan, little_writer
 

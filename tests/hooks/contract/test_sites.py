@@ -1,8 +1,8 @@
 import pytest
 
 from probe_kit.errors import UnknownSiteError
-from probe_kit.extract.run_layout import StoredStream
 from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.runs.layout import StoredStream
 
 
 @pytest.mark.parametrize("name", ["backbone.07.residual", "expert.03.residual@4", "expert.120.residual@12"])

@@ -11,7 +11,6 @@ import typer
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.extract import Run
 from probe_kit.hooks import Site
 from probe_kit.hooks.contract.interventions import ASKED_AS, InterventionKind
 from probe_kit.intervene import commands, load_effects
@@ -19,6 +18,7 @@ from probe_kit.intervene.edits.sites import TILE_ROLES
 from probe_kit.intervene.kinds.registry import KINDS
 from probe_kit.intervene.results.inventory import listed_interventions
 from probe_kit.retention import retention_table
+from probe_kit.runs import Run
 from probe_kit.suite import Suite
 from tests.intervene.kinds.dimmed_images.kind import KIND
 

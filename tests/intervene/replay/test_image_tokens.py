@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import EmptyRoleError, UnsupportedInterventionError, UsageError
-from probe_kit.extract import Run
 from probe_kit.hooks.registry import find_family
 from probe_kit.intervene import ClosedLoop, ConceptErasure, Interchange, ReplaySource, Steering, run_intervention
 from probe_kit.intervene.replay.image_tokens import TILES, role_token_mask, tokens_overlapping
 from probe_kit.intervene.replay.session import ReplayInput, ReplaySession
+from probe_kit.runs import Run
 from probe_kit.suite import Suite
 
 if TYPE_CHECKING:

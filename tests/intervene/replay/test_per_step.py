@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract import Run
 from probe_kit.intervene import (
     ClosedLoop,
     ConceptErasure,
@@ -20,6 +19,7 @@ from probe_kit.intervene import (
 )
 from probe_kit.intervene.replay.session import open_session
 from probe_kit.intervene.store.settings import key_of, settings_of
+from probe_kit.runs import Run
 from probe_kit.suite import Suite
 
 if TYPE_CHECKING:

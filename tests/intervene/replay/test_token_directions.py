@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract import Run
 from probe_kit.hooks import Site, capture
 from probe_kit.intervene import ClosedLoop, Interchange, ReplaySource, Steering, run_intervention
 from probe_kit.intervene.edits.linear_erasure import Method, PaddedTokens
@@ -19,6 +18,7 @@ from probe_kit.intervene.replay.token_directions import (
     half_differences_of,
 )
 from probe_kit.intervene.replay.token_features import TokenFeatures, by_episode, fit_by_fold
+from probe_kit.runs import Run
 
 pytestmark = pytest.mark.slow
 

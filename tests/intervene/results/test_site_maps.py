@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import EmptyRoleError, UnknownSiteError, UsageError
-from probe_kit.extract import Run
 from probe_kit.hooks import Site
 from probe_kit.hooks.capturing.edit_engine import EditLog, _ActiveEdits
 from probe_kit.hooks.capturing.token_edits import ReplaceInSubspace, ReplaceWith
@@ -25,6 +24,7 @@ from probe_kit.intervene.edits.pooled_directions import fit_directions
 from probe_kit.intervene.edits.sites import resolve_sites, token_mask
 from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.intervene.results.site_maps import keys_in_use
+from probe_kit.runs import Run
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

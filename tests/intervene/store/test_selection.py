@@ -10,8 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from probe_kit.extract.run_layout import INTERVENTIONS
-from probe_kit.extract.store.format.bundles import read_bundles, write_bundle
 from probe_kit.hooks import Site
 from probe_kit.intervene import (
     AttentionShares,
@@ -32,6 +30,8 @@ from probe_kit.intervene.results.site_maps import (
 )
 from probe_kit.intervene.store.answers import ATTENTION_FILE, StoredIntervention
 from probe_kit.intervene.store.settings import FORMAT, key_of
+from probe_kit.runs.layout import INTERVENTIONS
+from probe_kit.runs.results import read_bundles, write_bundle
 from probe_kit.train import ArrayRun
 from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
 

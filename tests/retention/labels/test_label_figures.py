@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
-from probe_kit.extract import Run, open_run
 from probe_kit.retention import label_retention_table
 from probe_kit.retention.displays.labels import (
     ClassConfusionDisplay,
@@ -26,6 +25,7 @@ from probe_kit.retention.displays.labels import (
 )
 from probe_kit.retention.displays.labels.figures import file_names
 from probe_kit.retention.report import report_html
+from probe_kit.runs import Run, open_run
 from probe_kit.train import LabelResults, Labels, load_label_results, train_probes
 from tests.support.recorded_run import write_recorded_run
 

@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
-from probe_kit.extract import Run, open_run
 from probe_kit.hooks import Site
 from probe_kit.retention import label_retention_table, measure_label_retention, measure_retention
 from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.retention.labels.estimate import with_corrected_p
+from probe_kit.runs import Run, open_run
 from probe_kit.train import Labels, ProbeCurve, train_probes
 from probe_kit.train.labels.label_results import LabelComparison, LabelControl, LabelControls
 from probe_kit.train.results.inventory import stored_probes

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.retention import retention_table
 from probe_kit.retention.columns.sentences import VERDICT_HELP
 from probe_kit.retention.report import report_html
 from probe_kit.retention.report.episodes import episode_grid
+from probe_kit.runs.store import locate
+from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from tests.retention.asked_runs import acted, asked
 from tests.retention.conftest import runs_in
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit.extract.needs import EPISODE, THUMBNAILS
-from probe_kit.extract.run_layout import StoredStream
+from probe_kit.runs.layout import StoredStream
 from probe_kit.study import Ledger, load_study
 from probe_kit.study.cells import Cell
 from probe_kit.study.ledger import Speed

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 from probe_kit._terminal.console import out
 from probe_kit.cli import app
 from probe_kit.errors import RunIncompleteError, UsageError
-from probe_kit.extract import ExtractSettings, open_run
+from probe_kit.extract import ExtractSettings
+from probe_kit.runs import open_run
 from probe_kit.study import Failure, Ledger, conduct_study, fit_probes, load_study, make_table, plan_study
 from probe_kit.study.running import model_task
 from probe_kit.suite import Suite

@@ -7,8 +7,8 @@ import pytest
 
 from probe_kit._system.installing import install_command
 from probe_kit.errors import MissingExtraError
-from probe_kit.extract.run_layout import COMMITS
 from probe_kit.extract.workers.worker_errors import WorkerLostWarning
+from probe_kit.runs.layout import COMMITS
 from probe_kit.study import conduct_study, load_study, plan_study
 from probe_kit.suite import Suite
 from tests.extract.two_nodes import TwoNodes, two_nodes, wait_for

@@ -5,7 +5,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from probe_kit.errors import NonFiniteActivationError, TooFewGroupsError
-from probe_kit.extract.store.format.rows import TokenBlock
+from probe_kit.runs.rows import TokenBlock
 from probe_kit.statistics.folds import Fold
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.crossval.site_probe import STRENGTHS, NestedFold, nested_folds, probe_site

@@ -14,11 +14,12 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SuiteError, SuiteNotFoundError
-from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, seal
+from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.extract.plan import make_plan
 from probe_kit.extract.prepared import check_run
-from probe_kit.extract.store.locations.locate import locate
-from probe_kit.extract.store.writer import RunWriter
+from probe_kit.runs import Run, open_run, seal
+from probe_kit.runs.store import locate
+from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite, build_suite
 from probe_kit.suite.build import default_folder
 from probe_kit.suite.ladder import Wording

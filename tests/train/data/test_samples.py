@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
-from probe_kit.extract.store.format.rows import TokenBlock
 from probe_kit.hooks import Site
+from probe_kit.runs.rows import TokenBlock
 from probe_kit.train import ArrayRun
 from probe_kit.train.data.samples import Samples, read_samples, role_of, sites_of
 

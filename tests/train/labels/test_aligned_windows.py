@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
-from probe_kit.extract import Run, open_run
+from probe_kit.runs import Run, open_run
 from probe_kit.train import Labels, train_probes
 from probe_kit.train.labels.controls.label_controls import step_features
 from probe_kit.train.labels.label_problem import label_problem

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.env.scoring.trajectory import CHANNELS
 from probe_kit.errors import UsageError
-from probe_kit.extract import open_run
+from probe_kit.runs import open_run
 from probe_kit.train import Labels
 from probe_kit.train.labels.builtin_columns import builtin_names, label_frame
 from tests.support.labelled_run import CALLS, EVERY, GRASP, RELEASE

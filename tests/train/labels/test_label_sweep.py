@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import NoProbesError, TooFewGroupsError, UnknownCategoryError, UsageError
-from probe_kit.extract import Run, open_run
+from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite
 from probe_kit.train import LabelResults, Labels, load_label_results, load_results, train_probes
 from probe_kit.train.labels.labelled_samples import labelled_samples

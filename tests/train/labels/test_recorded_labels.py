@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract import Run, open_run
+from probe_kit.runs import Run, open_run
 from probe_kit.train import LabelResults, Labels, train_probes
 from probe_kit.train.labels.builtin_columns import label_frame
 from probe_kit.train.labels.controls.label_controls import prepare_controls, small_pictures, step_features

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
-from probe_kit.extract import Run, open_run
+from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite
 from probe_kit.train import LabelResults, Labels, load_label_results, train_probes
 from tests.support.labelled_run import write_labelled_run

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import RunDamagedError, UnknownSiteError
-from probe_kit.extract.store.format.bundles import Bundle, read_bundle, write_bundle
-from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hooks import Site
+from probe_kit.runs.results import Bundle, read_bundle, write_bundle
+from probe_kit.runs.store import locate
 from probe_kit.train import ArrayRun, Direction, load_results, train_probes
 from probe_kit.train.results.probe_directions import StoredDirections, save_directions
 

@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
-from probe_kit.extract.store.format.bundles import write_bundle
-from probe_kit.extract.store.locations.locate import locate
 from probe_kit.hooks import Site
+from probe_kit.runs.results import write_bundle
+from probe_kit.runs.store import locate
 from probe_kit.train import ArrayRun, load_results, save_results, train_probes
 from probe_kit.train.labels.label_store import stored_targets
 from probe_kit.train.results.inventory import inventory

@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import SettingsMismatchError, TooFewGroupsError, UsageError
-from probe_kit.extract import open_run
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs import open_run
 from probe_kit.suite import Suite
 from probe_kit.train import ArrayRun, Labels, transfer_probes
 from tests.support.labelled_run import write_labelled_run

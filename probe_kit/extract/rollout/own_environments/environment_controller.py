@@ -23,11 +23,11 @@ from probe_kit.extract.rollout.controllers import Turn
 from probe_kit.extract.rollout.own_environments.environment_stage import cameras_of
 from probe_kit.extract.rollout.preflight import FIRST_EPISODES, exchanged_names, unusual_shares
 from probe_kit.extract.rollout.recorded.recorded_controller import RecordedController, check_predictions
-from probe_kit.extract.run_layout import StoredStream
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.layout import StoredStream
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

@@ -21,9 +21,9 @@ from probe_kit.extract.own_environments.opening import (
 )
 from probe_kit.extract.rollout.recorded.recorded_stage import small_picture
 from probe_kit.extract.rollout.stage import Answer, Ending, TimedStage
-from probe_kit.extract.run_layout import AT_END, ONCE, FrameChoice
-from probe_kit.extract.store.small_frames import SmallFrames, shrink
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.layout import AT_END, ONCE, FrameChoice
+from probe_kit.runs.small_frames import SmallFrames, shrink
 
 SUCCEEDED, FAILED, ENDED = "success", "failure", "ended"
 """Outcomes: whether the fact `success` is true at the last step; the last one where there is no such fact."""

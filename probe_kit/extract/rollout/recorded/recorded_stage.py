@@ -13,9 +13,9 @@ from probe_kit.extract.recordings.lerobot_folder import open_lerobot
 from probe_kit.extract.recordings.lerobot_source import ACTION, STATE, LeRobotSource
 from probe_kit.extract.recordings.recorded_plan import SIDE, PlannedStretch, Recording
 from probe_kit.extract.rollout.stage import Answer, Ending, TimedStage
-from probe_kit.extract.run_layout import CAPTURE_ONLY, FrameChoice
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
+from probe_kit.runs.layout import CAPTURE_ONLY, FrameChoice
 
 NO_STATE = np.zeros(ARM_NUMBERS, np.float32)
 """What a policy that reads no state is given of a data set without one."""

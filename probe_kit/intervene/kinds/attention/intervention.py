@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleError, UsageError
-from probe_kit.extract.store.run import Run
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.edits.sites import ALL, roles_of
@@ -28,6 +27,7 @@ from probe_kit.intervene.replay.conditions import (
 from probe_kit.intervene.replay.image_tokens import TILES, role_token_mask
 from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.intervene.store.answers import ATTENTION, ATTENTION_FILE, RECORDED
+from probe_kit.runs.run import Run
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.run import Run
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
@@ -39,6 +38,7 @@ from probe_kit.intervene.replay.conditions import (
 )
 from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.intervene.store.settings import FIRST_CHUNK, items_of
+from probe_kit.runs.run import Run
 
 SITES, ROLES = (f"{KV_STREAM}.*", "backbone.*"), ("image", "language", "state")
 TOP = 20

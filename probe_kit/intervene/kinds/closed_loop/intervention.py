@@ -11,7 +11,6 @@ from typing import Any
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.run import Run
 from probe_kit.hooks.capturing.edit_engine import EditLog, apply_patch
 from probe_kit.hooks.capturing.token_edits import Identity, TokenSelection
 from probe_kit.hooks.contract.interventions import InterventionKind
@@ -39,6 +38,7 @@ from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.intervene.replay.token_directions import DirectionBasis, check_direction, fit_token_directions
 from probe_kit.intervene.store.answers import CLEAN
 from probe_kit.intervene.store.settings import FIRST_CHUNK, items_of
+from probe_kit.runs.run import Run
 
 NAME = "closed-loop"
 

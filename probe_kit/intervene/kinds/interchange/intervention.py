@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Self
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.run import Run
 from probe_kit.hooks.capturing.edit_engine import apply_patch
 from probe_kit.hooks.capturing.token_edits import ReplaceInSubspace, ReplaceWith, TokenEdit
 from probe_kit.hooks.contract.interventions import InterventionKind
@@ -29,6 +28,7 @@ from probe_kit.intervene.replay.passed_over import PassedOver
 from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.intervene.replay.token_directions import DirectionBasis, check_direction, fit_token_directions
 from probe_kit.intervene.store.settings import items_of
+from probe_kit.runs.run import Run
 
 if TYPE_CHECKING:
     from probe_kit.hooks import ActivationCache

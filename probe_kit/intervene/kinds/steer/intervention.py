@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Self, get_args
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.store.run import Run
 from probe_kit.hooks.capturing.edit_engine import apply_patch
 from probe_kit.hooks.capturing.token_edits import AddVector
 from probe_kit.intervene.edits.pooled_directions import MEAN_DIFFERENCE
@@ -33,6 +32,7 @@ from probe_kit.intervene.replay.passed_over import PassedOver
 from probe_kit.intervene.replay.session import ReplaySession
 from probe_kit.intervene.replay.token_directions import DirectionBasis, check_direction, fit_token_directions
 from probe_kit.intervene.store.settings import items_of
+from probe_kit.runs.run import Run
 
 TargetSide = Literal["wrong", "correct", "left", "right"]
 COEFFICIENTS = (1.0, 2.0, 4.0)

@@ -33,7 +33,7 @@ from probe_kit.train.labels.label_results import (
 from probe_kit.train.labels.labelled_samples import LabelledSamples
 
 if TYPE_CHECKING:
-    from probe_kit.extract.store.recorded.inputs import StoredInputs
+    from probe_kit.runs.inputs import StoredInputs
     from probe_kit.suite import Suite
 
 RANDOM: Name = "random-features"

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.run_layout import DATASET
 from probe_kit.hashing import derive_seed
+from probe_kit.runs.layout import DATASET
 from probe_kit.statistics.paired_bootstrap import better_than_best
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import sites_of

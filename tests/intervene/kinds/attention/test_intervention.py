@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import CaptureChangedActionError, CaptureError, UnsupportedInterventionError, UsageError
-from probe_kit.extract import Run, open_run, verify_run
 from probe_kit.hooks.capturing.attention import AttentionMass, capture_attention
 from probe_kit.hooks.registry import find_family
 from probe_kit.intervene import (
@@ -31,6 +30,7 @@ from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.replay.conditions import ReplayBatch
 from probe_kit.intervene.replay.image_tokens import TILES
 from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.runs import Run, open_run, verify_run
 from tests.intervene.answers import follower, outcomes_of
 
 if TYPE_CHECKING:

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from probe_kit.errors import UnsupportedInterventionError, UsageError
-from probe_kit.extract import Run
 from probe_kit.hooks import Policy, Site, gradients_at
 from probe_kit.intervene import (
     AttributionEffect,
@@ -26,6 +25,7 @@ from probe_kit.intervene.kinds.attribution.effects import (
 from probe_kit.intervene.kinds.attribution.table import attribution_sentences, attribution_table
 from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.results.results import verdicts_of
+from probe_kit.runs import Run
 from tests.intervene.wirings import WiredSession, outcomes_of, replay_inputs
 
 pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import CaptureChangedActionError, UsageError
-from probe_kit.extract import ExtractSettings, Run, extract_run, open_run, verify_run
+from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene import (
     ClosedLoop,
@@ -22,6 +22,7 @@ from probe_kit.intervene import (
 from probe_kit.intervene.replay.conditions import CleanRun
 from probe_kit.intervene.replay.rollout import roll_out
 from probe_kit.intervene.replay.session import ReplaySession, open_session
+from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.suite import Suite
 
 pytestmark = pytest.mark.slow

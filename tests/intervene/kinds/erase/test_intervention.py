@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract import Run, open_run, verify_run
 from probe_kit.intervene import (
     ConceptErasure,
     ConditionOutcomes,
@@ -20,6 +19,7 @@ from probe_kit.intervene import (
     stored_image_swaps,
 )
 from probe_kit.intervene.kinds.erase import ErasureEffect, erasure_effects
+from probe_kit.runs import Run, open_run, verify_run
 from tests.intervene.answers import follower, habit, outcomes_of
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,6 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UnknownSiteError, UnsupportedInterventionError, UsageError
-from probe_kit.extract import Run
 from probe_kit.intervene import (
     InstructionSwap,
     Interchange,
@@ -23,6 +22,7 @@ from probe_kit.intervene.edits.sites import resolve_sites, roles_of, token_mask
 from probe_kit.intervene.kinds.instruction_swap.effects import input_sensitivity
 from probe_kit.intervene.kinds.instruction_swap.intervention import counterpart_instruction
 from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.runs import Run
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

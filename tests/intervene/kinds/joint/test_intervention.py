@@ -7,13 +7,13 @@ import pytest
 
 from probe_kit._terminal.console import out
 from probe_kit.errors import UnsupportedInterventionError, UsageError
-from probe_kit.extract import Run
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.intervene import Interchange, InterventionResult, ReplaySource, run_intervention
 from probe_kit.intervene.kinds.joint.effects import joint_keys_in_use, stored_joint_places
 from probe_kit.intervene.kinds.joint.intervention import JointPlaces
 from probe_kit.intervene.results.inventory import listed_interventions
 from probe_kit.intervene.results.site_maps import stored_localised_sites, stored_site_effects
+from probe_kit.runs import Run
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

@@ -1,1 +1,0 @@
-"""Locations of runs: folders and prefixes in object stores."""

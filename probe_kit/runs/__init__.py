@@ -1,0 +1,51 @@
+"""Runs: where they lie, their records and arrays, and how these are written, read, verified and exported.
+
+Reading needs neither a simulator nor a model.
+"""
+
+from typing import TYPE_CHECKING
+
+from probe_kit._system.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from probe_kit.runs.action_errors import ActionErrors, compare_actions
+    from probe_kit.runs.copying import copy_run
+    from probe_kit.runs.export.export import export_run
+    from probe_kit.runs.label import label_run
+    from probe_kit.runs.run import Run, open_run
+    from probe_kit.runs.sealing import seal
+    from probe_kit.runs.store import Location, locate
+    from probe_kit.runs.verify import Audit, verify_run
+
+__all__ = [
+    "ActionErrors",
+    "Audit",
+    "Location",
+    "Run",
+    "compare_actions",
+    "copy_run",
+    "export_run",
+    "label_run",
+    "locate",
+    "open_run",
+    "seal",
+    "verify_run",
+]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "ActionErrors": "action_errors",
+        "Audit": "verify",
+        "Location": "store",
+        "Run": "run",
+        "compare_actions": "action_errors",
+        "copy_run": "copying",
+        "export_run": "export.export",
+        "label_run": "label",
+        "locate": "store",
+        "open_run": "run",
+        "seal": "sealing",
+        "verify_run": "verify",
+    },
+)

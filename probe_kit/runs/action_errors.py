@@ -1,0 +1,167 @@
+"""Predicted actions beside the recorded ones, of every shown frame of a run on recordings."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.runs.inputs import StoredInputs
+from probe_kit.runs.layout import DATASET, OTHER_ACTIONS
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Matrix = NDArray[np.float64]
+
+
+class ShownRun(Protocol):
+    """What is read of a run on recordings; see `Run`."""
+
+    @property
+    def recorded(self) -> bool:
+        """Whether it is of recordings."""
+
+    @property
+    def location(self) -> Any:
+        """Where it lies."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Of the run and its selection."""
+
+    @property
+    def inputs(self) -> StoredInputs | None:
+        """What was shown."""
+
+    @property
+    def episodes(self) -> "pd.DataFrame":
+        """A line per row of the plan."""
+
+    @property
+    def control_steps(self) -> NDArray[np.int64]:
+        """(E, C) frames."""
+
+
+@dataclass(frozen=True)
+class ActionErrors:
+    """Predicted minus recorded actions, in the units of the data set.
+
+    run: of recordings. names: (D,) of the numbers of an action. errors: (E, C, S, D) by row, inference and step of
+    the chunk, NaN where nothing was recorded. deviations: (D,) standard deviations of the recorded actions at the
+    shown frames. In these deviations, the mean recorded action has an error of 1.
+    """
+
+    run: ShownRun
+    names: tuple[str, ...]
+    errors: Matrix
+    deviations: Matrix
+
+    @property
+    def by_number(self) -> "pd.DataFrame":
+        """A line per number of an action: `number`, `deviation`, `bias`, `first` and `chunk`.
+
+        bias: mean error of the first action. first, chunk: root mean square error of the first action and of the
+        whole chunk. All three in recorded deviations, NaN for a number that never changes.
+        """
+        import pandas as pd
+
+        scaled = self._scaled
+        return pd.DataFrame(
+            {
+                "number": self.names,
+                "deviation": self.deviations,
+                "bias": _mean(scaled[:, :, 0], (0, 1)),
+                "first": np.sqrt(_mean(scaled[:, :, 0] ** 2, (0, 1))),
+                "chunk": np.sqrt(_mean(scaled**2, (0, 1, 2))),
+            }
+        )
+
+    @property
+    def by_frame(self) -> "pd.DataFrame":
+        """A line per shown frame: keys, `first` and `chunk`, root mean squares over all numbers that change."""
+        import pandas as pd
+
+        rows, calls = np.nonzero(self._shown)
+        steps = self.run.control_steps
+        first, chunk = self.of_frames
+        return pd.DataFrame(
+            {
+                "episode_id": self.run.episodes["episode_id"].to_numpy()[rows],
+                "source_episode": self.run.episodes["source_episode"].to_numpy()[rows],
+                "frame": steps[rows, calls],
+                "first": first[rows, calls],
+                "chunk": chunk[rows, calls],
+            }
+        )
+
+    @property
+    def by_episode(self) -> "pd.DataFrame":
+        """A line per recorded episode: `source_episode`, `frames`, and root mean squares `first` and `chunk`."""
+        import pandas as pd
+
+        frames = self.by_frame
+        squares = frames.assign(first=frames["first"] ** 2, chunk=frames["chunk"] ** 2)
+        groups = squares.groupby("source_episode")
+        found = groups[["first", "chunk"]].mean() ** 0.5
+        table: pd.DataFrame = found.assign(frames=groups.size()).reset_index()
+        return table[["source_episode", "frames", "first", "chunk"]]
+
+    @property
+    def of_frames(self) -> tuple[Matrix, Matrix]:
+        """(E, C) root mean square errors of the first action and of the whole chunk, in recorded deviations."""
+        squares = self._scaled**2
+        return np.sqrt(_mean(squares[:, :, 0], 2)), np.sqrt(_mean(squares, (2, 3)))
+
+    @property
+    def _scaled(self) -> Matrix:
+        """Errors in recorded deviations; numbers that never change are NaN."""
+        return np.asarray(self.errors / np.where(self.deviations > 0, self.deviations, np.nan))
+
+    @property
+    def _shown(self) -> NDArray[np.bool_]:
+        """(E, C) whether an inference has a recorded action."""
+        return np.asarray(np.isfinite(self.errors[:, :, 0]).any(axis=2))
+
+
+def compare_actions(run: ShownRun) -> ActionErrors:
+    """The predicted actions of a run on recordings beside the recorded ones.
+
+    Raises UsageError for another run, or where the two are not the same numbers: another count, changes beside
+    positions, or values outside the statistics of the checkpoint.
+    """
+    if not run.recorded:
+        raise UsageError(f"{run.location} has no recorded actions: it is not of recordings")
+    inputs, reason = run.inputs, why_not_compared(run)
+    if reason is not None:
+        raise UsageError(
+            f"{run.location}: predicted and recorded actions are not compared: {reason}. `run.inputs.read` gives "
+            "both as they are"
+        )
+    assert inputs is not None, "runs on recordings have inputs"
+    recorded, predicted = (inputs.read(kind).astype(np.float64) for kind in ("action", "prediction"))
+    first = recorded[:, :, 0]
+    constant = np.nanmax(first, axis=(0, 1)) == np.nanmin(first, axis=(0, 1))  # its deviation may not round to 0
+    deviations = np.where(constant, 0.0, np.nanstd(first, axis=(0, 1)))
+    return ActionErrors(run, inputs.names["action"], predicted - recorded, deviations)
+
+
+def why_not_compared(run: ShownRun) -> str | None:
+    """Why predicted and recorded actions are not the same numbers; None if they are."""
+    inputs = run.inputs
+    if inputs is None or "action" not in inputs.kinds:
+        return "the data set has no actions"
+    recorded, predicted = (run.settings[DATASET]["inputs"][kind][-1] for kind in ("action", "prediction"))
+    if recorded != predicted:
+        return f"the policy predicts {predicted} numbers, the data set has {recorded}"
+    found: str | None = run.settings["recording"].get(OTHER_ACTIONS)
+    return found
+
+
+def _mean(values: Matrix, axes: int | tuple[int, ...]) -> Matrix:
+    """The mean of the numbers among `values`; NaN, without a warning, where there are none."""
+    there = np.isfinite(values)
+    count = there.sum(axis=axes)
+    total = np.where(there, values, 0.0).sum(axis=axes)
+    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))

@@ -1,0 +1,180 @@
+"""Reading of the column store: one pooled vector per episode, as probes need it.
+
+A row store answers "everything of one episode". Columns hold the same numbers the other way round; `seal`
+writes them. They are derived: safe to delete, and used only while their stamp matches the commits.
+
+    columns.zarr/<stream>/pooled   float32 (call, view, [iteration,] layer, episode, feature)
+    columns.zarr/<stream>/later    uint16 (call - 1, [iteration,] layer, episode, feature), with --later-views mean
+    columns.zarr/<stream>/role     uint8   (call, episode, token), codes named by the attribute `roles`
+    sealed/<stamp>.json            the hash of every object in columns.zarr, and of which run and commits they are
+
+A seal says which episodes it was made of. It is older than a run that has more; one that names an episode which is
+not committed any more shows that the run lost it.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from zarr.abc.store import Store
+from zarr.errors import ChunkNotFoundError
+
+from probe_kit.errors import RunDamagedError
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.arrays import bounded_codecs, decode_bfloat16, open_array
+from probe_kit.runs.checking import CheckedStore
+from probe_kit.runs.commits import Commit, commit_key, stamp_of
+from probe_kit.runs.layout import COLUMNS, LATER, SEALED, StoredStream
+from probe_kit.runs.records import Sum, as_record, check_sums, expect, read_record, read_sums
+from probe_kit.runs.root import Root
+from probe_kit.runs.store import Location
+
+if TYPE_CHECKING:
+    import xarray as xr
+    import zarr
+
+
+STAMP_DIGITS = 16
+METADATA = "zarr.json"
+_NAMED = re.compile(rf"[0-9a-f]{{{STAMP_DIGITS}}}\.json")
+
+
+class Columns:
+    """The sealed columns of a run.
+
+    sums: of every object in their folder. advice: what to do if they are damaged.
+    """
+
+    def __init__(self, location: Location, folder: str, sums: Mapping[str, Sum]) -> None:
+        self.folder, self.sums = folder, sums
+        self._location = location
+        self.advice = (
+            f"Delete {folder}; the rows are not concerned, and `probe-kit run verify {location} --seal` builds "
+            "it again"
+        )
+
+    @property
+    def store(self) -> Store:
+        """The objects, each checked as it is read."""
+        store = self._location.store(self.folder, read_only=True)
+        return CheckedStore(store, self.sums, self._where, lambda _key: self.advice)
+
+    def _where(self, key: str) -> str:
+        return f"{self._location}/{self.folder}/{key}"
+
+    def array(self, name: str) -> "zarr.Array[Any]":
+        """One array, such as `backbone/pooled`."""
+        return open_array(self.store, name)
+
+    def column(self, stored: StoredStream, site: Site, view: str, call: int) -> NDArray[np.float32]:
+        """(E, D) float32: one view of one site at one captured inference. Raises RunDamagedError."""
+        return self._read(f"{stored.name}/pooled", (call, stored.views.index(view), *stored.at(site)), site)
+
+    def later_column(self, stored: StoredStream, site: Site, call: int) -> NDArray[np.float32]:
+        """(E, D) float32: the mean of one site at a later inference that keeps no other view."""
+        return decode_bfloat16(self._read(f"{stored.name}/{LATER}", (call - 1, *stored.at(site)), site))
+
+    def _read(self, name: str, index: tuple[int, ...], site: Site) -> NDArray[Any]:
+        array = self.array(name)
+        try:
+            return np.asarray(array[index])
+        except (ChunkNotFoundError, ValueError, RuntimeError) as error:
+            raise RunDamagedError(
+                f"the column of {site} in {self._location}/{self.folder} cannot be read: {error}. {self.advice}"
+            ) from error
+
+    def xarray(self, stream: str) -> "xr.DataArray":
+        """The pooled columns of one stream, read when they are used."""
+        import xarray as xr
+
+        others = ("role", LATER)  # which may have other numbers of calls
+        self.array(f"{stream}/pooled")  # checks its metadata
+        with bounded_codecs():
+            dataset: xr.Dataset = xr.open_zarr(
+                self.store, group=stream, consolidated=False, chunks=None, drop_variables=others
+            )
+        return dataset["pooled"].drop_attrs()
+
+    def problems(self) -> Iterator[str]:
+        """What is missing or has another size, without reading it."""
+        sizes = self._location.sizes(self.folder, self.sums)
+        for key, known in self.sums.items():
+            if sizes.get(key) != known.length:
+                seen = f"has {sizes[key]} bytes; {known.length} were written" if key in sizes else "is missing"
+                yield f"{self.folder}/{key} {seen}. {self.advice}"
+
+
+def find_columns(root: Root, commits: Mapping[int, Commit]) -> Columns | None:
+    """The columns of a run if they were sealed from exactly these commits.
+
+    Raises RunDamagedError if what was noted of them when they were sealed was changed, or names commits that are
+    gone or others, or if a part of the columns is gone.
+    """
+    location, stamp = root.location, stamp_of(commits)
+    sums = {seal["stamp"]: read_sums(seal["objects"]) for seal in _read_seals(root, commits)}.get(stamp)
+    if sums is None:
+        return None
+    found = Columns(location, location.derived(COLUMNS, stamp), sums)
+    if not location.exists(f"{found.folder}/{METADATA}"):
+        if not (location.keys(found.folder) and location.exists(seal_key(stamp))):
+            return None  # all of them were removed, as is allowed, or are being built again
+        raise RunDamagedError(f"{location}/{found.folder}/{METADATA} is missing. {found.advice}")
+    return found
+
+
+def seal_key(stamp: str) -> str:
+    """Where the hashes of the columns lie that were made from the commits that `stamp` names."""
+    return f"{SEALED}/{stamp[:STAMP_DIGITS]}.json"
+
+
+def write_seal(root: Root, commits: Mapping[int, Commit], sums: Mapping[str, Sum]) -> None:
+    """Note the hashes of the columns, and the episodes they are of, which makes them count."""
+    stamp, objects = stamp_of(commits), {key: one.to_json() for key, one in sums.items()}
+    seal = {"run": root.identity, "stamp": stamp, "episodes": sorted(commits), "objects": objects}
+    root.location.write_record(seal_key(stamp), as_record(seal))
+
+
+def _read_seals(root: Root, commits: Mapping[int, Commit]) -> Iterator[dict[str, Any]]:
+    """All that count, each checked."""
+    for file, raw in root.location.read_all(SEALED, ".json").items():
+        if not _NAMED.fullmatch(file):
+            continue  # a copy under another name
+        name = f"{root.location}/{SEALED}/{file}"
+        advice = f"Delete it; `probe-kit run verify {root.location} --seal` builds the columns again"
+        seal = read_record(raw, name, advice)
+        expect(seal, {"run": str, "stamp": str, "objects": dict}, name, advice)
+        check_sums(seal["objects"], name, advice)
+        if seal["run"] != root.identity or seal_key(seal["stamp"]) != f"{SEALED}/{file}":
+            raise RunDamagedError(f"{name} belongs to another run or to other episodes. {advice}")
+        if lost := _metadata(root) - {*seal["objects"]}:
+            raise RunDamagedError(f"{name} names no hash of {min(lost)}. {advice}")
+        if "episodes" in seal:  # seals of before this was noted say less
+            _check_lost(root, commits, seal, name, advice)
+        yield seal
+
+
+def _metadata(root: Root) -> set[str]:
+    """What columns have for every episode."""
+    arrays = [f"{stream}/{kind}" for stream in root.streams for kind in root.vector_kinds]
+    return {METADATA, *(f"{array}/{METADATA}" for array in arrays)}
+
+
+def _check_lost(
+    root: Root, commits: Mapping[int, Commit], seal: Mapping[str, Any], name: str, advice: str
+) -> None:
+    """Raise RunDamagedError if a seal was made of commits that are gone, or are others by now."""
+    expect(seal, {"episodes": list}, name, advice)
+    numbers = seal["episodes"]
+    if not all(type(number) is int for number in numbers):
+        raise RunDamagedError(f"{name} names other episodes than by number. {advice}")
+    absent = [number for number in numbers if number not in commits]
+    if lost := [number for number in absent if not root.location.exists(commit_key(number))]:
+        raise RunDamagedError(
+            f"{root.location}/{commit_key(lost[0])} is missing: {name} was made of {len(numbers)} episodes, of "
+            f"which {len(lost)} are gone. Restore the commits, or run the same `probe-kit extract` again to redo "
+            f"them; to continue without them, delete {SEALED} and {COLUMNS}"
+        )
+    if not absent and stamp_of({number: commits[number] for number in numbers}) != seal["stamp"]:
+        raise RunDamagedError(f"{name} was made of other commits than the run has. {advice}")

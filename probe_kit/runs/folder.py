@@ -1,0 +1,304 @@
+"""A folder on this machine, or on a shared file system, as the location of a run."""
+
+import errno
+import fcntl
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, BinaryIO
+
+from zarr.abc.store import Store
+from zarr.storage import LocalStore
+
+from probe_kit._system.drafts import draft_of
+from probe_kit.errors import FULL_DISK, DiskSpaceError, RunDamagedError, SettingsMismatchError
+from probe_kit.runs.layout import (
+    CERTIFICATES,
+    COLUMNS,
+    COMMITS,
+    DATA,
+    FAILED,
+    FRAMES,
+    PLANS,
+    PROVENANCE,
+    RUN_FILE,
+    SEALED,
+    TIMES,
+    VIDEOS,
+)
+from probe_kit.runs.location import Location, check_size
+
+# What a killed process leaves: objects and columns that never got their final name.
+_WRITTEN_ASIDE = (PLANS, COMMITS, TIMES, FAILED, CERTIFICATES, PROVENANCE, SEALED, FRAMES, VIDEOS)
+_ORPHANS = ("*.tmp", *(f"{folder}/*.tmp" for folder in _WRITTEN_ASIDE), f"{DATA}/**/*.partial")
+_PIECE = 1 << 20
+_TRIES = 5
+"""Times that a file is written whose folder another process clears or removes meanwhile."""
+
+
+class Folder(Location):
+    """A folder on a file system that knows hard links and `flock`."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __str__(self) -> str:
+        return str(self._path)
+
+    @property
+    def name(self) -> str:
+        """Of the folder."""
+        return self._path.resolve().name
+
+    @property
+    def path(self) -> Path:
+        """As the user gave it."""
+        return self._path
+
+    @property
+    def address(self) -> str:
+        """Absolute."""
+        return str(self._path.resolve())
+
+    def beside(self, name: str) -> Path:
+        """Next to the folder."""
+        return self._path.resolve().parent / name if self._path.name in ("", "..") else self._path.with_name(name)
+
+    def free_bytes(self) -> int:
+        """Of the disk where the folder lies or will lie."""
+        there = next(p for p in (self._path, *self._path.resolve().parents) if p.exists())
+        return shutil.disk_usage(there).free
+
+    @contextmanager
+    def in_words(self) -> Iterator[None]:
+        """A full disk."""
+        try:
+            yield
+        except OSError as error:
+            if error.errno not in FULL_DISK:
+                raise
+            free = f"{self.free_bytes() / 1e6:.1f} MB free"
+            raise DiskSpaceError(
+                f"the disk of {self} {FULL_DISK[error.errno]} ({free}); every committed episode is whole and "
+                "kept. Free some space, then the same command continues"
+            ) from error
+
+    def exists(self, key: str) -> bool:
+        """Whether the file is there."""
+        return _inside(key) and (self._path / key).is_file()
+
+    def read(self, key: str) -> bytes:
+        """The file."""
+        path = self._object(key)
+        check_size(key, path.stat().st_size, self)
+        return path.read_bytes()
+
+    def pieces(self, key: str) -> Iterator[memoryview]:
+        """Into the same memory again and again, which stays in the processor's cache."""
+        buffer = memoryview(bytearray(_PIECE))
+        with self._object(key).open("rb", buffering=0) as file:
+            while length := file.readinto(buffer):
+                yield buffer[:length]
+
+    def open(self, key: str) -> BinaryIO:
+        """The file."""
+        return self._object(key).open("rb")
+
+    def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
+        """One file after another."""
+        found = {}
+        for path in sorted((self._path / folder).glob(f"*{suffix}")):
+            with suppress(FileNotFoundError):  # no plain file, or removed since: seals and failures come and go
+                found[path.name] = self.read(f"{folder}/{path.name}")
+        return found
+
+    def keys(self, folder: str) -> list[str]:
+        """Every file."""
+        below = (self._path / folder).rglob("*")
+        return sorted(path.relative_to(self._path).as_posix() for path in below if path.is_file())
+
+    def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
+        """From the directory entries."""
+        paths = {key: self._path / folder / key for key in keys if _inside(key)}
+        return {key: path.stat().st_size for key, path in paths.items() if path.is_file()}
+
+    def confirm(self, lengths: Mapping[str, int]) -> None:
+        """A file system says so itself when it is written."""
+
+    def create(self, key: str, content: bytes) -> bool:
+        """Written aside, flushed to the disk, then linked to its name."""
+        path = self._place(key)
+        for left in reversed(range(_TRIES)):
+            try:
+                path.parent.mkdir(exist_ok=True)
+                with _written_aside(path, content, flush=True) as aside:
+                    os.link(aside, path)
+                return True
+            except FileExistsError:
+                return False
+            except FileNotFoundError:
+                if not left:  # before: another process began to write here, and cleared what was written aside
+                    raise
+        return False
+
+    def write(self, key: str, content: bytes) -> None:
+        """Written aside, then renamed."""
+        path = self._place(key)
+        for left in reversed(range(_TRIES)):
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with _written_aside(path, content, flush=False) as aside:
+                    aside.replace(path)
+                return
+            except (FileNotFoundError, FileExistsError):
+                if not left:  # before: another process was done with the same work, and removed the folder
+                    raise
+
+    def delete(self, key: str) -> None:
+        """The file."""
+        self._place(key).unlink(missing_ok=True)
+
+    def remove(self, folder: str) -> None:
+        """The folder and all in it."""
+        shutil.rmtree(self._path / folder, ignore_errors=True)
+
+    def store(self, folder: str, read_only: bool = False) -> Store:
+        """Plain files."""
+        return LocalStore(self._path / folder, read_only=read_only)
+
+    def found(self, objects: Mapping[str, bytes], last: str) -> None:
+        """The folder is made aside and renamed, so that it appears whole or not at all."""
+        with draft_of(self._path) as draft:
+            try:
+                for key, content in objects.items():
+                    (draft / key).parent.mkdir(parents=True, exist_ok=True)
+                    with _written_aside(draft / key, content, flush=True) as file:
+                        file.rename(draft / key)
+                draft.rename(self._path)
+            except OSError as error:
+                if not self.exists(last):
+                    if not self._path.exists():
+                        raise
+                    raise SettingsMismatchError(f"{self} exists and is not a run; choose another --out") from error
+
+    @contextmanager
+    def held(self, clear: Callable[[], None]) -> Iterator[None]:
+        """Every process that works holds a shared lock, so only one that finds itself alone may clear.
+
+        An apparent leftover may be another process's work. The last process to finish removes what
+        others left that were killed meanwhile.
+        """
+        with (self._path / RUN_FILE).open("rb") as file:
+            if _alone(file):
+                self._clear_orphans()
+                clear()
+            fcntl.flock(file, fcntl.LOCK_SH)
+            yield
+            if _alone(file):
+                self._clear_orphans()
+
+    def _object(self, key: str) -> Path:
+        """Where an object lies. Raises FileNotFoundError for what is no plain file, or not in the folder.
+
+        Records of others may name a device, a pipe, which never ends, or a file outside the run.
+        """
+        path = self._path / key
+        if not (_inside(key) and path.is_file()):
+            raise FileNotFoundError(errno.ENOENT, "no file of the run", str(path))
+        return path
+
+    def _place(self, key: str) -> Path:
+        """Where an object is written or removed. Raises RunDamagedError for a key that leads out of the folder."""
+        if not _inside(key):
+            raise RunDamagedError(
+                f"{self}: a record of this run names {key!r}, which leads out of its folder; probe_kit writes no "
+                "such name. Take the run from where it was made"
+            )
+        return self._path / key
+
+    def _clear_orphans(self) -> None:
+        for pattern in _ORPHANS:
+            for orphan in self._path.glob(pattern):
+                if orphan.is_dir():
+                    shutil.rmtree(orphan)
+                else:
+                    orphan.unlink()
+
+    @contextmanager
+    def one_at_a_time(self) -> Iterator[None]:
+        """By locks; also that of the run, so that no process removes the work as a leftover."""
+        turn = os.open(self._path / DATA, os.O_RDONLY)  # a folder that is never exchanged
+        try:
+            with (self._path / RUN_FILE).open("rb") as run:
+                fcntl.flock(run, fcntl.LOCK_SH)
+                fcntl.flock(turn, fcntl.LOCK_EX)
+                for leftover in self._path.glob(f"{COLUMNS}*.tmp"):  # of a killed seal: a live one holds this lock
+                    shutil.rmtree(leftover, ignore_errors=True)
+                yield
+        finally:
+            os.close(turn)
+
+    @contextmanager
+    def tended(self, folder: str) -> Iterator[None]:
+        """By a lock on the folder itself, so that drafts in it have no owner any more."""
+        path = self._path / folder
+        path.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            with suppress(PermissionError):  # a run that may only be read is listed too
+                for leftover in path.glob("*.tmp"):
+                    leftover.unlink(missing_ok=True)  # or its writer has just removed it
+            yield
+        finally:
+            os.close(handle)
+
+    def derived(self, folder: str, stamp: str) -> str:  # noqa: ARG002 - there is only one, see `rebuilding`
+        """Always `folder`."""
+        return folder
+
+    @contextmanager
+    def rebuilding(self, folder: str, stamp: str) -> Iterator[Store]:
+        """Aside; then renamed, so that a crash leaves the old group or none."""
+        aside = self._path / f"{folder}{secrets.token_hex(8)}.tmp"
+        aside.mkdir()
+        try:
+            yield LocalStore(aside)
+            self.remove(folder)
+            aside.rename(self._path / self.derived(folder, stamp))
+        finally:
+            shutil.rmtree(aside, ignore_errors=True)
+
+
+def _inside(key: str) -> bool:
+    """Whether a key stays below the folder it is read in."""
+    return not key.startswith("/") and ".." not in key.split("/")
+
+
+def _alone(file: IO[bytes]) -> bool:
+    """Hold the lock alone, if no other process holds it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+@contextmanager
+def _written_aside(path: Path, content: bytes, flush: bool) -> Iterator[Path]:
+    """A file of this content beside `path`, gone afterwards; on the disk already if it was flushed."""
+    aside = path.with_name(f"{secrets.token_hex(8)}.tmp")
+    # Who may read a run is a matter of the umask; tempfile would keep it from the others of a group.
+    handle = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+            if flush:
+                file.flush()
+                os.fsync(file.fileno())
+        yield aside
+    finally:
+        aside.unlink(missing_ok=True)

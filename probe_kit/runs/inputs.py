@@ -1,0 +1,80 @@
+"""The inputs of recorded frames: one array per kind beside the streams, one chunk per row of the plan.
+
+    data.zarr/inputs/state        float32 (episode, call, number), as recorded
+    data.zarr/inputs/action       float32 (episode, call, step, number): the recorded actions from the frame on
+    data.zarr/inputs/prediction   float32 (episode, call, step, number), in the checkpoint's own units
+    data.zarr/inputs/columns      float64 (episode, call, column): timestamp, reward … as the data set has them
+    data.zarr/inputs/pixels       uint8 (episode, call, camera, y, x, colour): 32 × 32
+
+Rows behind the last frame of a stretch are not numbers; of pixels they are zero.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.abc.store import Store
+from zarr.core.array_spec import ArrayConfigLike
+
+from probe_kit.runs.arrays import codecs, open_array
+from probe_kit.runs.layout import INPUTS
+from probe_kit.runs.rows import Rows
+
+_TYPES = {"columns": "float64", "pixels": "uint8"}
+
+
+def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], codec: str) -> None:
+    """Create the arrays for no rows yet. shapes: by kind, of one inference."""
+    root = zarr.open_group(store, mode="a", zarr_format=3)
+    group = root.create_group(INPUTS)
+    for name, shape in shapes.items():
+        dtype = np.dtype(_TYPES.get(name, "float32"))
+        group.create_array(
+            name,
+            shape=(0, calls, *shape),
+            chunks=(1, calls, *shape),
+            dtype=dtype,
+            fill_value=0 if dtype.kind == "u" else np.nan,
+            compressors=codecs(codec, typesize=dtype.itemsize),
+            config={"write_empty_chunks": True},
+        )
+
+
+def write_inputs(store: Store, number: int, inputs: Mapping[str, NDArray[Any]], config: ArrayConfigLike) -> None:
+    """Store the inputs (n, …) by kind of the row `number`, n at most its calls."""
+    for name, values in inputs.items():
+        array: zarr.Array[Any] = zarr.open_array(
+            store, path=f"{INPUTS}/{name}", mode="r+", zarr_format=3, config=config
+        )
+        row = np.full(array.shape[1:], array.fill_value, array.dtype)
+        row[: len(values)] = values
+        array[number] = row
+
+
+class StoredInputs:
+    """The inputs of the committed rows of a run, in their order.
+
+    kinds: that are stored. columns: names of the numbers of `columns`. names: of those of `state` and `action`.
+    """
+
+    def __init__(self, store: Store, numbers: list[int], dataset: Mapping[str, Any]) -> None:
+        self._store, self._numbers = store, numbers
+        self.kinds: tuple[str, ...] = tuple(dataset["inputs"])
+        self.columns: tuple[str, ...] = tuple(dataset["columns"])
+        self.names: dict[str, tuple[str, ...]] = {name: tuple(own) for name, own in dataset["names"].items()}
+
+    def read(self, kind: str) -> NDArray[Any]:
+        """(E, C, …) of one kind. Raises KeyError for one that is not stored, RunDamagedError."""
+        if kind not in self.kinds:
+            raise KeyError(kind)
+        rows = Rows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)
+        return np.stack(list(rows))
+
+    def column(self, name: str) -> NDArray[np.float64]:
+        """(E, C) one column of the data set. Raises KeyError."""
+        if name not in self.columns:
+            raise KeyError(name)
+        found: NDArray[np.float64] = self.read("columns")[..., self.columns.index(name)]
+        return found

@@ -1,0 +1,281 @@
+"""Bundles: results stored with a run, one folder each, either complete or absent.
+
+    <home>/<key>/settings.json    the head, a record written last: what it is, whose, and the sums of its files
+    <home>/<key>/times.json       a record of when it was made, which no other hash covers
+    <home>/<key>/<file>           what the head names; anything else there is not read
+    <home>/.<key>.partial/        work that is not finished; only then may a folder lie there without a head
+
+Of the same settings and the same run, every file but `times.json` has the same bytes, killed and resumed or not.
+Files are never written over: what changes gets another name, and counts when the head names it.
+"""
+
+import re
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Any, BinaryIO
+
+from probe_kit._system.bounded_json import parse_json
+from probe_kit.errors import RunDamagedError, UsageError
+from probe_kit.runs.layout import INTERVENTIONS, PROBES
+from probe_kit.runs.records import HASH, Sum, as_record, digest_of, expect, is_sum, read_record
+from probe_kit.runs.root import find_root
+from probe_kit.runs.store import Location
+
+BUNDLES = (PROBES, INTERVENTIONS)
+"""Where bundles may lie in a run."""
+_MAKERS = {PROBES: "train", INTERVENTIONS: "intervene"}
+HEAD, TIMES, PARTIAL = "settings.json", "times.json", ".partial"
+_KEY = re.compile(r"[0-9a-f]{12}")
+_SHORT = 8
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """One bundle, its head checked; files are checked when they are read.
+
+    head: settings of the producer. times: times of its events by name (UTC, ISO 8601). files: by the name
+    asked for, the name that counts now and the sum of it.
+    """
+
+    location: Location
+    home: str
+    key: str
+    head: Mapping[str, Any]
+    times: Mapping[str, str]
+    files: Mapping[str, tuple[str, Sum]]
+
+    @property
+    def folder(self) -> str:
+        """Its folder in the run."""
+        return f"{self.home}/{self.key}"
+
+    def has(self, name: str) -> bool:
+        """Whether it has a file of this name."""
+        return name in self.files
+
+    def read(self, name: str) -> bytes:
+        """One file. Raises RunDamagedError if it is missing or was changed."""
+        try:
+            content = self.location.read(self._place(name))
+        except FileNotFoundError:
+            raise self.damaged(name, "is missing") from None
+        if problem := self.files[name][1].problem(content):
+            raise self.damaged(name, problem)
+        return content
+
+    def open(self, name: str) -> BinaryIO:
+        """One file to be read here and there; see `check`."""
+        try:
+            return self.location.open(self._place(name))
+        except FileNotFoundError:
+            raise self.damaged(name, "is missing") from None
+
+    def check(self, name: str) -> None:
+        """Read one file to its end, a piece at a time. Raises RunDamagedError if it was changed."""
+        try:
+            _, digest = digest_of(self.location.pieces(self._place(name)))
+        except FileNotFoundError:
+            raise self.damaged(name, "is missing") from None
+        if digest != self.files[name][1].digest:
+            raise self.damaged(name, "has other bytes than were written")
+
+    def problems(self, deep: bool, left_out: Collection[str] = ()) -> Iterator[str]:
+        """What is missing or has another size; with `deep` whose bytes are others.
+
+        left_out: files that a copy of the run was made without.
+        """
+        names = {actual: name for name, (actual, _) in self.files.items()}
+        sizes = self.location.sizes(self.folder, names)
+        for actual, name in names.items():
+            known = self.files[name][1]
+            if name in left_out and actual not in sizes:
+                continue
+            try:
+                if sizes.get(actual) != known.length:
+                    seen = f"{sizes[actual]} bytes; {known.length} were written" if actual in sizes else None
+                    raise self.damaged(name, f"has {seen}" if seen else "is missing")
+                if deep:
+                    self.check(name)
+            except RunDamagedError as error:
+                yield str(error)
+
+    def _place(self, name: str) -> str:
+        if name not in self.files:
+            raise self.head_damaged(f"names no file {name}")
+        return f"{self.folder}/{self.files[name][0]}"
+
+    def read_json(self, name: str) -> dict[str, Any]:
+        """One file that holds a JSON object, in which numbers may be NaN. Raises RunDamagedError."""
+        try:
+            content = parse_json(self.read(name))
+        except ValueError as error:
+            raise self.damaged(name, f"is not JSON ({error})") from error
+        if not isinstance(content, dict):
+            raise self.damaged(name, f"holds a {type(content).__name__}, not an object")
+        return content
+
+    def check_format(self, *readable: int | str) -> None:
+        """Raise RunDamagedError unless the settings say one of these formats."""
+        stored = self.head["settings"].get("format")
+        if stored not in readable:
+            words = " or ".join(map(str, readable))
+            raise self.head_damaged(f"has format {stored}; this version of probe_kit reads format {words}")
+
+    def head_damaged(self, problem: str) -> RunDamagedError:
+        """What is raised about the head."""
+        return RunDamagedError(f"{self.location}/{self.folder}/{HEAD} {problem}. {_advice(self.folder)}")
+
+    def damaged(self, name: str, problem: str) -> RunDamagedError:
+        """What is raised about one file."""
+        return RunDamagedError(f"{self.location}/{self._place(name)} {problem}. {_advice(self.folder)}")
+
+
+def write_bundle(
+    location: Location,
+    home: str,
+    key: str,
+    head: Mapping[str, Any],
+    files: Mapping[str, bytes] = {},
+    times: Mapping[str, str] = {},
+) -> None:
+    """Store a bundle, or change one: files that are not given stay as they are.
+
+    head, times: replace the former ones; of the head without the parts that are kept here (`key`, `run`, `files`).
+    What killed processes left in its folder is removed.
+    """
+    with location.tended(f"{home}/{key}"):
+        _write_bundle(location, home, key, head, files, times)
+
+
+def tidy_bundle(location: Location, home: str, key: str) -> None:
+    """Remove what killed processes left of a bundle that is complete: files and folders that never counted."""
+    with location.tended(f"{home}/{key}"):
+        location.remove(f"{home}/.{key}{PARTIAL}")
+
+
+def _write_bundle(
+    location: Location,
+    home: str,
+    key: str,
+    head: Mapping[str, Any],
+    files: Mapping[str, bytes],
+    times: Mapping[str, str],
+) -> None:
+    before = read_bundle(location, home, key) if location.exists(f"{home}/{key}/{HEAD}") else None
+    kept = dict(before.files) if before else {}
+    named, written = dict(kept), dict[str, int]()
+    for name, content in files.items():
+        known = Sum.of(content)
+        if name not in kept or kept[name][1] != known:
+            actual = name if before is None else _renamed(name, known)
+            location.write(f"{home}/{key}/{actual}", content)
+            written[f"{home}/{key}/{actual}"] = known.length
+            named[name] = actual, known
+    location.confirm(written)
+    stored = {name: [actual, *known.to_json()] for name, (actual, known) in named.items()}
+    whose = {"key": key, "run": _identity(location)}
+    location.write_record(f"{home}/{key}/{TIMES}", as_record({**times, **whose}))
+    record = as_record({**head, **whose, "files": stored})
+    if before is None or location.read(f"{home}/{key}/{HEAD}") != record:
+        location.write_record(f"{home}/{key}/{HEAD}", record)
+    for name, (actual, _) in kept.items():
+        if named[name][0] != actual:
+            location.delete(f"{home}/{key}/{actual}")
+
+
+def _renamed(name: str, known: Sum) -> str:
+    path = PurePosixPath(name)
+    return f"{path.stem}-{known.digest[:_SHORT]}{path.suffix}"
+
+
+def read_bundle(location: Location, home: str, key: str) -> Bundle:
+    """The bundle `key`. Raises RunDamagedError if its head or times are missing, changed, or of another run."""
+    folder = f"{home}/{key}"
+    name, advice = f"{location}/{folder}/{HEAD}", _advice(folder)
+    head = _read_own(location, home, key, HEAD)
+    times = _read_own(location, home, key, TIMES)
+    if strange := [part for part, value in times.items() if not isinstance(value, str)]:
+        raise RunDamagedError(f"{location}/{folder} has no time as {strange[0]!r}. {advice}")
+    expect(head, {"settings": dict, "files": dict}, name, advice)
+    stored = head.pop("files")
+    if wrong := [one for one, known in stored.items() if not _is_file(known)]:
+        raise RunDamagedError(f"{name} has no name, length and hash of {wrong[0]!r}. {advice}")
+    files = {one: (actual, Sum(*known)) for one, (actual, *known) in stored.items()}
+    if strange := sorted(actual for actual, _ in files.values() if "/" in actual or actual in ("", ".", "..")):
+        raise RunDamagedError(f"{name} names {strange[0]!r}, which is not a file in the same folder. {advice}")
+    return Bundle(location, home, key, head, times, files)
+
+
+def _read_own(location: Location, home: str, key: str, file: str) -> dict[str, Any]:
+    """A record of the bundle `key`, without what only says whose it is."""
+    folder = f"{home}/{key}"
+    name, advice = f"{location}/{folder}/{file}", _advice(folder)
+    try:
+        raw = location.read(f"{folder}/{file}")
+    except FileNotFoundError:
+        raise RunDamagedError(f"{name} is missing, though the folder is there. {advice}") from None
+    record, run = read_record(raw, name, advice), _identity(location)
+    if (record.get("key"), record.get("run", "")) != (key, run):
+        raise RunDamagedError(
+            f"{name} is {record.get('key')} of run {record.get('run')}; this is run {run}. {advice}"
+        )
+    return {part: value for part, value in record.items() if part not in (HASH, "key", "run")}
+
+
+def _is_file(stored: Any) -> bool:
+    """Whether a head says [name, length, hash] of a file."""
+    return isinstance(stored, list) and len(stored) == 3 and isinstance(stored[0], str) and is_sum(stored[1:])
+
+
+def bundle_keys(location: Location, home: str) -> list[str]:
+    """Keys of the bundles that should be there: folders of that form, but for those that are being filled."""
+    parts = [key.split("/") for key in location.keys(home)]
+    names = dict.fromkeys(own[1] for own in parts if len(own) > 2)
+    complete = {own[1] for own in parts if own[2:] == [HEAD]}
+    return [
+        name for name in names if _KEY.fullmatch(name) and (name in complete or f".{name}{PARTIAL}" not in names)
+    ]
+
+
+def complete_key(key: str, stored: Collection[str], location: Location, kind: str) -> str:
+    """The stored key that `key` is, or begins. kind: what is stored, in the plural, for messages.
+
+    Raises UsageError if there is none, or if there are several.
+    """
+    found = [name for name in stored if name == key] or [name for name in stored if key and name.startswith(key)]
+    if len(found) != 1:
+        raise UsageError(
+            f"{location} has {'several' if found else 'no'} {kind} {key!r}; it has: {', '.join(stored) or 'none'}"
+        )
+    return found[0]
+
+
+def read_bundles(location: Location, home: str) -> dict[str, Bundle]:
+    """Every bundle of a run by key. Raises RunDamagedError for the first that is damaged."""
+    return {key: read_bundle(location, home, key) for key in bundle_keys(location, home)}
+
+
+def bundle_problems(location: Location, deep: bool, left_out: Collection[str] = ()) -> Iterator[str]:
+    """What is wrong with the bundles of a run; with `deep` every byte of them is read. left_out: of a copy."""
+    for home in BUNDLES:
+        for key in bundle_keys(location, home):
+            try:
+                bundle = read_bundle(location, home, key)
+            except RunDamagedError as error:
+                yield str(error)
+            else:
+                yield from bundle.problems(deep, left_out)
+
+
+def _identity(location: Location) -> str | None:
+    """That of the run; None for one that nothing protects.
+
+    Bundles may also lie where there is no run, beside arrays in memory.
+    """
+    root = find_root(location)
+    return None if root is None else root.identity
+
+
+def _advice(folder: str) -> str:
+    return f"Remove {folder} and run the same `probe-kit {_MAKERS[folder.partition('/')[0]]}` again"

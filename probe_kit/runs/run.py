@@ -1,0 +1,752 @@
+"""Reading of a run: episodes, pooled columns, tokens. Needs neither a simulator nor a model."""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from zarr.abc.store import Store
+
+from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
+from probe_kit.errors import (
+    NoTrajectoryError,
+    RunDamagedError,
+    RunIncompleteError,
+    UnknownSiteError,
+    UsageError,
+)
+from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.runs.arrays import decode_bfloat16, open_array
+from probe_kit.runs.certificates import read_certificate
+from probe_kit.runs.checking import CheckedStore
+from probe_kit.runs.columns import Columns, find_columns
+from probe_kit.runs.commits import (
+    LENS_MARGINS,
+    Commit,
+    committed_sums,
+    read_commits,
+    read_failures,
+    redo,
+    stamp_of,
+)
+from probe_kit.runs.inputs import StoredInputs
+from probe_kit.runs.label import read_label
+from probe_kit.runs.layout import (
+    DATA,
+    DATASET,
+    ENVIRONMENT,
+    INPUTS,
+    MEAN_VIEW,
+    PROVENANCE,
+    TRAJECTORY,
+    ArrayKind,
+    StoredStream,
+    VectorKind,
+    stored_inputs_of,
+)
+from probe_kit.runs.outcomes_by_rule import Watched, judged, watch, with_outcomes
+from probe_kit.runs.plans import RESTORE, while_growing
+from probe_kit.runs.provenance import Provenance, differences, read_provenances
+from probe_kit.runs.records import Sum
+from probe_kit.runs.root import read_root
+from probe_kit.runs.rows import Rows, TokenBlock, role_mask, token_blocks
+from probe_kit.runs.seconds import Seconds, read_seconds
+from probe_kit.runs.selection import select_items
+from probe_kit.runs.sources import RunSources
+from probe_kit.runs.store import Location, locate
+from probe_kit.runs.summary import run_html, run_text
+from probe_kit.runs.trajectories import Trajectories, has_trajectories, names_trajectory
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from probe_kit.env.scoring.trajectory import Trajectory
+
+
+_OUTCOME = ("outcome", "side_placed")
+"""What every outcome says, and so a table of no episodes too."""
+_SECONDS = ("seconds_inference", "seconds_simulation")
+
+
+class NotSealedWarning(UserWarning):
+    """A column was read from rows, which gives the same numbers slowly."""
+
+
+def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
+    """Open the run in folder `path`, or at a URL such as `s3://bucket/prefix/run` (extra `remote`).
+
+    allow_partial: open it also if episodes of the plan are missing or failed; `episodes` then lists fewer.
+    Raises RunNotFoundError if it is none, RunIncompleteError if it is unfinished, RunDamagedError if its schema
+    is another one, a committed object is missing, or plan, metadata or any record is not what was written.
+    """
+    run = read_run(locate(path))
+    run.check_records()
+    done = len(run.episodes)
+    if done < run.planned and not allow_partial:
+        failed = f" ({len(run.failed)} failed: {', '.join(run.failed)})" if run.failed else ""
+        raise RunIncompleteError(
+            f"{path} has {done} of {run.planned} episodes{failed}. Finish it with the same `probe-kit extract`, "
+            "or accept what is there (--partial, allow_partial=True)"
+        )
+    return run
+
+
+def read_run(location: Location) -> "Run":
+    """The run at `location`, its plan and its commits read together, finished or not. Raises as `open_run`."""
+
+    def read() -> Run:
+        run = Run(location)
+        _ = run.stamp
+        return run
+
+    return while_growing(location, read)
+
+
+class Run:
+    """A stored run. Rows of every array follow `episodes`, which lists the committed ones in plan order.
+
+    rule, last_steps: by which outcomes are given, see `under`; `disc` at the last step is what was stored.
+    wording: the only one whose episodes are shown, None for all; see `in_wording`. item_ids: the only items whose
+    episodes are shown, None for all; see `only`.
+    """
+
+    rule: str = DEFAULT_RULE
+    last_steps: int = 1
+
+    def __init__(
+        self, location: Location, wording: str | None = None, item_ids: frozenset[str] | None = None
+    ) -> None:
+        self.location, self.wording, self.item_ids = location, wording, item_ids
+        self.root = read_root(location)
+        self.root.check()
+        if not self.root.plan:
+            raise RunIncompleteError(
+                f"{location} was begun and has no plan yet. Run the same `probe-kit extract` again"
+            )
+        self.settings: dict[str, Any] = self.root.settings
+        self.settings_sha256: str = self.root.card["settings_sha256"]
+        self._streams = self.root.streams
+
+    def check_records(self) -> None:
+        """Raise RunDamagedError if a record of the run is not what was written, or names a commit that is gone.
+
+        Of label, commits, seconds, provenance, certificates, seal and failures; results stored with the run are
+        checked when read.
+        """
+        _ = self.label, self._seconds, self.failed, self.provenances, self.columns
+        if self._commits:
+            _ = self._certificates
+
+    def __repr__(self) -> str:
+        return run_text(self)
+
+    def _repr_html_(self) -> str:
+        return run_html(self)
+
+    @property
+    def path(self) -> Path:
+        """The run's folder. Raises UsageError if it lies in an object store."""
+        return self.location.path
+
+    @property
+    def model(self) -> str:
+        """The model's name, as given to `probe-kit extract`."""
+        return str(self.settings["model"])
+
+    @cached_property
+    def label(self) -> str:
+        """What tables and legends call the run: the model and what sets it apart, or as it was named.
+
+        It may be changed, see `label_run`. Raises RunDamagedError if its record is missing or was changed.
+        """
+        return read_label(self.root)
+
+    @property
+    def weights_sha256(self) -> str | None:
+        """Hash of the weights that acted; None for a scripted run."""
+        weights: str | None = self.settings["weights_sha256"]
+        return weights
+
+    @property
+    def random_weights(self) -> bool:
+        """Whether this run was made with random weights."""
+        return bool(self.settings["random_weights"])
+
+    @property
+    def capture_only(self) -> bool:
+        """Whether its model was captured and did not act: it has activations and no success rate."""
+        return bool(self.settings.get("capture_only"))
+
+    @property
+    def recorded(self) -> bool:
+        """Whether it was made of recordings: there are no sides, no outcomes and no scene."""
+        return DATASET in self.settings
+
+    @property
+    def in_own_environment(self) -> bool:
+        """Whether its episodes were played in an environment of the user's own: there are no sides."""
+        return ENVIRONMENT in self.settings
+
+    @property
+    def suite(self) -> str:
+        """Identity of the suite that was run, `name@version#hash`.
+
+        Of recordings it is the data set's `name#hash`, of an environment of the user's own its `name@revision`.
+        """
+        if self.recorded:
+            return f"{self.settings['recording']['name']}#{self.settings[DATASET]['meta_blake2b'][:12]}"
+        if self.in_own_environment:
+            return f"{self.settings['played']['name']}@{self.settings[ENVIRONMENT]['revision']}"
+        return str(self.settings["suite"]["identity"])
+
+    @property
+    def seed_text(self) -> str:
+        """The text that random draws over the run's items are seeded with; see `suite.Suite.seed_text`.
+
+        Runs that show no suite have `suite` here.
+        """
+        return str(self.settings["suite"]["seed_text"]) if "suite" in self.settings else self.suite
+
+    @cached_property
+    def inputs(self) -> StoredInputs | None:
+        """State, actions and small pictures of every shown frame; None for a run of scenes.
+
+        Raises ActivationsLeftOutError in a copy without activations.
+        """
+        source = stored_inputs_of(self.settings)
+        if not source:
+            return None
+        if any(name.startswith(f"{INPUTS}/") for name in self.root.left_out):
+            self.root.refuse_left_out("there are no inputs")
+        return StoredInputs(self.data, self._numbers, source)
+
+    @property
+    def suite_parent(self) -> str | None:
+        """Content hash of the suite that `suite` was selected from.
+
+        None for a whole suite.
+        """
+        return self.root.suite_parent
+
+    @cached_property
+    def items(self) -> pd.DataFrame:
+        """One row per planned item, played or not: `item_id`, `category`, `group_id`, `pair_id`, `content_sha256`.
+
+        Items of two runs are the same where `item_id` and `content_sha256` are equal. The hash is that of
+        `suite.Item.content_sha256`, None in runs that show no suite. Two wordings of an item are one row.
+        """
+        names = {name: name for name in ("item_id", "category", "group_id", "pair_id")}
+        names["item_content_sha256"] = "content_sha256"
+        rows = {one["item_id"]: [one.get(name) for name in names] for one in self._plan_of_items}
+        return pd.DataFrame(list(rows.values()), columns=list(names.values()))
+
+    @cached_property
+    def _certificates(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        return read_certificate(self.root)
+
+    @cached_property
+    def certificate(self) -> dict[str, Any]:
+        """What was loaded and checked: the first process's record, then what every process measured.
+
+        `processes` are the records of all of them, `hooks_on_equals_hooks_off` whether in each the actions or
+        answers with and without capture have one hash, `mixed` what changes numbers and was not the same for all
+        episodes.
+        """
+        first, processes = self._certificates
+        certificate = dict(first)
+        checks = [process["capture_check"] for process in processes if process.get("capture_check")]
+        if checks:
+            certificate["hooks_on_equals_hooks_off"] = all(
+                value == check.get(name.replace("_with_", "_without_"))
+                for check in checks
+                for name, value in check.items()
+                if name.endswith("_with_hooks_sha256")
+            )
+        return {**certificate, "processes": processes, "mixed": list(self.mixed)}
+
+    @cached_property
+    def sources(self) -> tuple[RunSources, ...]:
+        """Sources of the processes that played it, the first process's first; empty before the first episode."""
+        if not self._commits:
+            return ()
+        certificate, processes = self._certificates
+        found: list[RunSources] = []
+        for record in (certificate, *processes):
+            if (sources := RunSources.of_record(record)) not in found:
+                found.append(sources)
+        return tuple(found)
+
+    @cached_property
+    def provenances(self) -> dict[str, Provenance]:
+        """Device and versions that committed episodes were made with, by the name commits call them.
+
+        Raises RunDamagedError if a commit names one that is not there.
+        """
+        stored = read_provenances(self.root)
+        named = sorted({commit["provenance"] for commit in self.commits()})
+        if missing := [name for name in named if name not in stored]:
+            raise RunDamagedError(
+                f"{self.location}/{PROVENANCE}/{missing[0]}.json is missing, though episodes name it; it was "
+                f"there when they were committed. {RESTORE}"
+            )
+        return {name: stored[name] for name in named}
+
+    @property
+    def mixed(self) -> tuple[str, ...]:
+        """What changes numbers and is not the same for all episodes, such as `versions.torch`; mostly nothing."""
+        return differences(self.provenances.values())
+
+    # -- wordings --------------------------------------------------------------------------------------
+
+    @property
+    def wordings(self) -> tuple[str, ...]:
+        """The wordings that items were asked in, as `--wordings` named them; empty for their own words alone."""
+        return tuple(self.settings.get("wordings", {}).get("names", ()))
+
+    def in_wording(self, wording: str | None = None) -> "Run":
+        """The same run with the episodes of one wording only, as probes and success rates take it.
+
+        wording: None for the first; a run in the items' own words is returned as it is. Raises UsageError for a
+        wording that was not asked.
+        """
+        if wording is None and not self.wordings:
+            return self
+        chosen = self.wordings[0] if wording is None else wording
+        if chosen not in self.wordings:
+            there = ", ".join(self.wordings) or "the items' own words only (it was extracted without --wordings)"
+            raise UsageError(f"{self.location} has no wording {chosen!r}; it has {there}")
+        return self._showing(chosen, self.item_ids)
+
+    @property
+    def whole(self) -> "Run":
+        """The same run with the episodes of all wordings."""
+        return self if self.wording is None else self._showing(None, self.item_ids)
+
+    def only(self, categories: Sequence[str] | None = None, items: int | None = None) -> "Run":
+        """The same run with the first items of some categories only, in the order of the plan.
+
+        A run of more items thereby serves where fewer are wanted: seeds depend on the run's seed and the item
+        alone. Probes are fitted to the episodes that are shown, and stored with the run under a key of their own.
+        categories: slugs, all by default. items: per category, all by default.
+        Raises UnknownCategoryError for a category the run lacks, and UsageError for a number that is not positive,
+        exceeds what a category has, or would separate role-exchanged twins.
+        """
+        if categories is None and items is None:
+            return self
+        chosen = select_items(self.items, categories, items, str(self.location))
+        return self._showing(self.wording, frozenset(chosen))
+
+    def _showing(self, wording: str | None, item_ids: frozenset[str] | None) -> "Run":
+        return Run(self.location, wording, item_ids).under(self.rule, self.last_steps)
+
+    def grown(self) -> "Run":
+        """The same run with the episodes that were committed since; only their commits are read."""
+
+        def read() -> Run:
+            run = self._showing(self.wording, self.item_ids)
+            run.__dict__["_commits"] = read_commits(run.root, self._commits)
+            return run
+
+        return while_growing(self.location, read)
+
+    @cached_property
+    def _commits(self) -> dict[int, Commit]:
+        return read_commits(self.root)
+
+    def commits(self) -> list[Commit]:
+        """The commit of every episode, in the order of `episodes`."""
+        return [self._commits[number] for number in self._numbers]
+
+    @cached_property
+    def _numbers(self) -> list[int]:
+        return [planned["episode"] for planned in self._plan if planned["episode"] in self._commits]
+
+    @cached_property
+    def stamp(self) -> str:
+        """Hash of all commits: what derived files were made from."""
+        return stamp_of(self._commits)
+
+    @cached_property
+    def failed(self) -> dict[str, str]:
+        """Episodes that were given up, with the reason."""
+        return read_failures(self.root)
+
+    @cached_property
+    def planned(self) -> int:
+        """Episodes the plan has, committed or not."""
+        return len(self._plan)
+
+    @cached_property
+    def planned_items(self) -> Mapping[str, str]:
+        """Category of every item of the plan by its id, whatever is shown of the run: its suite has them all."""
+        return {str(one["item_id"]): str(one["category"]) for one in self.root.plan}
+
+    @cached_property
+    def _plan_of_items(self) -> list[dict[str, Any]]:
+        """The plan of the items that are shown, in all wordings."""
+        return [e for e in self.root.plan if self.item_ids is None or e["item_id"] in self.item_ids]
+
+    @cached_property
+    def _plan(self) -> list[dict[str, Any]]:
+        return [e for e in self._plan_of_items if self.wording is None or e["wording"] == self.wording]
+
+    @cached_property
+    def _columns_rows(self) -> NDArray[np.intp] | slice:
+        """Which rows of the columns, which hold every committed episode, are those of `episodes`."""
+        if self.wording is None and self.item_ids is None:
+            return slice(None)
+        sealed = [planned["episode"] for planned in self.root.plan if planned["episode"] in self._commits]
+        return np.flatnonzero(np.isin(sealed, self._numbers))
+
+    @cached_property
+    def episodes(self) -> pd.DataFrame:
+        """One row per committed episode: the plan's columns, then the outcome's, then how long it took.
+
+        `seconds_inference` and `seconds_simulation` are wall-clock seconds: of the model's calls (of a call for
+        several observations its share), and of setting up, simulating and drawing. NaN where the folder
+        `times` was deleted. They differ between runs of one identity.
+        """
+        plan = self.root.planned
+        rows = [
+            {**plan[number], **self._commits[number]["outcome"], **self._seconds_columns(number)}
+            for number in self._numbers
+        ]
+        return pd.DataFrame(rows or None, columns=None if rows else [*self.root.plan[0], *_OUTCOME, *_SECONDS])
+
+    @cached_property
+    def _seconds(self) -> dict[int, Seconds]:
+        return read_seconds(self.root, self._commits)
+
+    def _seconds_columns(self, number: int) -> dict[str, float]:
+        seconds = self._seconds[number]
+        return dict(zip(_SECONDS, (seconds.inference, seconds.simulation), strict=True))
+
+    @cached_property
+    def control_steps(self) -> NDArray[np.int64]:
+        """(E, N) int64: the control step at which each inference of an episode was made, -1 behind its last one.
+
+        A control step is one executed action; an inference at step 4 saw the state after four actions. Of
+        recordings it is the number of the frame in its episode. N: most
+        inferences of an episode; 0 for scripts. Captured inference `call` is column `call`. An episode in which
+        nothing moves (`ask`, or without acting) has one inference, at step 0.
+        """
+        stored = [commit["control_steps"] for commit in self.commits()]
+        steps = np.full((len(stored), max((len(own) for own in stored), default=0)), -1, np.int64)
+        for row, own in enumerate(stored):
+            steps[row, : len(own)] = own
+        return steps
+
+    @cached_property
+    def lens_margins(self) -> NDArray[np.float64] | None:
+        """(E, L) of the logit lens: logit of the letter for left minus that for right, at every layer.
+
+        Of questions that are answered by letter, with left named first. The last layer gives the model's answer.
+        None for every other run; NaN for episodes without one.
+        """
+        stored = [commit.get(LENS_MARGINS, []) for commit in self.commits()]
+        layers = max(map(len, stored), default=0)
+        if not layers:
+            return None
+        return np.array([own or [np.nan] * layers for own in stored], np.float64)
+
+    # -- trajectories ----------------------------------------------------------------------------------
+
+    @cached_property
+    def has_trajectories(self) -> bool:
+        """Whether episodes keep what happened in them step by step.
+
+        Runs made before it was stored do not, nor those whose model did not act, nor copies without it.
+        """
+        if TRAJECTORY in self.root.left_out:
+            return False
+        return has_trajectories(self.root) and all(map(names_trajectory, self._commits.values()))
+
+    @cached_property
+    def trajectories(self) -> Trajectories:
+        """What happened in every episode, in the order of `episodes`. Raises NoTrajectoryError without any."""
+        if not self.has_trajectories:
+            raise NoTrajectoryError(
+                f"{self.location} keeps no trajectories; it was made before they were stored, or is a copy "
+                "without them. Extract it again to have them"
+            )
+        rows = Rows(open_array(self.data, TRAJECTORY), self._numbers)
+        return Trajectories(rows, self.episodes["steps"].astype(int).tolist(), str(self.location))
+
+    def trajectory(self, episode: str | int) -> "Trajectory":
+        """What happened in one episode, frame by frame; `.to_xarray()` labels it.
+
+        episode: its id, such as `color-0001:o`, or its row in `episodes`. Raises NoTrajectoryError if the run
+        keeps none, UsageError for an unknown episode, RunDamagedError if stored bytes are missing or changed.
+        """
+        return self.trajectories[self._position(episode)]
+
+    def judged(self, rule: str, last_steps: int = 1) -> pd.DataFrame:
+        """A row per episode with the fields of `Judgement`: what an outcome rule says of it.
+
+        rule: a name of `probe_kit.env.scoring.rules.RULES`. last_steps: control steps at the end that count; the
+        released evaluation averages over 11. Raises UsageError for an unknown rule, NoTrajectoryError.
+        """
+        if last_steps == 1:
+            return self._watched.verdicts[check_rule(rule)].copy()
+        return judged(self.trajectories, self.episodes["side_correct"], self.settings["scene"], rule, last_steps)
+
+    def under(self, rule: str, last_steps: int = 1) -> "Run":
+        """The same run with its outcomes by another rule, for tables and figures; see `judged`."""
+        if (check_rule(rule), last_steps) == (self.rule, self.last_steps):
+            return self
+        judged = copy(self)
+        judged.rule, judged.last_steps = rule, last_steps
+        judged.__dict__["episodes"] = with_outcomes(self.episodes, self.judged(rule, last_steps))
+        return judged
+
+    @cached_property
+    def behaviour(self) -> pd.DataFrame:
+        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring.behaviour`.
+
+        Raises NoTrajectoryError if the run keeps no trajectories.
+        """
+        table = self._watched.behaviour
+        return table.assign(episode_id=self.episodes["episode_id"]).set_index("episode_id").reset_index()
+
+    @cached_property
+    def _watched(self) -> Watched:
+        return watch(self.trajectories, self.episodes["side_correct"], self.settings["scene"])
+
+    def instruction_ids(self, episode: str | int) -> tuple[int, ...] | None:
+        """The instruction of one episode as the policy was delivered it; None where nothing was stored."""
+        ids = self.commits()[self._position(episode)].get("instruction_ids")
+        return None if ids is None else tuple(ids)
+
+    def _position(self, episode: str | int) -> int:
+        """Row in `episodes`. Raises UsageError."""
+        names = self.episodes["episode_id"].tolist()
+        if isinstance(episode, str) and episode in names:
+            return names.index(episode)
+        if isinstance(episode, int) and 0 <= episode < len(names):
+            return episode
+        raise UsageError(
+            f"{self.location} has no episode {episode!r}; it has {len(names)}, from {names[0]!r} on"
+            if names
+            else f"{self.location} has no episode yet"
+        )
+
+    # -- streams ---------------------------------------------------------------------------------------
+
+    @property
+    def streams(self) -> dict[str, Stream]:
+        """The captured streams; empty for a scripted run."""
+        return {name: stored.stream for name, stored in self._streams.items()}
+
+    def stored(self, stream: str) -> StoredStream:
+        """How one stream lies in the store. Raises UnknownSiteError."""
+        if stream not in self._streams:
+            known = ", ".join(self._streams) or "none (a scripted run has no activations)"
+            raise UnknownSiteError(f"{self.location} has no stream {stream!r}; stored: {known}")
+        return self._streams[stream]
+
+    def views(self, stream: str, call: int = 0) -> tuple[str, ...]:
+        """Pooled views of one stream that are stored of captured inference `call`."""
+        return (MEAN_VIEW,) if self._keeps_mean_of(call) else self.stored(stream).views
+
+    def _keeps_mean_of(self, call: int) -> bool:
+        """Whether captured inference `call` is one of which the mean alone is stored, in bfloat16."""
+        return call > 0 and self.root.later_views == MEAN_VIEW
+
+    def sites(self, stream: str) -> list[Site]:
+        """All sites of one stream."""
+        return self.stored(stream).stream.sites()
+
+    @property
+    def captured_calls(self) -> int:
+        """Inferences captured per episode, from the first on; episodes that ended early have fewer."""
+        return int(self.settings["captured_calls"])
+
+    def reached(self, call: int) -> NDArray[np.bool_]:
+        """(E,) whether an episode got as far as captured inference `call`."""
+        return np.array([len(commit["roles"]) > call for commit in self.commits()], bool)
+
+    def _check(self, site: Site, call: int) -> StoredStream:
+        stored = self.stored(site.stream)
+        if not 0 <= call < self.captured_calls:
+            raise UnknownSiteError(
+                f"{self.location} has {self.captured_calls} captured inferences per episode, counted from 0; "
+                f"asked for {call}. Extract with --captured-calls {call + 1}"
+            )
+        if site not in stored.stream.sites():
+            raise UnknownSiteError(
+                f"{self.location} has no site {site}; {site.stream} has {stored.layers} layers"
+                + (f" and {stored.iterations} iterations" if stored.iterations else "")
+            )
+        return stored
+
+    # -- pooled ----------------------------------------------------------------------------------------
+
+    def column(self, site: Site, view: str = "mean", call: int = 0) -> NDArray[np.float32]:
+        """(E, D) float32: one pooled view of one site at one captured inference, a row per episode.
+
+        NaN in the rows of episodes that ended before inference `call`; see `reached`. With `--later-views mean`,
+        inferences after the first have the view `mean` alone, rounded to bfloat16.
+
+        Raises UnknownSiteError, RunDamagedError if stored bytes are missing or fail their checksum, or
+        ActivationsLeftOutError in a copy without activations.
+        """
+        stored = self._check(site, call)
+        if self.columns is None and f"{site.stream}/pooled" in self.root.left_out:
+            self.root.refuse_left_out(f"there is no column of {site}")
+        view = resolve_view(view, stored.views)
+        if view not in (known := self.views(site.stream, call)):
+            at = f" at inference {call}, with --later-views mean" if self._keeps_mean_of(call) else ""
+            raise UnknownSiteError(f"no view {view!r} of {site.stream}{at}; stored: {', '.join(known)}")
+        if self.columns is None:
+            self._note_slow_reading()
+            return self._column_of_rows(stored, site, view, call)
+        if self._keeps_mean_of(call):
+            return self.columns.later_column(stored, site, call)[self._columns_rows]
+        return self.columns.column(stored, site, view, call)[self._columns_rows]
+
+    def _column_of_rows(self, stored: StoredStream, site: Site, view: str, call: int) -> NDArray[np.float32]:
+        at = stored.at(site)
+        index: tuple[Any, ...] = (slice(None), call - 1, *at)
+        if self._keeps_mean_of(call):
+            return decode_bfloat16(self._kept(site.stream, "later")[index])
+        index = (slice(None), call, *at, stored.views.index(view))
+        return np.asarray(self._kept(site.stream, "pooled")[index])
+
+    @property
+    def sealed(self) -> bool:
+        """Whether columns were built from exactly the episodes that are committed."""
+        return self.columns is not None
+
+    @cached_property
+    def columns(self) -> Columns | None:
+        """The sealed columns, None if there are none of exactly these episodes. Raises RunDamagedError."""
+        return find_columns(self.root, self._commits)
+
+    def _note_slow_reading(self) -> None:
+        warnings.warn(
+            f"{self.location} is not sealed; columns are put together from rows, which is slow but gives the same "
+            f"numbers. `probe-kit run verify {self.location} --seal` makes it fast",
+            NotSealedWarning,
+            stacklevel=3,
+        )
+
+    def rows(self, stream: str, kind: ArrayKind = "pooled") -> Rows:
+        """The stored rows of the committed episodes: all that was captured in one episode at a time.
+
+        Raises ActivationsLeftOutError in a copy without activations.
+        """
+        if f"{stream}/{kind}" in self.root.left_out:
+            self.root.refuse_left_out(f"there are no {kind} of {stream}")
+        return Rows(open_array(self.data, f"{stream}/{kind}"), self._numbers)
+
+    @property
+    def data(self) -> Store:
+        """The arrays of the committed episodes as Zarr reads them; every object is checked as it is read."""
+        store = self.location.store(DATA, read_only=True)
+        return CheckedStore(
+            store, self._sums, lambda key: f"{self.location}/{DATA}/{key}", self._advice, self.root.metadata
+        )
+
+    @cached_property
+    def _sums(self) -> dict[str, Sum]:
+        return committed_sums(self.root, self._commits)
+
+    def _advice(self, key: str) -> str:
+        """What to do about a damaged object of `data.zarr`."""
+        of = next((number for number, commit in self._commits.items() if key in commit["objects"]), None)
+        return RESTORE if of is None else redo(of)
+
+    def _kept(self, stream: str, kind: VectorKind) -> NDArray[Any]:
+        """(E, S, [I,] L, [V,] D) rows of the committed episodes, read once per array."""
+        if (stream, kind) not in self._kept_rows:
+            rows = self.rows(stream, kind)
+            self._kept_rows[stream, kind] = np.stack([rows[position] for position in range(len(rows))])
+        return self._kept_rows[stream, kind]
+
+    @cached_property
+    def _kept_rows(self) -> dict[tuple[str, VectorKind], NDArray[Any]]:
+        return {}
+
+    def xarray(self) -> "xr.Dataset":
+        """The pooled arrays with labelled views and episodes; dimensions of a stream carry its name.
+
+        With `--later-views mean` they hold the first inference alone; `column` reads the others.
+
+        Values of a sealed run are read when they are used, not before.
+        """
+        import xarray as xr
+
+        arrays = {}
+        for name, stored in self._streams.items():
+            if self.columns is None:
+                dimensions = ["episode", "call", *stored.dimensions, "view", "feature"]
+                array = xr.DataArray(self._kept(name, "pooled"), dims=dimensions)
+            else:
+                array = self.columns.xarray(name).isel(episode=self._columns_rows)
+            own = {dimension: f"{name}_{dimension}" for dimension in (*stored.dimensions, "view", "feature")}
+            array = array.rename(own).transpose("episode", "call", *own.values())
+            arrays[f"{name}_pooled"] = array.assign_coords({f"{name}_view": list(stored.views)})
+        labels = ("episode_id", "category", "layout", "side_correct", "outcome")
+        there = [label for label in labels if label in self.episodes]
+        return xr.Dataset(arrays, coords={label: ("episode", self.episodes[label]) for label in there})
+
+    # -- tokens ----------------------------------------------------------------------------------------
+
+    def tokens(
+        self, site: Site, role: str | None = None, call: int = 0
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """(E, T, D) float32 values and (E, T) bool mask of one site; the mask chooses `role`, or all but padding.
+
+        Values outside the mask are zero. For large runs use `iter_token_blocks`, which holds one block.
+        Raises UnknownSiteError if the run was extracted without `--tokens all`, or never had that role.
+        """
+        mask = self._role_mask(site, role, call)
+        values = np.zeros((*mask.shape, self.stored(site.stream).width), np.float32)
+        for block in self.iter_token_blocks(site, role, call):
+            values[:, block.start : block.start + block.mask.shape[1]] = block.values
+        return values, mask
+
+    def token_mask(self, site: Site, role: str | None = None, call: int = 0) -> NDArray[np.bool_]:
+        """(E, T) bool: the positions of `role` at one site, or of all tokens but padding; see `tokens`."""
+        return self._role_mask(site, role, call)
+
+    def iter_token_blocks(self, site: Site, role: str | None = None, call: int = 0) -> Iterator[TokenBlock]:
+        """The tokens of one site, at most 128 positions of all episodes at a time; see `tokens`.
+
+        Only blocks that hold a token of `role` are read.
+        """
+        mask = self._role_mask(site, role, call)
+        stored = self.stored(site.stream)
+        rows = self.rows(site.stream, "tokens")
+        return token_blocks(rows, (call, *stored.at(site)), mask, stored.token_block)
+
+    def gram(self, site: Site, role: str | None = None, call: int = 0) -> NDArray[np.float64]:
+        """(E, E) float64 linear kernel: products of tokens at equal positions, summed, over sqrt(n_i n_j).
+
+        n is an episode's number of chosen tokens, so that longer instructions do not weigh more.
+        """
+        kernel = np.zeros((len(self._numbers), len(self._numbers)))
+        counts = np.zeros(len(self._numbers))
+        for block in self.iter_token_blocks(site, role, call):
+            flat = block.values.reshape(len(kernel), -1)
+            kernel += flat @ flat.T
+            counts += block.mask.sum(axis=1)
+        return np.asarray(kernel / np.sqrt(np.outer(counts, counts)))
+
+    def _role_mask(self, site: Site, role: str | None, call: int) -> NDArray[np.bool_]:
+        stored = self._check(site, call)
+        if self.settings["tokens"] != "all":
+            raise UnknownSiteError(f"{self.location} stores pooled views only; extract with --tokens all")
+        calls = [commit["roles"] for commit in self.commits()]
+        spans = [own[call][site.stream] if call < len(own) else [] for own in calls]
+        mask = role_mask(spans, stored.stored_tokens, role)
+        if not mask[self.reached(call)].any(axis=1).all():
+            known = sorted({name for episode in spans for name, _, _ in episode})
+            raise UnknownSiteError(f"not every episode has a token of role {role!r} at {site}; roles: {known}")
+        return mask

@@ -1,0 +1,102 @@
+"""Small frames of an episode as one picture: the first and last one (2 kB), or all of them (4 kB each).
+
+They illustrate: no number depends on them. The commit of their episode names the picture with its hash, because
+who looks at a report believes what it shows. All pictures may be deleted, not single ones.
+"""
+
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from probe_kit.errors import RunDamagedError
+from probe_kit.runs.commits import FRAME_COUNT, pictures_of, read_own_commit, redo_picture
+from probe_kit.runs.layout import FRAME_COLUMNS, FRAMES, FrameChoice
+from probe_kit.runs.small_frames import SmallFrames, shrink
+from probe_kit.runs.store import Location, locate
+from probe_kit.suite.pictures import decode_bytes
+
+_LARGEST_SHEET = 16_383
+"""Pixels of the longer side, as WebP has them."""
+_CODING: dict[FrameChoice, dict[str, int]] = {
+    "ends": {"quality": 85, "method": 4},
+    "all": {"quality": 80, "method": 0},
+}
+"""Method 2 would save a fifth of the bytes of a sheet, and take twice the time."""
+
+
+@dataclass(frozen=True)
+class FrameSheet:
+    """The stored picture of an episode. content: the WebP.
+
+    count: how many frames it holds, one before the first action and one behind each. None in a picture of the
+    first and last frame.
+    """
+
+    content: bytes
+    count: int | None
+
+
+def as_thumbnail(frames: SmallFrames, choice: FrameChoice = "ends") -> bytes:
+    """The frames as one WebP, `FRAME_COLUMNS` to a row; black behind the last one."""
+    columns = min(len(frames), FRAME_COLUMNS)
+    blank = [np.zeros_like(frames[0])] * (-len(frames) % columns)
+    full = [*frames, *blank]
+    rows = [np.hstack(full[start : start + columns]) for start in range(0, len(full), columns)]
+    encoded = BytesIO()
+    Image.fromarray(np.vstack(rows)).save(encoded, "WEBP", **_CODING[choice])
+    return encoded.getvalue()
+
+
+def decode_frames(content: bytes, count: int) -> SmallFrames:
+    """The `count` frames of a picture that `as_thumbnail` made."""
+    columns = min(count, FRAME_COLUMNS)
+    rows = -(-count // columns)
+    pixels = np.asarray(
+        decode_bytes(
+            content, "the stored frames:", RunDamagedError, "Extract the run again.", largest=_LARGEST_SHEET
+        )
+    )
+    cells = pixels.reshape(rows, pixels.shape[0] // rows, columns, pixels.shape[1] // columns, 3).swapaxes(1, 2)
+    return tuple(cells.reshape(-1, *cells.shape[2:])[:count])
+
+
+def read_thumbnail(run: Path | Location, number: int) -> bytes | None:
+    """A WebP of episode `number`, first frame left and last frame right; None if the run keeps none.
+
+    Raises RunDamagedError as `read_sheet`.
+    """
+    sheet = read_sheet(run, number)
+    if sheet is None or sheet.count is None:
+        return None if sheet is None else sheet.content
+    first, *further = decode_frames(sheet.content, sheet.count)
+    return as_thumbnail(tuple(shrink(frame) for frame in (first, *further[-1:])))
+
+
+def read_sheet(run: Path | Location, number: int) -> FrameSheet | None:
+    """The picture of episode `number` as it is stored; None if the run keeps none.
+
+    Raises RunDamagedError if it is not the one that was stored when the episode was committed, or is lost alone.
+    Pictures of arrays that are no run are bound to nothing.
+    """
+    location, key = locate(run), thumbnail_key(number)
+    commit = read_own_commit(location, number)
+    promised = None if commit is None else pictures_of(commit)
+    if promised is not None and key not in promised:
+        return None
+    try:
+        content = location.read(key)
+    except FileNotFoundError:
+        if promised is None or not location.keys(FRAMES):
+            return None
+        raise RunDamagedError(f"{location}/{key} is missing. {redo_picture(number)}") from None
+    if promised is not None and (problem := promised[key].problem(content)):
+        raise RunDamagedError(f"{location}/{key} {problem}. {redo_picture(number)}")
+    return FrameSheet(content, None if commit is None else commit.get(FRAME_COUNT))
+
+
+def thumbnail_key(number: int) -> str:
+    """Where the thumbnail of episode `number` lies."""
+    return f"{FRAMES}/{number:08d}.webp"

@@ -1,0 +1,345 @@
+"""Writing of a run: created once, then one committed episode at a time."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import prod
+from typing import Any, Protocol, Self
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.core.array_spec import ArrayConfigLike
+from zarr.core.buffer import Buffer
+from zarr.storage import MemoryStore
+
+from probe_kit.errors import SettingsMismatchError
+from probe_kit.hashing import canonical_json
+from probe_kit.runs.arrays import at_extent, create_arrays
+from probe_kit.runs.certificates import write_certificate
+from probe_kit.runs.commits import (
+    FRAME_COUNT,
+    LENS_MARGINS,
+    Commit,
+    commit_key,
+    read_commit,
+    read_commits,
+    write_commit,
+    write_failure,
+)
+from probe_kit.runs.growth import check_other_settings, further_rows
+from probe_kit.runs.inputs import create_inputs, write_inputs
+from probe_kit.runs.label import label_record
+from probe_kit.runs.layout import (
+    COMMITS,
+    DATA,
+    FAILED,
+    LABEL_FILE,
+    PLANS,
+    RUN_FILE,
+    StoredStream,
+    stored_inputs_of,
+)
+from probe_kit.runs.plans import grown_record, plan_key, while_growing
+from probe_kit.runs.provenance import (
+    Provenance,
+    check_other_provenance,
+    keep_provenance,
+    name_of,
+    provenance_here,
+    read_provenances,
+)
+from probe_kit.runs.recording import RecordingStore
+from probe_kit.runs.records import Sum, as_record, record_hash
+from probe_kit.runs.root import Root, new_root, read_root
+from probe_kit.runs.seconds import Seconds, write_seconds
+from probe_kit.runs.store import Location
+from probe_kit.runs.trajectories import create_trajectories, has_trajectories, write_trajectory
+
+# Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
+# a reader must be able to tell an empty chunk from a lost one. Not stored in the array, so asked for here.
+_WRITE_ALL: ArrayConfigLike = {"write_empty_chunks": True}
+
+
+class WrittenRow(Protocol):
+    """A row of a plan as the store knows it: its number in the run, and its id, the same in every selection."""
+
+    @property
+    def index(self) -> int:
+        """Its number in the run, where its objects lie."""
+
+    @property
+    def episode_id(self) -> str:
+        """Its id."""
+
+
+class WrittenPlan(Protocol):
+    """The rows that a writer is to store, and how their streams lie."""
+
+    @property
+    def episodes(self) -> Sequence[WrittenRow]:
+        """The rows, in order."""
+
+    @property
+    def streams(self) -> Sequence[StoredStream]:
+        """The captured streams."""
+
+    @property
+    def selection(self) -> dict[str, Any]:
+        """What was selected; no part of the run's identity."""
+
+    def to_json(self) -> dict[str, Any]:
+        """`episodes` as flat columns, and `suite_parent`."""
+
+    def numbered(self, numbers: Mapping[str, int]) -> Self:
+        """The same rows with the numbers that a run has for their ids."""
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """All that is stored of one episode.
+
+    arrays: by kind (`pooled`, `tokens`) and stream, each shaped like its row in the store.
+    roles: per captured inference and stream, the spans of roles. trajectory: (T + 1, C) float32 frames.
+    instruction_ids: the instruction as the policy was delivered it. pictures: encoded, by key in the run. frames:
+    how many one of them holds, if it holds all of the episode.
+    control_steps: of every inference, how many actions of the episode came before it; rising. seconds: what the
+    episode took, which no hash of the run covers. inputs: what was shown of recordings, by kind. lens_margins: of
+    an answer by letter, left minus right at every layer.
+    """
+
+    planned: WrittenRow
+    outcome: Mapping[str, Any]
+    arrays: Mapping[str, Mapping[str, NDArray[Any]]]
+    roles: Sequence[Mapping[str, Sequence[tuple[str, int, int]]]]
+    trajectory: NDArray[np.float32] | None = None
+    instruction_ids: Sequence[int] | None = None
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
+    control_steps: Sequence[int] = ()
+    seconds: Seconds = field(default_factory=Seconds)
+    frames: int | None = None
+    inputs: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    lens_margins: Sequence[float] | None = None
+
+
+class RunWriter[PlanT: WrittenPlan]:
+    """Creates a run, continues the one that is there, or lets it grow; any number of processes may do so at once.
+
+    plan: episodes to play. Those that the run lacks are appended to its plan; `self.plan` has the run's numbers.
+    settings: without what a selection decides. provenance: of this process, by default of one that computes on
+    the CPU. label: what tables call a run that begins here, by default the model's name; one that is there keeps
+    its own, see `label_run`.
+    Raises SettingsMismatchError if the location holds a run with other settings, episodes that `plan` lacks while
+    it lacks others, or anything else, and RunDamagedError if what it holds was changed.
+    """
+
+    def __init__(
+        self, location: Location, plan: PlanT, settings: dict[str, Any], provenance: Provenance | None = None,
+        label: str | None = None,
+    ) -> None:  # fmt: skip
+        self.location, self.plan = location, plan
+        self.provenance = provenance or provenance_here()
+        self._begun = self._certified = False
+        self.settings = json.loads(canonical_json(settings))
+        self._label = label or str(self.settings["model"])
+        if not location.exists(RUN_FILE):
+            location.found(self._beginning(), last=RUN_FILE)
+        self.root = while_growing(location, self._continued)
+        self.plan = plan.numbered({row["episode_id"]: row["episode"] for row in self.root.plan})
+
+    @property
+    def streams(self) -> list[StoredStream]:
+        """How the streams lie in the run, which may have room for longer sequences than this plan needs."""
+        return [self.root.streams[stream.name] for stream in self.plan.streams]
+
+    @property
+    def _with_tokens(self) -> bool:
+        return bool(self.settings["tokens"] == "all")
+
+    def _beginning(self) -> dict[str, bytes]:
+        """Every object that a run of these settings has before its first plan, the same for every selection."""
+        arrays: dict[str, Buffer] = {}
+        store = MemoryStore(arrays)
+        create_arrays(
+            store, list(self.plan.streams), 0, self.settings["captured_calls"], self._with_tokens,
+            self.settings["codec"], self.settings.get("later_views", "all"),
+        )  # fmt: skip
+        still = "ask" in self.settings or bool(self.settings.get("capture_only"))
+        if "scene" in self.settings and not still:  # who is asked or captured does not move
+            frames = self.settings["scene"]["max_steps"] + 1
+            create_trajectories(store, 0, frames, self.settings["codec"])
+        if source := stored_inputs_of(self.settings):
+            create_inputs(store, self.settings["captured_calls"], source["inputs"], self.settings["codec"])
+        objects = {f"{DATA}/{key}": at_extent(value.to_bytes(), 0) for key, value in arrays.items()}
+        root = new_root(self.settings, [self._without_length(one) for one in self.plan.streams], objects)
+        return {**objects, LABEL_FILE: label_record(record_hash(root), self._label), RUN_FILE: root}
+
+    def _without_length(self, stream: StoredStream) -> dict[str, Any]:
+        """A stream as `run.json` has it: without its number of tokens, unless arrays are as long as that."""
+        kept = stream.to_json()
+        return kept if self._with_tokens else {name: value for name, value in kept.items() if name != "tokens"}
+
+    def _continued(self) -> Root:
+        """The root of the run that is there, whose plan now holds the one of this writer."""
+        root = read_root(self.location)
+        root.check_continuable()
+        check_other_settings(root.own_settings, self.settings, str(self.location))
+        self._check_lengths(root)
+        if self._lacks(root) or root.narrow:
+            with self.location.held(lambda: None), self.location.tended(PLANS):
+                root = self._grown()
+        root.check()
+        return root
+
+    def _lacks(self, root: Root) -> bool:
+        """Whether the run does not plan all of this writer's episodes yet. Raises SettingsMismatchError."""
+        rows = self.plan.to_json()["episodes"]
+        return not root.plan or bool(further_rows(root.plan, rows, str(self.location)))
+
+    def _grown(self) -> Root:
+        """The root, once the run plans all of this writer's episodes and has room for them. Room is only added."""
+        root = read_root(self.location)
+        while self._lacks(root):
+            self.location.create_record(plan_key(len(root.stored_plan.extents)), self._record(root))
+            root = read_root(self.location)  # ours, or that of a process that was first
+        while root.narrow:
+            for key, content in root.widened().items():
+                self.location.write_record(key, content)
+            root = read_root(self.location)  # another process may have let it grow further
+        return root
+
+    def _check_lengths(self, root: Root) -> None:
+        """Raise SettingsMismatchError for instructions that the arrays of all tokens are too short for."""
+        for stream in self.plan.streams if self._with_tokens else ():
+            room = root.own_streams[stream.name].tokens
+            if stream.tokens > room:
+                raise SettingsMismatchError(
+                    f"{self.location} stores {room} tokens of {stream.name} per episode; the longest instruction "
+                    f"of this command needs {stream.tokens}. A run with --tokens all takes no longer instructions "
+                    "than it began with. Choose another --out"
+                )
+
+    def _record(self, root: Root) -> bytes:
+        """The plan record that adds this writer's plan to the one of the run."""
+        plan = self.plan.to_json()
+        tokens = {} if self._with_tokens else {stream.name: stream.tokens for stream in self.plan.streams}
+        selection = json.loads(canonical_json(self.plan.selection))
+        return grown_record(
+            root.identity, root.stored_plan, plan["episodes"], selection, plan["suite_parent"], tokens
+        )
+
+    @cached_property
+    def _keeps_trajectories(self) -> bool:
+        """Not in a run that was begun before there were any: all of its episodes stay alike."""
+        return has_trajectories(self.root)
+
+    @contextmanager
+    def owned(self) -> Iterator[None]:
+        """Work on the run while the body runs; failures of earlier attempts are forgotten."""
+        with self.location.held(lambda: self.location.remove(FAILED)):
+            yield
+
+    @contextmanager
+    def joined(self) -> Iterator[None]:
+        """Work along while the body runs, in a process that the owner started, and may outlive it.
+
+        No process then removes its drafts as leftovers. Failures that the owner recorded stay.
+        """
+        with self.location.held(lambda: None):
+            yield
+
+    def begin(self, allow_mixed: bool = False) -> None:
+        """Say in the run who is going to play in it.
+
+        Raises SettingsMismatchError if episodes were played where numbers come out otherwise, unless that is
+        allowed.
+        """
+        if not allow_mixed:
+            stored = read_provenances(self.root).values()
+            check_other_provenance(stored, self.provenance, str(self.location))
+        self._say_who_plays()
+
+    def _say_who_plays(self) -> None:
+        if not self._begun:
+            keep_provenance(self.location, self.provenance)
+            self._begun = True
+
+    def remaining(self) -> list[int]:
+        """Numbers of the episodes that are not committed; objects of the committed ones are checked."""
+        done = while_growing(self.location, lambda: read_commits(read_root(self.location)))
+        return [episode.index for episode in self.plan.episodes if episode.index not in done]
+
+    def write(self, episode: EpisodeRecord) -> None:
+        """Store one episode: first its arrays, then the commit that makes it count.
+
+        An episode that another process has committed meanwhile stays as it is.
+        """
+        number = episode.planned.index
+        if self.location.exists(commit_key(number)):
+            return
+        self._say_who_plays()  # before any commit names it
+        self.write_certificate({})
+        commit = self._write_objects(episode)
+        write_seconds(self.root, number, episode.seconds)
+        if not write_commit(self.location, number, commit):
+            self._settle(episode, commit)
+
+    def _settle(self, episode: EpisodeRecord, commit: Commit) -> None:
+        """Make objects and commit those of one process, where two have written the same episode at once.
+
+        Equal numbers are equal bytes, and the first commit stays. Numbers of other batches or processors differ by
+        rounding: some objects then are ours although the commit is not. All of them become ours, with the commit.
+        """
+        key = commit_key(episode.planned.index)
+        with self.location.tended(COMMITS):
+            theirs = read_commit(self.root, episode.planned.index, key, self.location.read(key))
+            if any(theirs[part] != commit[part] for part in ("objects", "pictures")):
+                self.location.write_record(key, as_record(self._write_objects(episode)))
+
+    def _write_objects(self, episode: EpisodeRecord) -> Commit:
+        """Everything of an episode but its commit, which is returned."""
+        planned = episode.planned
+        store = RecordingStore(self.location.store(DATA))
+        for kind, by_stream in episode.arrays.items():
+            for stream, values in by_stream.items():
+                array = zarr.open_array(
+                    store, path=f"{stream}/{kind}", mode="r+", zarr_format=3, config=_WRITE_ALL
+                )
+                if array.shards:
+                    store.shards[f"{stream}/{kind}"] = prod(array.shards) // prod(array.chunks)
+                array[planned.index] = values
+        if episode.trajectory is not None and self._keeps_trajectories:
+            write_trajectory(store, planned.index, episode.trajectory, _WRITE_ALL)
+        write_inputs(store, planned.index, episode.inputs, _WRITE_ALL)
+        for key, content in episode.pictures.items():
+            self.location.write(key, content)
+        pictures = {key: Sum.of(content) for key, content in episode.pictures.items()}
+        written = {**{f"{DATA}/{key}": one for key, one in store.sums.items()}, **pictures}
+        self.location.confirm({key: one.length for key, one in written.items()})
+        return {
+            "run": self.root.identity,
+            "episode": planned.index,
+            "episode_id": planned.episode_id,
+            "plan": self.root.stored_plan.hash_of(planned.index),
+            "outcome": episode.outcome,
+            "roles": episode.roles,
+            "provenance": name_of(self.provenance),
+            **({} if episode.instruction_ids is None else {"instruction_ids": list(episode.instruction_ids)}),
+            "control_steps": [int(step) for step in episode.control_steps],
+            **({} if episode.lens_margins is None else {LENS_MARGINS: list(episode.lens_margins)}),
+            "objects": {key: one.to_json() for key, one in store.sums.items()},
+            "pictures": {key: one.to_json() for key, one in pictures.items()},
+            **({} if episode.frames is None else {FRAME_COUNT: episode.frames}),
+        }
+
+    def write_certificate(self, certificate: dict[str, Any]) -> None:
+        """Record what was loaded and checked by this process, once; the whole of it stays from the first one."""
+        if not self._certified:
+            write_certificate(self.root, certificate, self.provenance)
+            self._certified = True
+
+    def give_up(self, number: int, reason: str, traceback: str = "") -> None:
+        """Record why episode `number` is not played, with the traceback of its error."""
+        write_failure(self.root, number, reason, traceback)

@@ -1,0 +1,463 @@
+"""A run grows: by more items, categories and wordings; what it has stays byte for byte, and nothing ever goes."""
+
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+
+from probe_kit.errors import NoProbesError, RunDamagedError, RunIncompleteError, SettingsMismatchError
+from probe_kit.extract import Extraction, ExtractSettings
+from probe_kit.extract.plan import Plan, make_plan
+from probe_kit.extract.vqa.phrases import QUERIES, phrases
+from probe_kit.runs import Run, open_run, seal, verify_run
+from probe_kit.runs.folder import Folder
+from probe_kit.runs.growth import growth_at
+from probe_kit.runs.plans import count_plans, plan_key
+from probe_kit.runs.store import locate
+from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.runs.writer import RunWriter
+from probe_kit.suite import Suite
+from probe_kit.suite.ladder import Wording
+from probe_kit.train import load_results, train_probes
+from probe_kit.train.results.inventory import inventory
+from tests.support.changed_suites import without_twins
+from tests.support.little_run import STREAMS, certify, episode, little_settings, still
+from tests.support.rehashing import write_record
+
+pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
+
+Selection = tuple[Sequence[str], int, Sequence[Wording] | None]
+COLOR: list[Selection] = [(["color"], items, None) for items in (2, 4, 6)]
+CHAINS: dict[str, list[Selection]] = {
+    "more items": COLOR,
+    "more categories before the first": [(["shape"], 2, None), (["color", "shape"], 2, None)],
+    "both": [(["color"], 2, None), (["color", "shape"], 2, None), (["color", "shape"], 6, None)],
+    "more wordings": [(["color"], 2, ["knowledge"]), (["color"], 4, ["side", "knowledge", "neutral"])],
+    "nothing": [(["color"], 2, None), (["color"], 2, None)],
+}
+
+
+def plan_of(suite: Suite, selection: Selection) -> Plan:
+    categories, items, wordings = selection
+    return make_plan(suite.select(categories, items), list(STREAMS), 0, 1, False, wordings)
+
+
+def writer_of(where: Path, plan: Plan) -> RunWriter:
+    writer = RunWriter(locate(where), plan, {**little_settings(), "tokens": "pooled"})
+    certify(writer)
+    return writer
+
+
+def play(writer: RunWriter, last: Plan, numbers: Sequence[int] | None = None) -> None:
+    """What an episode gives follows from its place in `last`, whatever its number is."""
+    places = {one.episode.episode_id: place for place, one in enumerate(last.episodes)}
+    for number in writer.remaining() if numbers is None else numbers:
+        planned = writer.plan.episode(number)
+        place = places[planned.episode.episode_id]
+        record = episode(last, place)
+        pictures = {thumbnail_key(number): as_thumbnail(still(0, place))}
+        arrays = {"pooled": record.arrays["pooled"]}
+        writer.write(replace(record, planned=planned, pictures=pictures, arrays=arrays))
+
+
+def extracted(where: Path, suite: Suite, selections: Sequence[Selection]) -> Run:
+    """A run that is played, sealed and grown selection by selection."""
+    last = plan_of(suite, selections[-1])
+    for selection in selections:
+        play(writer_of(where, plan_of(suite, selection)), last)
+        seal(where)
+    return open_run(where)
+
+
+def files_of(run: Path) -> dict[str, bytes]:
+    return {path.relative_to(run).as_posix(): path.read_bytes() for path in run.rglob("*") if path.is_file()}
+
+
+def contents(run: Run) -> dict[str, Any]:
+    """By episode, every byte that belongs to it, under names that hold no number."""
+    found = {}
+    for number, name in zip(run.episodes["episode"], run.episodes["episode_id"], strict=True):
+        commit = json.loads((run.path / f"commits/{number:08d}.json").read_bytes())
+        objects = {key.replace(f"/c/{number}/", "/c/#/"): (run.path / "data.zarr" / key).read_bytes()
+                   for key in commit["objects"]}  # fmt: skip
+        said = {key: commit[key] for key in ("run", "episode_id", "outcome", "roles", "instruction_ids",
+                                             "control_steps", "provenance")}  # fmt: skip
+        found[name] = [said, objects, (run.path / thumbnail_key(number)).read_bytes()]
+    return found
+
+
+# -- what grew is what would have been extracted at once ---------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "chain", [name if name == "both" else pytest.param(name, marks=pytest.mark.slow) for name in CHAINS]
+)
+def test_a_grown_run_equals_one_extracted_at_once_episode_by_episode(
+    chain: str, small_suite: Suite, tmp_path: Path
+) -> None:
+    grown = extracted(tmp_path / "grown", small_suite, CHAINS[chain])
+    at_once = extracted(tmp_path / "at_once", small_suite, CHAINS[chain][-1:])
+    assert (grown.path / "run.json").read_bytes() == (at_once.path / "run.json").read_bytes()
+    assert contents(grown) == contents(at_once)
+    times = ["episode", "seconds_inference", "seconds_simulation"]
+    assert grown.episodes.drop(columns=times).equals(at_once.episodes.drop(columns=times))
+    assert (grown.settings, grown.suite, grown.suite_parent) == (
+        at_once.settings,
+        at_once.suite,
+        at_once.suite_parent,
+    )
+    assert grown.items.equals(at_once.items)
+    assert grown.wordings == at_once.wordings
+    for site in [*grown.sites("backbone"), *grown.sites("expert")]:
+        np.testing.assert_array_equal(grown.column(site), at_once.column(site))
+    np.testing.assert_array_equal(
+        [one.frames for one in grown.trajectories], [one.frames for one in at_once.trajectories]
+    )
+    assert grown.sealed
+    found = verify_run(grown.path, deep=True)
+    assert (found.ok, found.finished, found.strays) == (True, True, ())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("chain", CHAINS)
+def test_growing_changes_no_byte_of_what_is_there(chain: str, small_suite: Suite, tmp_path: Path) -> None:
+    *first, last = CHAINS[chain]
+    run = extracted(tmp_path / "run", small_suite, first)
+    before, planned = files_of(run.path), run.planned
+    grown = extracted(run.path, small_suite, [last])
+    after = files_of(run.path)
+    derived = ("columns.zarr/", "sealed/")
+    metadata = {name for name in before if name.endswith("zarr.json")}
+    kept = {name for name in before if not name.startswith(derived)} - metadata
+    assert {name: after[name] for name in kept} == {name: before[name] for name in kept}
+    assert count_plans(run.location) == (len(first) + 1 if chain != "nothing" else 1)
+    assert grown.episodes["episode"].max() == grown.planned - 1 >= planned - 1
+
+
+def test_plain_zarr_reads_a_grown_run_at_its_size(small_suite: Suite, tmp_path: Path) -> None:
+    run = extracted(tmp_path / "run", small_suite, COLOR)
+    arrays = [
+        zarr.open_array(run.path / "data.zarr" / name, mode="r") for name in ("backbone/pooled", "trajectory")
+    ]
+    assert [array.shape[0] for array in arrays] == [12, 12]
+    assert not np.isnan(np.asarray(arrays[0])).any()
+
+
+@pytest.mark.parametrize("query", QUERIES)
+def test_the_plan_of_more_items_holds_the_plan_of_fewer(query: Any, small_suite: Suite) -> None:
+    for category in ("color", "shape"):
+        plans, named = [], []
+        for items in (2, 4, 12):
+            suite = small_suite.select([category], items)
+            own = phrases(suite, query)
+            rows = make_plan(suite, [], 3, 1, False, ("knowledge", "side")).to_json()["episodes"]
+            plans.append({row["episode_id"]: {**row, "episode": None} for row in rows})
+            named.append({item: phrase.text for item, phrase in own.items()})
+        for fewer, more in ((0, 1), (1, 2)):
+            assert plans[fewer].items() <= plans[more].items()
+            assert named[fewer].items() <= named[more].items()
+
+
+def test_a_plan_that_was_made_without_its_model_is_compared_with_the_stored_one(
+    small_suite: Suite, tmp_path: Path
+) -> None:
+    """As by `--dry-run`, which knows no weights."""
+    run = extracted(tmp_path / "run", small_suite, COLOR[:1])
+    plan = replace(plan_of(small_suite, COLOR[1]), bytes=800)
+    declared = Extraction(ExtractSettings("pi0-tiny"), plan, {"weights_sha256": None}, None, declared=True)
+    further = declared.further_plan(run.location)
+    assert {one.episode.episode_id for one in further.episodes}.isdisjoint(run.episodes["episode_id"])
+    assert (len(further.episodes), further.bytes) == (4, 400)
+
+
+# -- never fewer ------------------------------------------------------------------------------------------
+
+
+def test_fewer_items_play_nothing_and_the_run_stays_as_it_is(small_suite: Suite, tmp_path: Path) -> None:
+    run = extracted(tmp_path / "run", small_suite, COLOR[2:])
+    before = files_of(run.path)
+    fewer = plan_of(small_suite, COLOR[0])
+    growth = growth_at(run.location, fewer.to_json()["episodes"])
+    assert growth is not None
+    assert (growth.stored, growth.asked, growth.added) == (12, 4, 0)
+    assert "never shrinks" in growth.words
+    assert writer_of(run.path, fewer).remaining() == []
+    assert files_of(run.path) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (
+            lambda suite: plan_of(suite, (["shape"], 4, None)),
+            r"items of color 4; .*asks for items of shape 4.*never",
+        ),
+        (lambda suite: plan_of(suite, (["color", "shape"], 2, None)), r"4 of its episodes are not asked for"),
+        (
+            lambda suite: plan_of(suite, (["color"], 6, ["knowledge"])),
+            r"wording is stored as None, here 'knowledge'",
+        ),
+        (
+            lambda suite: make_plan(suite.select(["color"], 6), list(STREAMS), 1, 1, False),
+            r"its policy_seed is stored",
+        ),
+        (
+            lambda suite: replace(
+                plan_of(suite, COLOR[2]),
+                suite=replace(suite, items=tuple(replace(item, group_id="x") for item in suite.items)),
+            ),
+            r"its item_content_sha256 is stored",
+        ),
+        (lambda suite: plan_of(without_twins(suite), COLOR[2]), r"its item_content_sha256 is stored"),
+    ],
+    ids=["another category", "fewer of one, more of another", "wordings", "another seed", "content", "twins"],
+)
+def test_a_plan_that_does_not_hold_the_stored_one_is_refused_by_name(
+    change: Callable[[Suite], Plan], why: str, small_suite: Suite, tmp_path: Path
+) -> None:
+    run = extracted(tmp_path / "run", small_suite, COLOR[:2])
+    before = files_of(run.path)
+    with pytest.raises(SettingsMismatchError, match=why):
+        writer_of(run.path, change(small_suite))
+    assert files_of(run.path) == before
+
+
+def test_arrays_of_all_tokens_take_no_longer_instructions_and_pooled_ones_do(
+    small_suite: Suite, tmp_path: Path
+) -> None:
+    longer = [replace(stream, tokens=stream.tokens + 1) for stream in STREAMS]
+    suite = small_suite.select(["color"], 4)
+    for tokens in ("all", "pooled"):
+        settings, where = {**little_settings(), "tokens": tokens}, locate(tmp_path / tokens)
+        RunWriter(
+            where, make_plan(small_suite.select(["color"], 2), list(STREAMS), 0, 1, tokens == "all"), settings
+        )
+        plan = make_plan(suite, longer, 0, 1, tokens == "all")
+        if tokens == "all":
+            with pytest.raises(SettingsMismatchError, match=r"stores 130 tokens of backbone .* needs 131"):
+                RunWriter(where, plan, settings)
+        else:
+            assert [one.tokens for one in RunWriter(where, plan, settings).streams] == [131, 4]
+            fewer = make_plan(small_suite.select(["color"], 2), list(STREAMS), 0, 1, False)
+            assert [one.tokens for one in RunWriter(where, fewer, settings).streams] == [131, 4]
+
+
+# -- kills, other processes, readers -----------------------------------------------------------------------
+
+
+class KilledError(Exception):
+    """Stands for a process that ends here."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "point", ["before the record", "after the record", "after some metadata", "after metadata"]
+)
+def test_a_kill_while_a_run_grows_loses_nothing(
+    point: str, small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    undisturbed = files_of(extracted(tmp_path / "undisturbed", small_suite, COLOR[:2]).path)
+    run = extracted(tmp_path / "run", small_suite, COLOR[:1])
+    before = contents(run)
+    create, write, written = Folder.create_record, Folder.write_record, list[str]()
+
+    def kill_at_creation(location: Folder, key: str, record: bytes) -> bool:
+        if point == "before the record":
+            raise KilledError
+        return create(location, key, record)
+
+    def kill_at_metadata(location: Folder, key: str, record: bytes) -> None:
+        if point == "after it" or (point == "after some metadata" and written):
+            raise KilledError
+        written.append(key)
+        write(location, key, record)
+
+    with monkeypatch.context() as patched, suppress(KilledError):
+        patched.setattr(Folder, "create_record", kill_at_creation)
+        patched.setattr(Folder, "write_record", kill_at_metadata)
+        RunWriter(run.location, plan_of(small_suite, COLOR[1]), {**little_settings(), "tokens": "pooled"})
+    killed = open_run(run.path, allow_partial=True)
+    assert contents(killed) == before
+    assert verify_run(run.path, deep=True).ok
+    assert killed.planned == (4 if point == "before the record" else 8)
+    assert killed.column(killed.sites("backbone")[0]).shape[0] == 4
+    again = extracted(run.path, small_suite, COLOR[1:2])
+    assert again.planned == 8
+    assert files_of(run.path) == undisturbed
+
+
+def test_a_run_that_was_killed_before_its_first_plan_says_so_and_begins(
+    small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(*_: object) -> bool:
+        raise KilledError
+
+    with monkeypatch.context() as patched, suppress(KilledError):
+        patched.setattr(Folder, "create_record", killed)
+        writer_of(tmp_path / "run", plan_of(small_suite, COLOR[0]))
+    with pytest.raises(RunIncompleteError, match="has no plan yet"):
+        open_run(tmp_path / "run", allow_partial=True)
+    found = verify_run(tmp_path / "run")
+    assert (found.ok, found.finished) == (True, False)
+    assert files_of(extracted(tmp_path / "run", small_suite, COLOR[:1]).path) == files_of(
+        extracted(tmp_path / "other", small_suite, COLOR[:1]).path
+    )
+
+
+def test_processes_that_begin_with_nested_plans_at_once_leave_one_run(small_suite: Suite, tmp_path: Path) -> None:
+    plans = [plan_of(small_suite, one) for one in [*COLOR, (["color", "shape"], 6, None)]]
+    with ThreadPoolExecutor(4) as processes:
+        writers = list(processes.map(lambda plan: writer_of(tmp_path / "run", plan), plans))
+        list(processes.map(lambda writer: play(writer, plans[-1]), writers))
+    seal(tmp_path / "run")
+    run = open_run(tmp_path / "run")
+    assert (run.planned, len(run.episodes)) == (24, 24)
+    assert verify_run(run.path, deep=True).ok
+
+
+def test_who_works_with_the_smaller_plan_is_not_disturbed_by_a_growth(small_suite: Suite, tmp_path: Path) -> None:
+    small, large = (plan_of(small_suite, one) for one in COLOR[:2])
+    first = writer_of(tmp_path / "run", small)
+    second = writer_of(tmp_path / "run", large)
+    play(second, large, second.remaining()[-2:])
+    assert first.remaining() == [0, 1, 2, 3]
+    play(first, large)
+    assert len(open_run(tmp_path / "run", allow_partial=True).episodes) == 6
+    play(second, large)
+    seal(tmp_path / "run")
+    at_once = extracted(tmp_path / "at_once", small_suite, COLOR[1:2])
+    assert contents(open_run(tmp_path / "run")) == contents(at_once)
+
+
+def test_who_reads_while_a_run_grows_reads_what_was_opened(small_suite: Suite, tmp_path: Path) -> None:
+    run = extracted(tmp_path / "run", small_suite, COLOR[:1])
+    site = run.sites("backbone")[0]
+    expected = [run.rows("backbone")[row] for row in range(4)]
+    extracted(run.path, small_suite, COLOR[1:2])
+    np.testing.assert_array_equal([run.rows("backbone")[row] for row in range(4)], expected)
+    assert len(run.trajectories[3].frames) == 3
+    assert open_run(run.path).column(site).shape[0] == 8
+
+
+# -- what was made of the former episodes ------------------------------------------------------------------
+
+
+def test_former_probes_and_seals_are_named_and_not_read(small_suite: Suite, tmp_path: Path) -> None:
+    run = extracted(tmp_path / "run", small_suite, [(["color"], 10, None)])
+    key = train_probes(run, permutations=1).key
+    plan = plan_of(small_suite, (["color"], 12, None))
+    growth = growth_at(run.location, plan.to_json()["episodes"])
+    assert growth is not None
+    assert growth.results == (f"probes {key}",)
+    assert (
+        growth.words
+        == f"from 20 to 24 episodes; stored ones stay as they are; of the former episodes only: probes {key}"
+    )
+    play(writer_of(run.path, plan), plan)
+    grown = open_run(run.path)
+    assert not grown.sealed
+    assert [(one.key, one.state) for one in inventory(grown).probes] == [(key, "other episodes")]
+    with pytest.raises(NoProbesError, match="of 1 stored, none: other episodes"):
+        load_results(grown)
+    assert seal(run.path)
+    assert len(list((run.path / "sealed").iterdir())) == 1
+    again = train_probes(open_run(run.path), permutations=1)
+    assert again.key != key
+    assert {one.state for one in inventory(open_run(run.path)).probes} == {"used", "other episodes"}
+
+
+# -- a growth record is a record ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def untouched(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return extracted(tmp_path_factory.mktemp("grown") / "run", small_suite, COLOR[:2]).path
+
+
+@pytest.fixture
+def grown(untouched: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(untouched, tmp_path / "run"))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda plan: plan["episodes"][0].update(side_correct="up"),
+        lambda plan: plan["order"].reverse(),
+        lambda plan: plan["order"].append(3),
+        lambda plan: plan["order"].append("x"),
+        lambda plan: plan["episodes"].pop(),
+        lambda plan: plan["episodes"][0].update(episode=0),
+        lambda plan: plan.update(former=None),
+        lambda plan: plan.update(record=0),
+        lambda plan: plan.update(run="0" * 64),
+        lambda plan: plan["selection"].update(items=2),
+        lambda plan: plan["selection"]["suite"].update(identity="other@1#0"),
+        lambda plan: plan["tokens"].clear(),
+    ],
+    ids=["a label", "order", "a place twice", "no number", "an episode less", "a number twice", "nothing before",
+         "another place", "another run", "items", "suite", "tokens"],
+)  # fmt: skip
+@pytest.mark.parametrize("hashed", [True, False], ids=["with a right hash", "as it is"])
+@pytest.mark.parametrize("record", [0, 1])
+def test_a_changed_growth_record_is_damage(
+    record: int, hashed: bool, change: Callable[[dict[str, Any]], object], grown: Path
+) -> None:
+    path = grown / plan_key(record)
+    before, content = path.read_bytes(), json.loads(path.read_bytes())
+    change(content)
+    if hashed:
+        write_record(path, content)
+    else:
+        path.write_text(json.dumps(content, sort_keys=True, indent=1), encoding="utf-8")
+    if path.read_bytes() == before:
+        return  # the first record is at place 0, after nothing
+    with pytest.raises(RunDamagedError, match=r"plan/|commits/"):
+        open_run(grown, allow_partial=True)
+    assert not verify_run(grown).ok
+
+
+@pytest.mark.parametrize(
+    ("lost", "why"),
+    [
+        (0, r"plan/00000000\.json is missing, though plan/00000001"),
+        (1, "room for 8 episodes, and 4 are planned; .* a file of plan is missing"),
+    ],
+)
+def test_a_lost_growth_record_is_damage(lost: int, why: str, grown: Path, small_suite: Suite) -> None:
+    content = (grown / plan_key(lost)).read_bytes()
+    (grown / plan_key(lost)).unlink()
+    with pytest.raises(RunDamagedError, match=why):
+        open_run(grown, allow_partial=True)
+    assert not verify_run(grown).ok
+    if lost:  # the command that let it grow writes the same record again
+        writer_of(grown, plan_of(small_suite, COLOR[1]))
+        assert (grown / plan_key(lost)).read_bytes() == content
+        assert open_run(grown).planned == 8
+
+
+def test_metadata_without_room_for_what_is_committed_is_damage_that_the_same_command_repairs(
+    grown: Path, small_suite: Suite
+) -> None:
+    path = grown / "data.zarr/backbone/pooled/zarr.json"
+    whole = path.read_bytes()
+    for shape, why in (
+        (4, "has room for 4 episodes, and episode 7 is committed"),
+        (5, "other bytes than were written"),
+    ):
+        path.write_bytes(whole.replace(b'"shape": [\n    8,', f'"shape": [\n    {shape},'.encode()))
+        assert path.read_bytes() != whole
+        with pytest.raises(RunDamagedError, match=why):
+            open_run(grown)
+        assert any(why in problem for problem in verify_run(grown).problems)
+        if shape == 4:
+            writer_of(grown, plan_of(small_suite, COLOR[1]))
+            assert path.read_bytes() == whole
