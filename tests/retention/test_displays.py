@@ -258,6 +258,28 @@ def test_names_of_crowded_points_do_not_cover_each_other() -> None:
     assert all(frame.x0 <= box.x0 and box.x1 <= frame.x1 for box in boxes), "no name leaves the axes"
 
 
+def test_names_avoid_error_bars_where_there_is_room() -> None:
+    figure = Figure(figsize=(6, 6))
+    axes = figure.subplots()
+    axes.set_xlim(0, 100)
+    axes.set_ylim(0, 100)
+    bars = [((20, 50), (80, 50)), ((50, 20), (50, 80))]
+    place_labels(axes, [(50, 50)], ["living world"], ["black"], bars)
+    box = axes.texts[0].get_window_extent()
+    for (left, low), (right, high) in bars:
+        (x0, y0), (x1, y1) = axes.transData.transform([(left, low), (right, high)])
+        assert x1 < box.x0 or box.x1 < x0 or y1 < box.y0 or box.y1 < y0
+
+
+def test_the_caret_of_the_best_layer_stands_above_its_error_bar(probed_run: ProbedRun) -> None:
+    axes = layer_curve(load_results(probed_run({"color": SIGNAL}))).axes[0]
+    (caret,) = [line for line in axes.get_lines() if line.get_gid() == "peak"]
+    best = LayerCurveDisplay.from_results(load_results(probed_run({"color": SIGNAL})), "color").streams[0].lines[0]
+    highest = int(np.argmax(best.accuracy))
+    assert caret.get_xdata() == [best.layers[highest]]
+    assert caret.get_ydata() == pytest.approx([100 * max(best.accuracy[highest], best.high[highest])])
+
+
 def test_paired_layouts_count_items_and_draw_their_shares(tmp_path: Path, outcome_table: Any) -> None:
     # Items in order: 3 right twice, 1 right and wrong, 2 wrong twice, 1 wrong and outside, 1 outside twice.
     run = ArrayRun(tmp_path, "pi0", "suite", outcome_table(7, 6, 3), {})

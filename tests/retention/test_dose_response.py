@@ -11,6 +11,7 @@ from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.store.settings import FORMAT
 from probe_kit.retention import retention_table
 from probe_kit.retention.displays import DoseResponseDisplay, collect_figures, dose_response
+from probe_kit.retention.displays.dose_response import _share
 from probe_kit.train import ArrayRun
 from tests.intervene.answers import follower, outcomes_of, store_outcomes
 
@@ -61,6 +62,7 @@ def test_it_shows_episodes_that_turn_by_dose_and_side_beside_controls(run: Array
     labels = [line.get_label() for line in display.ax_.get_lines()]
     assert {"all episodes", "pushed to the left", "pushed to the right"} <= set(labels)
     assert len(display.ax_.collections) == 1
+    assert [tick.get_text() for tick in display.ax_.get_xticklabels()] == ["0\n100 %", "2\n100 %", "4\n100 %"]
     names = [exhibit.name for exhibit in collect_figures([run], retention_table([run]))]
     assert any(name.endswith("doses") for name in names)
     assert len(dose_response(run).axes) == 1
@@ -74,3 +76,10 @@ def test_without_a_steering_there_is_no_such_figure(run: ArrayRun) -> None:
     steered(run)
     with pytest.raises(NoInterventionsError, match=r"it has it at backbone\.01 image"):
         DoseResponseDisplay.from_run(run, "color", "backbone.02 image")
+
+
+@pytest.mark.parametrize(
+    ("ratio", "text"), [(0, "0 %"), (0.00006, "<0.1 %"), (0.0071, "0.71 %"), (0.24, "24 %"), (2.5, "250 %")]
+)
+def test_small_changes_of_the_tokens_are_not_written_as_none(ratio: float, text: str) -> None:
+    assert _share(ratio) == text

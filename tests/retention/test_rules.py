@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 from typer.testing import CliRunner
@@ -158,6 +159,17 @@ def test_rules_stand_side_by_side_on_the_same_episodes(idle: Run) -> None:
     assert [bar.shares["correct"] for bar in bars if bar.shares] == [0, 0.5, 0]
     assert [bar.idle for bar in bars] == [0, 0.5, 0]
     OutcomeRulesDisplay.from_runs([idle]).plot()
+
+
+def test_rules_are_drawn_as_means_over_categories_as_the_tables_have_them(
+    tmp_path: Path, outcome_table: Any
+) -> None:
+    few, many = outcome_table(2, 0, 0, "color"), outcome_table(1, 8, 1, "shape")
+    run = ArrayRun(tmp_path, "pi0", "suite", pd.concat([few, many], ignore_index=True), {})
+    shares = [row.success.sr for row in retention_table([run]).rows]
+    bar = next(bar for bar in OutcomeRulesDisplay.from_runs([run]).bars if bar.shares is not None)
+    assert bar.shares["correct"] == pytest.approx(np.mean(shares))
+    assert bar.shares["correct"] != pytest.approx((run.episodes["outcome"] == "correct").mean())
 
 
 def test_figures_follow_the_rule_of_the_table(idle: Run) -> None:

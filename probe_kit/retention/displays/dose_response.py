@@ -91,7 +91,7 @@ class DoseResponseDisplay(Panelled):
     @property
     def title(self) -> str:
         """The category, and where."""
-        return f"{spell(self.category)}, {self.place}"
+        return "\n".join([spell(self.category), *self.place.split(", ")])
 
     def draw(self, axes: "Axes") -> None:
         """A line for all episodes and one for either side, over the band of the controls."""
@@ -106,11 +106,18 @@ class DoseResponseDisplay(Panelled):
         lines = {"all episodes": self.net, "pushed to the left": self.left, "pushed to the right": self.right}
         for position, (label, percent) in enumerate(lines.items()):
             filled = self.significant if position == 0 else np.zeros(self.coefficients.size, bool)
-            draw_series(axes, series(position), self.coefficients, percent, filled, label)
-        axes.set_xticks(self.coefficients, [f"{coefficient:g}\n{ratio:.1f}×" for coefficient, ratio in zip(
-            self.coefficients, self.relative_change, strict=True)])  # fmt: skip
+            draw_series(axes, series(position), self.coefficients, percent, filled, label, 3.0 - 0.1 * position)
+        ticks = zip(self.coefficients, self.relative_change, strict=True)
+        axes.set_xticks(self.coefficients, [f"{coefficient:g}\n{_share(ratio)}" for coefficient, ratio in ticks])
         axes.set_ylim(-108, 108)
-        axes.set_xlabel("half class-mean differences; below: in norms of the tokens", fontsize=7.5)
+        axes.set_xlabel("half class-mean differences\n%: of the tokens' own norm", fontsize=7.5)
+
+
+def _share(ratio: float) -> str:
+    """Return a ratio in percent with one or two digits that count, however small it is."""
+    if 0 < ratio < 0.001:
+        return "<0.1 %"
+    return f"{100 * ratio:.2g} %" if ratio < 1 else f"{100 * ratio:.0f} %"
 
 
 def dose_response(run: RunReader) -> "Figure":

@@ -102,7 +102,11 @@ class KnowledgeActionDisplay(Display):
             figure.draw_without_rendering()  # labels need the final places of points
         words = [spell(point.category) for point in self.points]
         inks = [darker(series(models.index(point.model)).colour) for point in self.points]
-        place_labels(axes, [(100 * p.accuracy, 100 * p.sr) for p in self.points], words, inks)
+        points = [(100 * point.accuracy, 100 * point.sr) for point in self.points]
+        bars = [ends for point in self.points for ends in _bars(point)]
+        diagonal = [((step, step), (step + 1, step + 1)) for step in range(100)]
+        guessing = [((0, 50), (100, 50)), ((50, 0), (50, 100))]
+        place_labels(axes, points, words, inks, [*bars, *diagonal, *guessing])
         self.ax_ = axes
         return self
 
@@ -159,6 +163,15 @@ def _draw_model(axes: "Axes", points: Sequence[GapPoint], position: int, model: 
             marker=line.marker, ms=6, color=line.colour, mfc=line.colour if filled else "white",
             label=model if filled else None, zorder=3,
         )  # fmt: skip
+
+
+def _bars(point: GapPoint) -> "list[tuple[tuple[float, float], tuple[float, float]]]":
+    """The ends of a point's error bars, in percent."""
+    x, y = 100 * point.accuracy, 100 * point.sr
+    across, up = _arms(point.accuracy, point.accuracy_ci), _arms(point.sr, point.sr_ci)
+    level = [] if across is None else [((x - across[0][0], y), (x + across[1][0], y))]
+    upright = [] if up is None else [((x, y - up[0][0]), (x, y + up[1][0]))]
+    return level + upright
 
 
 def _arms(value: float, limits: Limits) -> list[list[float]] | None:

@@ -215,7 +215,7 @@ def _finish(axes: "Axes", layers: int, title: str) -> None:
 def _draw_stream(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0) -> None:
     line = PARTS[curve.part]
     if len(curve.lines) == 1:
-        draw_line(axes, curve.lines[0], line, curve.label, sidestep, bars=curve.iterations == 1)
+        draw_line(axes, curve.lines[0], line, curve.label, sidestep, bars=_has_bars(curve))
     else:
         colours = _colours()
         for number, one in enumerate(curve.lines):
@@ -223,6 +223,11 @@ def _draw_stream(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0) -> Non
             draw_line(axes, one, shade, f"iteration {one.iteration}", sidestep, bars=False)
         axes.plot([], [], color=line.colour, marker=line.marker, ms=4, lw=1.3, label=f"{curve.name}, by iteration")
     mark_peaks(axes, curve, sidestep)
+
+
+def _has_bars(curve: StreamCurve) -> bool:
+    """Whether each layer has an interval of its own: the stream runs once."""
+    return len(curve.lines) == 1 and curve.iterations == 1
 
 
 def draw_line(
@@ -254,16 +259,20 @@ def draw_line(
 
 
 def mark_peaks(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0) -> None:
-    """A mark above every site that no other one of its stream beats."""
+    """A mark above every site that no other one of its stream beats, and above its error bar where it has one."""
     from matplotlib.transforms import ScaledTranslation
 
     figure = axes.figure
     layers = sorted({layer for layer, _ in curve.peaks})
     above = axes.transData + ScaledTranslation(0, 5 / 72, figure.dpi_scale_trans)
-    height = 100 * float(curve.accuracy.max())
+    top = dict.fromkeys(layers, float(curve.accuracy.max()))
+    if _has_bars(curve):
+        line = curve.lines[0]
+        high = dict(zip(line.layers.tolist(), line.high.tolist(), strict=True))
+        top = {layer: np.fmax(value, high[layer]) for layer, value in top.items()}
     (mark,) = axes.plot(
-        [layer + sidestep for layer in layers], [height] * len(layers), ls="none", marker=_MARK, ms=5,
-        color="black", transform=above, clip_on=False, zorder=4,
+        [layer + sidestep for layer in layers], [100 * top[layer] for layer in layers], ls="none",
+        marker=_MARK, ms=5, color="black", transform=above, clip_on=False, zorder=4,
     )  # fmt: skip
     mark.set_gid("peak")
 

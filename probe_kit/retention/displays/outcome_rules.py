@@ -4,6 +4,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
+import numpy as np
+
 from probe_kit.env.scoring.rules import DEFAULT_RULE, RULES
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.run_labels import full_names
@@ -17,6 +19,7 @@ from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from numpy.typing import ArrayLike
 
 _PARTS = (
     ("correct", "right", GREEN, ""),
@@ -27,7 +30,10 @@ _PARTS = (
 
 @dataclass(frozen=True)
 class RuleBar:
-    """One run by one rule: shares of episodes, and what doing nothing would score; None where it is n/a."""
+    """One run by one rule: shares of episodes, and what doing nothing would score; None where it is n/a.
+
+    Both are means over the categories, as in the tables.
+    """
 
     run: str
     rule: str
@@ -63,7 +69,7 @@ class OutcomeRulesDisplay(Display):
         axes.set_ylim(places[-1] + 0.6, -0.6)
         axes.set_xlim(0, 112)
         axes.set_xticks(range(0, 101, 25))
-        axes.set_xlabel("episodes (%)", fontsize=9)
+        axes.set_xlabel("episodes (%), mean over categories", fontsize=9)
         plain(axes)
         axes.spines["left"].set_visible(False)
         axes.tick_params(axis="y", length=0)
@@ -78,17 +84,23 @@ class OutcomeRulesDisplay(Display):
 def _bars(run: RunReader, name: str) -> list[RuleBar]:
     judged = RunUnderRule.of(run, DEFAULT_RULE)
     if judged.verdicts is None:
-        stored = {part: float(shares_of(run.episodes, part).mean()) for part, *_ in _PARTS}
+        stored = {part: _over_categories(run, shares_of(run.episodes, part)) for part, *_ in _PARTS}
         return [RuleBar(name, rule, stored if rule == DEFAULT_RULE else None, None) for rule in RULES]
     return [
         RuleBar(
             name,
             rule,
-            {part: float(verdicts[part].mean()) for part, *_ in _PARTS},
-            float((verdicts["idle"] == "correct").mean()),
+            {part: _over_categories(run, verdicts[part]) for part, *_ in _PARTS},
+            _over_categories(run, verdicts["idle"] == "correct"),
         )
         for rule, verdicts in judged.verdicts.items()
     ]
+
+
+def _over_categories(run: RunReader, shares: "ArrayLike") -> float:
+    """Return the mean over categories of a share (E,) per episode, in the order of the run's episodes."""
+    values, categories = np.asarray(shares, dtype=float), run.episodes["category"].to_numpy()
+    return float(np.mean([values[categories == name].mean() for name in np.unique(categories)]))
 
 
 def _draw_bar(axes: "Axes", place: float, bar: RuleBar) -> None:

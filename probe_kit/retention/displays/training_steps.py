@@ -23,6 +23,8 @@ _PANELS = (
     ("drift", "drift of the backbone (points)", 100.0, 0.0),
 )
 """Number, label, its factor, and where a dashed line stands."""
+_SIDESTEP = 0.02
+"""Of the range of steps: how far categories stand apart."""
 
 
 def training_step_figure(table: NumbersTable, lines: Sequence[ProvenanceLine]) -> ReportFigure:
@@ -40,11 +42,17 @@ def draw_training_steps(table: NumbersTable, lines: Sequence[ProvenanceLine]) ->
     names = [name for name in dict.fromkeys(one["category"] for one in table.numbers) if name != MEAN]
     chosen = [panel for panel in _PANELS if any(one[panel[0]] is not None for one in table.numbers)]
     figure, grid = panels(len(chosen), width=3.6, height=2.5, columns=2, share=False)
+    steps = {one["step"] for one in table.numbers}
+    # Categories stand side by side, so that their intervals do not hide each other.
+    apart = _SIDESTEP * (max(steps) - min(steps))
+    shifts = [apart * (at - (len(names) - 1) / 2) for at in range(len(names))]
     for (key, label, factor, line), axes in zip(chosen, grid, strict=True):
+        if axes is not grid[0]:
+            axes.sharex(grid[0])
         if line is not None:
             axes.axhline(line, color="0.45", lw=0.8, ls="--", zorder=0)
-        for at, name in enumerate(names):
-            _draw_line(axes, [one for one in table.numbers if one["category"] == name], key, factor, at)
+        for at, (name, shift) in enumerate(zip(names, shifts, strict=True)):
+            _draw_line(axes, [one for one in table.numbers if one["category"] == name], key, factor, at, shift)
         plain(axes)
         axes.set_xlabel("training step", fontsize=8.5)
         axes.set_ylabel(label, fontsize=8.5)
@@ -53,10 +61,12 @@ def draw_training_steps(table: NumbersTable, lines: Sequence[ProvenanceLine]) ->
     return figure
 
 
-def _draw_line(axes: "Axes", rows: Sequence[Mapping[str, Any]], key: str, factor: float, at: int) -> None:
+def _draw_line(
+    axes: "Axes", rows: Sequence[Mapping[str, Any]], key: str, factor: float, at: int, shift: float
+) -> None:
     look = series(at)
     values = [float("nan") if row[key] is None else factor * row[key] for row in rows]
-    steps = [row["step"] for row in rows]
+    steps = [row["step"] + shift for row in rows]
     for step, row, value in zip(steps, rows, values, strict=True):
         low, high = row[f"{key}_ci"] or (None, None)
         if low is not None and high is not None and value == value:

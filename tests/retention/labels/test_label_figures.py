@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
 from probe_kit.retention import label_retention_table
+from probe_kit.retention.displays.base.style import PARTS
 from probe_kit.retention.displays.labels import (
     ClassConfusionDisplay,
     LabelCurveDisplay,
@@ -103,6 +105,11 @@ def test_scores_by_step_are_means_of_the_samples_and_their_mean_is_the_metric(ru
         "as many samples at each step"
     )
     assert list(display.controls) == ["state", "step"], "the best one, and the step"
+    table = results.scores[results.scores["view"] == "mean"].set_index("site")
+    assert display.signal == table.loc[display.site, "signal"]
+    for signal, colour in ((True, PARTS["backbone"].colour), (False, "white")):
+        axes = replace(display, signal=signal).plot().ax_
+        assert axes.get_lines()[0].get_markerfacecolor() == colour, "open markers where nothing is shown"
     for name, scores in display.controls.items():
         (control,) = [one for one in results.controls.scores if one.name == name]
         assert scores.mean() == pytest.approx(control.score)

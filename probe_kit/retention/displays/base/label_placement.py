@@ -15,13 +15,25 @@ _HEIGHT, _CHARACTER = 1.15 * _SIZE, 0.56 * _SIZE  # of one line of text, in poin
 _REACHES = (6.0, 13.0, 22.0, 32.0)  # from the point, in points
 
 
-def place_labels(axes: "Axes", points: Sequence[Point], names: Sequence[str], inks: Sequence[str]) -> None:
-    """Write each name near its point (data coordinates) in its ink, with a thin line where it had to move away."""
+def place_labels(
+    axes: "Axes",
+    points: Sequence[Point],
+    names: Sequence[str],
+    inks: Sequence[str],
+    lines: Sequence[tuple[Point, Point]] = (),
+) -> None:
+    """Write each name near its point (data coordinates) in its ink, with a thin line where it had to move away.
+
+    lines: level or upright ones by their ends, such as error bars, which names avoid where they can.
+    """
     unit = axes.figure.dpi / 72  # pixels per point of type
     seen = [axes.transData.transform(point) / unit for point in points]
     corners = axes.get_window_extent()
     frame = (corners.x0 / unit, corners.y0 / unit, corners.x1 / unit, corners.y1 / unit)
     taken: list[Box] = [(x - 3, y - 3, x + 3, y + 3) for x, y in seen]
+    for ends in lines:
+        (x0, y0), (x1, y1) = (axes.transData.transform(end) / unit for end in ends)
+        taken.append((min(x0, x1) - 1, min(y0, y1) - 1, max(x0, x1) + 1, max(y0, y1) + 1))
 
     def in_data(x: float, y: float) -> Point:
         across, up = axes.transData.inverted().transform((x * unit, y * unit))

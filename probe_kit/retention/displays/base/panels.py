@@ -63,11 +63,12 @@ def draw_series(
     y: "NDArray[np.float64]",
     filled: "NDArray[np.bool_]",
     label: str,
+    zorder: float = 2.0,
 ) -> None:
     """A line, with filled markers where it is significant and open ones elsewhere. x, y, filled: (K,)."""
-    axes.plot(x, y, color=line.colour, ls=line.dash, lw=1.6, label=label)
+    axes.plot(x, y, color=line.colour, ls=line.dash, lw=1.6, label=label, zorder=zorder)
     for is_filled in (True, False):
         axes.plot(
             x[filled == is_filled], y[filled == is_filled], ls="none", marker=line.marker, ms=5, mec=line.colour,
-            mfc=line.colour if is_filled else "white",
+            mfc=line.colour if is_filled else "white", zorder=zorder,
         )  # fmt: skip

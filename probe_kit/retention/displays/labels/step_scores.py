@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.retention.displays.base.style import GREEN, PARTS, Line
+from probe_kit.retention.displays.base.style import GREEN, PARTS, Line, significance_handles
 from probe_kit.retention.displays.labels.label_panel import (
     LabelPanel,
     best_row,
@@ -19,6 +19,7 @@ from probe_kit.retention.displays.labels.label_panel import (
 from probe_kit.train.labels.label_results import METRICS, LabelControl, LabelResults, score_interval
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -33,7 +34,7 @@ class StepScoresDisplay(LabelPanel):
     R² is that of the label's spread over all steps. Balanced accuracy is that of the classes at the
     step. steps: inferences, or places behind the event where windows begin. low, high: 95 % interval over groups.
     controls: by name, the metric of the best control and of `step`. site: of the largest score above its
-    own chance.
+    own chance. signal: whether the site exceeds chance, family-wise, and every control that was run.
     """
 
     target: str
@@ -42,6 +43,7 @@ class StepScoresDisplay(LabelPanel):
     stream: str
     part: str
     site: str
+    signal: bool
     steps: NDArray[np.int64]
     from_event: bool
     score: NDArray[np.float64]
@@ -62,6 +64,7 @@ class StepScoresDisplay(LabelPanel):
             raise UsageError(f"the label {results.settings.target!r} has one step; expected several to show")
         curve, row = results.curves[view], best_row(results, view, stream)
         own, scores = results.settings, curve.scores[row]
+        table = results.scores[results.scores["view"] == view].set_index("site")
         balanced = results.step_scores(scores)
         limits = [
             score_interval(
@@ -80,6 +83,7 @@ class StepScoresDisplay(LabelPanel):
             stream=stream,
             part=curve.parts[row],
             site=str(curve.sites[row]),
+            signal=bool(table.loc[str(curve.sites[row]), "signal"]),
             steps=results.steps,
             from_event=results.aligned is not None,
             score=results.by_step(scores),
@@ -99,6 +103,10 @@ class StepScoresDisplay(LabelPanel):
         """The metric, at each step by itself."""
         return f"{self.metric} at each step"
 
+    def further_handles(self) -> "list[Artist]":
+        """What filled and open markers are."""
+        return list(significance_handles())
+
     def draw(self, axes: "Axes") -> None:
         """The site's and the controls' scores."""
         line = PARTS[self.part]
@@ -113,6 +121,7 @@ class StepScoresDisplay(LabelPanel):
             lw=1.3,
             marker=line.marker,
             ms=4.5,
+            mfc=line.colour if self.signal else "white",
             label=f"best site, {self.part}",
         )
         for (name, scores), dash in zip(self.controls.items(), _CONTROLS, strict=False):
