@@ -26,14 +26,8 @@ def verify(
     Exits with 1 if an error exceeds its tolerance. Outputs that the adapter cannot produce are listed as not
     compared.
     """
-    from probe_kit.hooks.verification.reference_files import check_key_list, check_reference
-
     if (folder is None) == (keys is None):
         raise UsageError("give either a golden reference folder or --keys FILE")
-    if keys is not None:
-        check_key_list(family, keys)
-    else:
-        check_reference(family, cast("Path", folder))
     from probe_kit.hooks.verification.verify import verify_keys, verify_reference
 
     verification = verify_keys(family, keys) if keys else verify_reference(family, cast("Path", folder))

@@ -57,11 +57,12 @@ class Family:
     """A model family by name.
 
     default_checkpoint: hub id, or None for the embedded one. streams: layers and iterations at full size.
-    loader, verifier, full_size: `module:function`, imported only when used. loader(checkpoint, device, dtype,
-    random_weights) gives a Model, and takes `weights_seed` if its untrained networks can differ; verifier(folder,
-    recorded arrays) gives comparisons; full_size() gives the network of the released size on the meta device; it
-    takes the name of one where there are `sizes`. stored_names: `module:constant`, how names of tensors in
-    released files become those of the network, see `probe_kit.models.naming`.
+    loader, outputs, full_size: `module:function`, imported only when used. loader(checkpoint, device, dtype,
+    random_weights) gives a Model, and takes `weights_seed` if its untrained networks can differ; outputs(loader,
+    folder, recorded arrays) gives the `Outputs` that a golden reference is compared with; full_size() gives the
+    network of the released size on the meta device; it takes the name of one where there are `sizes`.
+    stored_names: `module:constant`, how names of tensors in released files become those of the network, see
+    `probe_kit.models.naming`.
     options: what else the loader takes as keyword arguments. acts, reads: whether it is a Policy, an AnswerModel.
     hub: what the default checkpoint is loaded from, hub ids with a file each whose presence tells; default its
     config.json. packages: modules of an extra that it needs, with the name of that extra.
@@ -96,7 +97,7 @@ class Family:
     streams: str = ""
     embodiment: str = "7-DoF end-effector delta"
     notes: str = ""
-    verifier: str | None = None
+    outputs: str | None = None
     full_size: str | None = None
     stored_names: str | None = None
     options: tuple[Option, ...] = ()
@@ -390,7 +391,7 @@ class Family:
 
         return embedded_checkpoint(self.name)
 
-    def function(self, purpose: Literal["verifier", "full_size"]) -> Callable[..., Any]:
+    def function(self, purpose: Literal["outputs", "full_size"]) -> Callable[..., Any]:
         """The family's function for `purpose`. Raises UsageError if it has none."""
         path = getattr(self, purpose)
         if path is None:

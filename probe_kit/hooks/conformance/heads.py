@@ -20,7 +20,7 @@ from probe_kit.hooks.conformance.check import SkipTest, check, refused, require,
 from probe_kit.hooks.conformance.subject import Subject
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
-from probe_kit.hooks.families.shared.module_outputs import outputs_of
+from probe_kit.hooks.verification.outputs import outputs_of
 
 _SUM_TOLERANCE = 1e-5
 

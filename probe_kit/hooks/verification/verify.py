@@ -1,24 +1,29 @@
 """`probe-kit verify`: compares an adapter with outputs recorded from the original implementation."""
 
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
 from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
 from probe_kit._system.bounded_json import load_gzipped_json, load_json
 from probe_kit.errors import UsageError
 from probe_kit.hooks.checkpoints.third_party import in_words, while_loading
+from probe_kit.hooks.family import imported
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.naming import renamed
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from probe_kit.hooks.verification.outputs import Arrays, Outputs
+
 Status = Literal["ok", "over", "not compared"]
-Produce = Callable[[], NDArray[Any]]
+REFERENCE_FILE, CHECKPOINT_FOLDER = "reference.npz", "checkpoint"
 
 
 @dataclass(frozen=True)
@@ -51,38 +56,25 @@ class Verification:
         return {**asdict(self), "passed": self.passed}
 
 
-def compare(
-    recorded: Mapping[str, NDArray[Any]],
-    produced: Mapping[str, Produce],
-    tolerance: float,
-    valid: Mapping[str, NDArray[np.bool_]],
-    absolute: bool = False,
-) -> tuple[Comparison, ...]:
-    """Compare every recorded output but the inputs (`in_…`).
+def compare(recorded: "Arrays", outputs: "Outputs") -> tuple[Comparison, ...]:
+    """Compare every recorded quantity but the inputs."""
+    remade = {name: recorded[entered] for name, entered in outputs.remade.items() if entered in recorded}
+    names = {name for name in recorded if not name.startswith("in_")} - set(outputs.inputs)
+    theirs = {name: recorded[name] for name in names} | remade
+    return tuple(_compared(name, theirs[name], outputs) for name in sorted(theirs))
 
-    tolerance: of an output whose values are below one; larger values may differ by as much of the largest one.
-    produced: how to make each output we can make. valid: per output a mask over its leading axes behind the
-    first, where only some positions mean anything. absolute: the tolerance is the same for larger values.
-    """
-    comparisons = []
-    for name in sorted(recorded):
-        if name.startswith("in_"):
-            continue
-        if name not in produced:
-            comparisons.append(
-                Comparison(name, "not compared", None, tolerance, "the adapter does not produce it")
-            )
-            continue
-        ours, theirs = np.asarray(produced[name]()), recorded[name]
-        if ours.shape != theirs.shape:
-            note = f"shape {ours.shape}, recorded {theirs.shape}"
-            comparisons.append(Comparison(name, "over", None, tolerance, note))
-            continue
-        error = _largest_error(ours, theirs, valid.get(name))
-        exact = not np.issubdtype(theirs.dtype, np.floating)
-        allowed = tolerance if absolute and not exact else _allowed(theirs, tolerance)
-        comparisons.append(Comparison(name, "ok" if error <= allowed else "over", error, allowed))
-    return tuple(comparisons)
+
+def _compared(name: str, theirs: NDArray[Any], outputs: "Outputs") -> Comparison:
+    tolerance = outputs.tolerances.get(name, outputs.tolerance)
+    if name not in outputs.produced:
+        return Comparison(name, "not compared", None, tolerance, "the adapter does not produce it")
+    ours = np.asarray(outputs.produced[name]())
+    if ours.shape != theirs.shape:
+        return Comparison(name, "over", None, tolerance, f"shape {ours.shape}, recorded {theirs.shape}")
+    error = _largest_error(ours, theirs, outputs.valid.get(name))
+    exact = not np.issubdtype(theirs.dtype, np.floating)
+    allowed = tolerance if name in outputs.absolute and not exact else _allowed(theirs, tolerance)
+    return Comparison(name, "ok" if error <= allowed else "over", error, allowed)
 
 
 def _allowed(theirs: NDArray[Any], tolerance: float) -> float:
@@ -103,17 +95,23 @@ def _largest_error(ours: NDArray[Any], theirs: NDArray[Any], valid: NDArray[np.b
 
 
 def verify_reference(family: str, folder: Path) -> Verification:
-    """Load `folder/checkpoint` through the family's adapter and compare with `folder/reference.npz`.
+    """Compare an adapter with `folder/reference.npz`, on the model in `folder/checkpoint`.
 
-    Raises UsageError if the folder has no reference or the family no verifier, and whatever loading raises.
+    Raises UnknownModelError, UsageError for a folder without a reference or a family that compares nothing, and
+    whatever checking and loading raise.
     """
-    run = find_family(family).function("verifier")
-    file = folder / "reference.npz"
+    own, file = find_family(family), folder / REFERENCE_FILE
     if not file.is_file():
-        raise UsageError(f"{folder} is not a golden reference: it has no {file.name}")
+        raise UsageError(
+            f"{folder} is not a golden reference: it has no {REFERENCE_FILE}. Give a folder that has one, and the "
+            f"recorded model in {CHECKPOINT_FOLDER}/"
+        )
     recorded = _read_arrays(file)
+    own.check(str(folder / CHECKPOINT_FOLDER))
+    outputs = own.function("outputs")
     with while_loading(family, str(folder)):
-        return Verification(family, str(folder), run(folder, recorded))
+        produced = outputs(imported(own.loader), folder, recorded)
+        return Verification(family, str(folder), compare(recorded, produced))
 
 
 def _read_arrays(file: Path) -> dict[str, NDArray[Any]]:
@@ -197,5 +195,5 @@ def _is_declared(name: str, declared: tuple[str, ...]) -> bool:
     return any(name == entry or (entry.endswith(".") and name.startswith(entry)) for entry in declared)
 
 
-def _described(tensor: Tensor) -> Described:
+def _described(tensor: "Tensor") -> Described:
     return tuple(tensor.shape), str(tensor.dtype).removeprefix("torch.")

@@ -37,7 +37,7 @@ FAMILIES = (
             "vision-language model, whose tokenizer and processor files are fetched, not its weights, or given as "
             "-M vlm=FOLDER. No remote code. One observation per call: its bridge reads padding"
         ),
-        verifier="probe_kit.hooks.families.groot.verify:verify_groot",
+        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
         config_types=("groot", "Gr00tN1d7"),
         words="probe_kit.hooks.families.groot.adapter:check_groot_words",
         full_size="probe_kit.models.lerobot.groot:full_size_groot",

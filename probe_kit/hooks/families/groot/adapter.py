@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.capturing.gradients import frozen
 from probe_kit.hooks.checkpoints.checkpoint import side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.model import Tap
@@ -33,10 +32,11 @@ from probe_kit.hooks.families.groot.packing import PackedRow, Packing, Steps, pa
 from probe_kit.hooks.families.groot.pictures import NvidiasPictures, lerobots_rule
 from probe_kit.hooks.families.groot.units import BoundedUnits, StateUnits, action_units, state_units
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
-from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
-from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, LerobotPolicy
+from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
+from probe_kit.hooks.families.shared.lerobot.policy import IMAGES
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.qwen.tower import tower_tap
+from probe_kit.hooks.verification.outputs import Produce, RecordedRun, numpy_of
 from probe_kit.models.lerobot.groot import build_groot, flow_actions, network_config
 
 _MODEL = "_groot_model."
@@ -97,17 +97,15 @@ class TowerStack(Stack):
         return Stream(name, len(self.layers) + 1, self.width, part="vision", quantities=("residual",))
 
 
-class Groot(LerobotPolicy):
+class Groot(DenoisingPolicy):
     """A loaded GR00T N1.7. One observation per call: its bridge reads padding, which changes the actions."""
 
     family = "groot"
     config_type = "groot"
     known_steps = None
     interventions = INTERVENTIONS
-    draws_noise = True
     unread = (_HEAD,)
 
-    acting_stream = "expert"
     other_roles: ClassVar[tuple[str, ...]] = ("language", "special")
     suffix_roles = ("state", "action")
     masked_cameras = 0
@@ -236,30 +234,14 @@ class Groot(LerobotPolicy):
         (row,) = self._rows(seen, self.state(seen) if state is None else state)
         return {name: tensor.to(self.config.device) for name, tensor in row.inputs.items()}
 
-    def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """The end of the flow from the noise of the seeds."""
-        chunk: NDArray[np.float32] = self.infer(batch, self.noise(seeds)).float().cpu().numpy()
-        return chunk
-
-    def infer(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """(B, chunk, D) normalised actions from noise (B, horizon, widest action)."""
-        with torch.inference_mode():
-            return self._of_robot(flow_actions(self.network, batch, noise))
-
-    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
-        """The actions of `act`, bit for bit, with a graph of the whole flow; see the contract."""
-        self.check_acting(seen, seeds)
-        with frozen(self.network):
-            actions = flow_actions(self.network, self.batch(seen), self.noise(seeds))
-            return self.restored(self._of_robot(actions))
-
-    def _of_robot(self, actions: Tensor) -> Tensor:
+    def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
         """The steps and numbers that this embodiment has."""
-        return actions[:, : self.chunk, : self._action_numbers]
+        return flow_actions(self.network, batch, noise)[:, : self.chunk, : self._action_numbers]
 
-    def noise(self, seeds: Sequence[int]) -> Tensor:
-        """(B, horizon, widest action) float32 noise, a row per seed, the same on every device."""
-        return seeded_noise(seeds, (self._head.action_horizon, self._head.action_dim), self.config.device)
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """The network's whole horizon, and its widest action."""
+        return self._head.action_horizon, self._head.action_dim
 
     # -- the prompt --------------------------------------------------------------------------------------
 
@@ -351,6 +333,20 @@ class Groot(LerobotPolicy):
         """The first norm of the block the site enters, the norm behind the last, or what a block adds."""
         self.stream_of(site)
         return self.stacks[site.stream].tap(site)
+
+    # -- verification ------------------------------------------------------------------------------------
+
+    def watched(self) -> dict[str, nn.Module]:
+        """The velocity."""
+        return {"velocity": self._head.action_decoder}
+
+    def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
+        """The end of the backbone, and velocities without the state's position."""
+        end, horizon = self.streams["backbone"].sites()[-1], run.recorded["in_noise"].shape[1]
+        return {
+            "backbone_end": lambda: numpy_of(run.tape[end]),
+            "velocity": lambda: run.outputs("velocity")[:, :, -horizon:],
+        }
 
 
 def load_groot(

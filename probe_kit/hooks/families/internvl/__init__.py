@@ -13,7 +13,7 @@ FAMILIES = (
         streams="backbone 37 layers, answer 37 layers (8B)",
         embodiment="none: answers, does not act",
         notes="the repositories that end in -HF; 8B 17 GB, 38B 77 GB in bfloat16",
-        verifier="probe_kit.hooks.families.internvl.adapter:InternVL.verify",
+        outputs="probe_kit.hooks.families.shared.vlm.outputs:vlm_outputs",
         config_types=("internvl",),
         instead=(
             (

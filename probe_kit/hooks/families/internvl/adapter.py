@@ -9,16 +9,15 @@ from transformers import InternVLConfig
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.families.shared.qwen.vlm import ASSISTANT, USER
-from probe_kit.hooks.families.shared.vlm.adapter import Loaded, Pictures
-from probe_kit.hooks.families.shared.vlm.loading import Recipe
-from probe_kit.hooks.families.shared.vlm.recipe_vlm import RecipeVLM
+from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
+from probe_kit.hooks.families.shared.vlm.loading import Loaded, Recipe
 from probe_kit.hooks.families.shared.vlm.text import Frame
 from probe_kit.models.internvl import FILE_NAMES, TiledPictures, build_internvl
 
 TILES = ("auto", "1")
 
 
-class InternVL(RecipeVLM):
+class InternVL(VisionLanguageModel):
     """A loaded InternVL. tiles: `auto` cuts pictures as released, `1` shows every one as one tile."""
 
     family: ClassVar[str] = "internvl"

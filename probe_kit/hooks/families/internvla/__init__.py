@@ -34,7 +34,7 @@ FAMILIES = (
         streams="backbone 37 layers, bridge 2 layers, expert 13 layers x 10 iterations, twice under guidance",
         embodiment="as the data set of -M unnorm_key; bridge_dataset: WidowX end-effector delta at 5 Hz",
         notes="MIT, Qwen research licence; a .pt file; tokenizer and configuration of Qwen/Qwen2.5-VL-3B-Instruct",
-        verifier="probe_kit.hooks.families.internvla.verify:verify_internvla",
+        outputs="probe_kit.hooks.families.internvla.outputs:internvla_outputs",
         source="qwen2.5-vl",
         source_weights=SourceWeights("Qwen/Qwen2.5-VL-3B-Instruct", parameters=3_754_622_976),
         units="probe_kit.hooks.families.internvla.adapter:internvla_units",

@@ -30,7 +30,7 @@ FAMILIES = (
             "billion parameters, 11 GB in bfloat16; lerobot measured 12 GiB. Acts by its flow expert; discrete "
             "actions are refused. CUDA graphs are off"
         ),
-        verifier="probe_kit.hooks.families.molmoact2.verify:verify_molmoact2",
+        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
         config_types=("molmoact2",),
         words="probe_kit.hooks.families.molmoact2.adapter:check_molmoact2_words",
         full_size="probe_kit.models.lerobot.molmoact2:full_size_molmoact2",

@@ -14,13 +14,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from safetensors.numpy import load_file
 from torch import Tensor, nn
 
 from probe_kit.errors import CaptureError, CheckpointError
-from probe_kit.hooks.capturing.gradients import frozen
 from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.model import Tap
@@ -35,11 +33,12 @@ from probe_kit.hooks.families.molmoact2.units import SteppedUnits
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights, shares
 from probe_kit.hooks.families.shared.lerobot.config_fields import Inert
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
-from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
+from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
-from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, LerobotPolicy, checked_steps
+from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, checked_steps
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.prompt_kv import kv_tap
+from probe_kit.hooks.verification.outputs import Produce, RecordedRun, stacked
 from probe_kit.models.lerobot.molmoact2 import build_molmoact2, flow_actions, network_config, uses_cuda_graphs
 
 _PRECISION = "dtype"
@@ -68,7 +67,7 @@ class TowerStack(Stack):
         return Stream(name, len(self.layers), self.width, part="vision", quantities=("residual",))
 
 
-class MolmoAct2(LerobotPolicy):
+class MolmoAct2(DenoisingPolicy):
     """A loaded MolmoAct2."""
 
     family = "molmoact2"
@@ -79,10 +78,8 @@ class MolmoAct2(LerobotPolicy):
     }
     known_steps = STEPS
     interventions = LAYERWISE
-    draws_noise = True
     unread = ("model.lm_head.weight",)
 
-    acting_stream = "expert"
     other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
     suffix_roles = ("action",)
     masked_cameras = 0
@@ -168,36 +165,21 @@ class MolmoAct2(LerobotPolicy):
         packed = self.packing.batch(self._rows(seen, self.state(seen) if state is None else state))
         return {name: tensor.to(self.config.device) for name, tensor in packed.items()}
 
-    def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """The end of the flow from the noise of the seeds."""
-        chunk: NDArray[np.float32] = self.infer(batch, self.noise(seeds)).float().cpu().numpy()
-        return chunk
-
-    def infer(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """(B, chunk, D) normalised actions from noise (B, chunk, 32). Raises CaptureError for CUDA graphs."""
+    def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
+        """See the base. Raises CaptureError for CUDA graphs."""
         self._check_graphs()
-        with torch.inference_mode():
-            end = flow_actions(self.network, batch, noise, batch["action_dim_is_pad"])
+        end = flow_actions(self.network, batch, noise, batch["action_dim_is_pad"])
         return end[..., : self._action_numbers]
 
-    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
-        """The actions of `act`, bit for bit, with a graph of the whole flow; see the contract."""
-        self.check_acting(seen, seeds)
-        self._check_graphs()
-        with frozen(self.network):
-            batch = self.batch(seen)
-            end = flow_actions(self.network, batch, self.noise(seeds), batch["action_dim_is_pad"])
-            return self.restored(end[..., : self._action_numbers])
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """Actions of a chunk, and the widest action."""
+        return self.config.chunk_size, self.config.expected_max_action_dim
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Computed once more: block n of the expert on the keys of block n of the backbone."""
         blocks = self.network._backbone().action_expert.blocks
         return recording_weights([block.cross_attn for block in blocks], note, _on_the_prompt)
-
-    def noise(self, seeds: Sequence[int]) -> Tensor:
-        """(B, chunk, 32) float32 flow noise, a row per seed, the same on every device."""
-        shape = (self.config.chunk_size, self.config.expected_max_action_dim)
-        return seeded_noise(seeds, shape, self.config.device)
 
     @property
     def _action_numbers(self) -> int:
@@ -303,6 +285,16 @@ class MolmoAct2(LerobotPolicy):
         if stream is self.prompt_kv:
             return kv_tap(self.network._backbone().prompt_kv, site)
         return self.stacks[site.stream].tap(site)
+
+    # -- verification ------------------------------------------------------------------------------------
+
+    def watched(self) -> dict[str, nn.Module]:
+        """The velocity."""
+        return {"velocity": self.network._backbone().action_expert.final_layer}
+
+    def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
+        """The backbone without its end, which only its final norm reads."""
+        return {"backbone_resid": lambda: stacked(run.tape, self.streams["backbone"])[0, :-1]}
 
 
 def _on_the_prompt(attention: Any, inputs: tuple[Any, ...], given: dict[str, Any], _: Any) -> Tensor:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,16 +9,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.families.shared.module_outputs import numpy_of
+from probe_kit.hooks.contract.model import Prompt, Tap
 from probe_kit.hooks.families.shared.qwen.tower import by_picture
 from probe_kit.hooks.families.shared.qwen.vlm import ASSISTANT, USER
-from probe_kit.hooks.families.shared.vlm.adapter import Pictures
+from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
 from probe_kit.hooks.families.shared.vlm.loading import Recipe
-from probe_kit.hooks.families.shared.vlm.recipe_vlm import RecipeVLM
 from probe_kit.hooks.families.shared.vlm.text import Frame
-from probe_kit.hooks.families.shared.vlm.verify import Reference, questions_of, verify_vlm
-from probe_kit.hooks.verification.verify import Comparison, Produce
+from probe_kit.hooks.verification.outputs import Produce, numpy_of
 from probe_kit.models.ovis2_5 import (
     PICTURE,
     PICTURE_BEGINS,
@@ -29,17 +25,15 @@ from probe_kit.models.ovis2_5 import (
     build_ovis2_5,
 )
 
-STREAMS = 1e-4
-"""Tolerance of activations, which enter through a softmax over visual words."""
 
-
-class Ovis25(RecipeVLM):
+class Ovis25(VisionLanguageModel):
     """A loaded Ovis2.5."""
 
     family: ClassVar[str] = "ovis2.5"
     frame: ClassVar[Frame] = Frame(USER, "\n", USER, f"{ASSISTANT}<think>\n\n</think>\n\n")
     recipe: ClassVar[Recipe] = Recipe(OvisConfig.from_values, build_ovis2_5)
     marks: ClassVar[int] = 1
+    stream_tolerance: ClassVar[float] = 1e-4  # pictures enter through a softmax over visual words
     _grid: Tensor | None = None
     """Of the pictures under way: the tower runs over the patches of all rows at once."""
 
@@ -89,24 +83,20 @@ class Ovis25(RecipeVLM):
         device = self.loaded.device
         return {"pixel_values": pixels.to(device), "image_grid_thw": self._grid.to(device)}
 
-    @classmethod
-    def verify(cls, folder: Path, recorded: Mapping[str, NDArray[Any]]) -> tuple[Comparison, ...]:
-        """As of every VLM, with the visual words and patches in the order of the authors' code."""
-        model = cls.load(str(folder / "checkpoint"), dtype="float32")
-        reference = Reference(model, questions_of(folder, recorded, model), recorded)
+    def further_outputs(self, first: Prompt, produced: Mapping[str, Produce]) -> dict[str, Produce]:
+        """The visual words, and patches in the order of the authors' code."""
 
         def vision() -> NDArray[Any]:
-            return reference.vision()[:, _windows_first(model)]
+            return produced["vision_resid_row0"]()[:, _windows_first(self)]
 
         @torch.inference_mode()
         def words() -> NDArray[Any]:
-            shown = model.shown([reference.questions[0].seen.image])
-            probabilities = model.network.visual_tokenizer(shown["pixel_values"], shown["image_grid_thw"])
-            missing = model.network.config.words - probabilities.shape[1]
+            shown = self.shown([first.seen.image])
+            probabilities = self.network.visual_tokenizer(shown["pixel_values"], shown["image_grid_thw"])
+            missing = self.network.config.words - probabilities.shape[1]
             return np.pad(numpy_of(probabilities), ((0, 0), (0, missing)))
 
-        further: dict[str, Produce] = {"vision_resid_row0": vision, "visual_probabilities_row0": words}
-        return verify_vlm(model, folder, recorded, further, STREAMS)
+        return {"vision_resid_row0": vision, "visual_probabilities_row0": words}
 
 
 def _windows_first(model: Ovis25) -> NDArray[np.intp]:

@@ -10,9 +10,8 @@ from transformers import PaliGemmaConfig
 
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.families.shared.vlm.adapter import Pictures
+from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
 from probe_kit.hooks.families.shared.vlm.loading import Recipe
-from probe_kit.hooks.families.shared.vlm.recipe_vlm import RecipeVLM
 from probe_kit.hooks.families.shared.vlm.text import Frame
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.models.packing import LeftPacked
@@ -21,7 +20,7 @@ from probe_kit.models.paligemma import FILE_NAMES, SquarePictures, build_paligem
 _FIRST_POSITION = 1
 
 
-class PaliGemma(RecipeVLM):
+class PaliGemma(VisionLanguageModel):
     """A loaded PaliGemma."""
 
     family: ClassVar[str] = "paligemma"

@@ -9,7 +9,6 @@ from probe_kit.hooks.families.shared.capabilities import FLOW
 from probe_kit.hooks.families.shared.lerobot.evaluation import EVALUATION_OPTIONS
 from probe_kit.hooks.family import Family
 
-_VERIFIER = "probe_kit.hooks.families.pi0.verify:verify_pi0"
 _VLM_TINY = SourceWeights(
     sha256="77a4486bf2d356c1e11cfd2a7a0f835683dacf1a7864f714feef92cb19fa0650", parameters=658_944
 )
@@ -24,7 +23,7 @@ def _embedded(name: str, summary: str, notes: str) -> Family:
         f"probe_kit.hooks.families.pi0.adapter:load_{name.replace('-', '_')}",
         streams="backbone 4 layers, expert 4 layers x 10 iterations",
         notes=notes,
-        verifier=_VERIFIER,
+        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
         config_types=("pi0",),
         source="vlm-tiny",
         source_weights=_VLM_TINY,
@@ -62,7 +61,7 @@ FAMILIES = (
             "Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated. lerobot/pi0_base acts in 32 unnamed "
             "dimensions: --checkpoint lerobot/pi0_base --no-act"
         ),
-        verifier=_VERIFIER,
+        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
         config_types=("pi0",),
         source="paligemma",
         source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),

@@ -20,7 +20,7 @@ FAMILIES = (
             "acting (--no-act); to act it needs a fine-tune for end-effector deltas. The prompt holds the state "
             "as digits"
         ),
-        verifier="probe_kit.hooks.families.pi05.verify:verify_pi05",
+        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
         config_types=("pi05",),
         source="paligemma",
         source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),

@@ -30,7 +30,7 @@ FAMILIES = (
             "without its remote code. Head and embedding are two: 3.4 billion parameters, 14 GB in float32. The "
             "base can be captured without acting (--no-act)"
         ),
-        verifier="probe_kit.hooks.families.pi0_fast.verify:verify_pi0_fast",
+        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
         config_types=("pi0_fast",),
         source="paligemma",
         source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),

@@ -37,6 +37,7 @@ from probe_kit.hooks.families.shared.lerobot.stacks import Stack, TokenStack, fl
 from probe_kit.hooks.families.shared.lerobot.state_prompt import StatePrompt
 from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, kv_tap
 from probe_kit.hooks.families.shared.sampling import chooser
+from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun, numpy_of
 from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, TokenPrompt, build_pi0_fast, decode_tokens
 from probe_kit.models.lerobot.pi0_keys import current_pi0_fast_keys
 
@@ -219,6 +220,28 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         """PaliGemma's final norm and head."""
         head = self.network.model.paligemma_with_expert.paligemma.lm_head
         return Unembedding(("backbone", "action"), _FinalNorm(self._decoder.norm), head)
+
+    # -- verification ------------------------------------------------------------------------------------
+
+    def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> NDArray[Any]:
+        """Nothing is drawn in a golden reference."""
+        del recorded
+        ids = self.tokens(batch, range(len(batch[TOKENS])))
+        return np.stack([chunk.values for chunk in self.chunks(ids)])
+
+    def watched(self) -> dict[str, nn.Module]:
+        """The logits."""
+        return {"logits": self.network.model.paligemma_with_expert.paligemma.lm_head}
+
+    def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
+        """Prepared pictures, and the ids that are put out with their logits."""
+        batch = dict(run.batch)
+        return {
+            "prep_images": lambda: numpy_of(torch.stack(self.network._preprocess_images(batch)[0])),
+            "prefix_pad": lambda: self.recorded_padding(run.recorded),
+            "logits": lambda: numpy_of(torch.stack([step[:, -1] for step in run.calls["logits"]])),
+            "tokens": lambda: numpy_of(self.tokens(batch, range(len(batch[TOKENS])))),
+        }
 
 
 class _FinalNorm(nn.Module):

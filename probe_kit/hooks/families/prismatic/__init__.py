@@ -23,7 +23,7 @@ FAMILIES = (
             "MIT, Llama 2 licence; extra openvla; one .pt file, towers of timm, tokenizer of openvla/openvla-7b; "
             "also folders in the layout of PrismaticForConditionalGeneration"
         ),
-        verifier="probe_kit.hooks.families.prismatic.verify:verify_prismatic",
+        outputs="probe_kit.hooks.families.prismatic.outputs:prismatic_outputs",
         config_types=("prismatic", "openvla"),
         files=(*PATTERNS, RUN_WEIGHTS),
         hub=(

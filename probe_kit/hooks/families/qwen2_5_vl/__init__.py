@@ -13,7 +13,7 @@ FAMILIES = (
         streams="backbone 29 layers, answer 29 layers (7B)",
         embodiment="none: answers, does not act",
         notes="7B 17 GB, 32B 67 GB in bfloat16; 3B is InternVLA-M1's source",
-        verifier="probe_kit.hooks.families.qwen2_5_vl.adapter:Qwen25VL.verify",
+        outputs="probe_kit.hooks.families.shared.vlm.outputs:vlm_outputs",
         config_types=("qwen2_5_vl",),
         declared={
             "7B": answering(29, 3584, 110),

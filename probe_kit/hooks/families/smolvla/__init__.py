@@ -17,7 +17,7 @@ FAMILIES = (
             "Apache-2.0; configuration and tokenizer of HuggingFaceTB/SmolVLM2-500M-Video-Instruct. The base can "
             "be captured without acting (--no-act); to act it needs a fine-tune for end-effector deltas"
         ),
-        verifier="probe_kit.hooks.families.smolvla.verify:verify_smolvla",
+        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
         config_types=("smolvla",),
         words="probe_kit.hooks.families.smolvla.adapter:check_smolvla_words",
         declared={

@@ -29,7 +29,7 @@ FAMILIES = (
         streams="backbone 37 layers, expert 17 layers x 5 iterations (renormalised within layers)",
         embodiment="as the robot of -M robot; bridge: WidowX end-effector delta at 5 Hz",
         notes="Apache-2.0; 9.4 GB in bfloat16",
-        verifier="probe_kit.hooks.families.xiaomi.verify:verify_xiaomi",
+        outputs="probe_kit.hooks.families.xiaomi.outputs:xiaomi_outputs",
         source="qwen3-vl",
         source_weights=SourceWeights("Qwen/Qwen3-VL-4B-Instruct", parameters=4_437_815_808),
         units="probe_kit.hooks.families.xiaomi.adapter:xiaomi_units",

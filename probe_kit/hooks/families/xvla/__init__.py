@@ -38,7 +38,7 @@ FAMILIES = (
             "prompts of another robot. Pictures are padded as config.json says; the authors squash them to 224 x "
             "224, bicubic (-M picture=squashed). Absolute poses cannot act here: --no-act"
         ),
-        verifier="probe_kit.hooks.families.xvla.verify:verify_xvla",
+        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
         config_types=("xvla",),
         words="probe_kit.hooks.families.xvla.adapter:check_xvla_words",
         full_size="probe_kit.models.lerobot.xvla:full_size_xvla",

@@ -21,7 +21,6 @@ from PIL import Image
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
-from probe_kit.hooks.capturing.gradients import frozen
 from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.model import Tap
@@ -30,11 +29,12 @@ from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation, Picture
-from probe_kit.hooks.families.shared.lerobot.flow import seeded_noise
-from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE, LerobotPolicy
+from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
+from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.xvla import BLOCK, INTERVENTIONS
 from probe_kit.hooks.families.xvla.steps import STEPS, XvlaSteps, read_steps
+from probe_kit.hooks.verification.outputs import Produce, RecordedRun, numpy_of
 from probe_kit.models.lerobot.xvla import build_xvla, current_xvla_keys, denoised_actions
 from probe_kit.models.pretrained import load_pretrained
 
@@ -88,16 +88,14 @@ class SoftPromptedStack(Stack):
         return Stream(name, len(self.layers) + 1, self.width, self.iterations, quantities=BLOCK, heads=heads)
 
 
-class Xvla(LerobotPolicy):
+class Xvla(DenoisingPolicy):
     """A loaded X-VLA."""
 
     family = "xvla"
     config_type = "xvla"
     known_steps = STEPS
     interventions = INTERVENTIONS
-    draws_noise = True
 
-    acting_stream = "expert"
     other_roles: ClassVar[tuple[str, ...]] = ("language", "special")
     suffix_roles = ("action", SOFT_PROMPT)
 
@@ -213,25 +211,14 @@ class Xvla(LerobotPolicy):
         """Also where its network reads none."""
         return super().unguarded_state if self.config.use_proprio else "no state is read (use_proprio: false)"
 
-    def put_out(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """The end of the denoising from the noise of the seeds."""
-        chunk: NDArray[np.float32] = self.infer(batch, self.noise(seeds)).float().cpu().numpy()
-        return chunk
+    def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
+        """See the base."""
+        return denoised_actions(self.network, batch, noise)
 
-    def infer(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """(B, chunk, D) actions from noise (B, chunk, widest action)."""
-        with torch.inference_mode():
-            return denoised_actions(self.network, batch, noise)
-
-    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
-        """The actions of `act`, bit for bit, with a graph of the whole denoising; see the contract."""
-        self.check_acting(seen, seeds)
-        with frozen(self.network):
-            return self.restored(denoised_actions(self.network, self.batch(seen), self.noise(seeds)))
-
-    def noise(self, seeds: Sequence[int]) -> Tensor:
-        """(B, chunk, widest action) float32 noise, a row per seed, the same on every device."""
-        return seeded_noise(seeds, (self.config.chunk_size, self.network.model.dim_action), self.config.device)
+    @property
+    def noise_shape(self) -> tuple[int, int]:
+        """Actions of a chunk, and the widest action."""
+        return self.config.chunk_size, self.network.model.dim_action
 
     # -- the sequences -----------------------------------------------------------------------------------
 
@@ -302,6 +289,16 @@ class Xvla(LerobotPolicy):
         """See the stacks."""
         self.stream_of(site)
         return self.stacks[site.stream].tap(site)
+
+    # -- verification ------------------------------------------------------------------------------------
+
+    def watched(self) -> dict[str, nn.Module]:
+        """The chunk that every step predicts."""
+        return {"predicted": self.network.model.transformer.action_decoder}
+
+    def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
+        """The pictures as the network reads them."""
+        return {"pixels": lambda: numpy_of(self.network._prepare_images(run.batch)[0])}
 
 
 def load_xvla(

@@ -12,7 +12,7 @@ from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
 from probe_kit.hooks.families.pi0.old_layout import current_config
-from probe_kit.hooks.families.pi0.verify import verify_pi0
+from probe_kit.hooks.verification.verify import verify_reference
 from tests.support.pi0_checkpoints import old_golden
 
 
@@ -27,10 +27,9 @@ def policy(golden: Path) -> Pi0:
 
 
 def test_the_golden_reference_in_the_old_layout_gives_every_recorded_number(golden: Path) -> None:
-    found = verify_pi0(golden, dict(np.load(golden / "reference.npz")))
-    wrong = [one.output for one in found if one.status == "over"]
-    compared = {one.output for one in found if one.status == "ok"}
-    assert not wrong
+    verification = verify_reference("pi0", golden)
+    compared = {own.output for own in verification.comparisons if own.status == "ok"}
+    assert verification.passed
     assert {"actions", "actions_unnormalized", "backbone_resid", "expert_resid", "prep_images"} <= compared
 
 

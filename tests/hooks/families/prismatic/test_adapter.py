@@ -11,7 +11,6 @@ from probe_kit.hooks import Observation, Prompt, Site, capture, load_policy
 from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
 from probe_kit.hooks.families.prismatic.frames import frame_of
 from probe_kit.hooks.testing import AnswerModelContract
-from probe_kit.hooks.verification.verify import verify_reference
 from tests.support.prismatic_checkpoints import write_checkpoint, write_tokenizer
 
 
@@ -21,15 +20,6 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Prismatic:
         tmp_path_factory.mktemp("phi"), vision="dinoclip-vit-l-336px", language="phi-2-3b", model_type="prismatic"
     )
     return load_prismatic(str(folder), tokenizer="bytes", steps=3)
-
-
-def test_the_golden_reference_is_reproduced(golden_prismatic: Path) -> None:
-    verification = verify_reference("prismatic", golden_prismatic)
-    ok = {c.output for c in verification.comparisons if c.status == "ok"}
-    assert verification.passed
-    assert ok == {
-        "pixel_values", "vision_patches", "projector_features", "hidden_states", "logits", "generated_ids",
-    }  # fmt: skip
 
 
 def test_both_streams_together_are_the_hidden_states_of_one_pass(

@@ -51,12 +51,13 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
 )
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
+from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun
 from probe_kit.models.initialisation import initialise
 
-IMAGES, STATE = "observation.images.", "observation.state"
-TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 MOST_TOKENS = 1 << 16
 """Of a prompt: far beyond any policy, and no memory without end."""
+IMAGES, STATE = "observation.images.", "observation.state"
+TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 UNCOMPARED = ("IDENTITY", "EXCLUDED")
 """Modes of units without statistics: the state is read as it is, or not at all."""
 _DIMENSIONS = 7
@@ -596,6 +597,30 @@ class LerobotPolicy(Policy):
         """The ids of each instruction, without padding."""
         tokens, mask = self.tokenise(instructions)
         return [tuple(row[kept].tolist()) for row, kept in zip(tokens, mask, strict=True)]
+
+    # -- verification ------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> NDArray[Any]:
+        """(B, chunk, action numbers) that the network puts out with the randomness of a golden reference."""
+
+    def watched(self) -> dict[str, nn.Module]:
+        """Modules whose outputs a golden reference holds, by the name of the quantity."""
+        return {}
+
+    def watched_inputs(self) -> dict[str, nn.Module]:
+        """Modules whose inputs `further_outputs` reads, by any name."""
+        return {}
+
+    def recorded_padding(self, recorded: Arrays) -> NDArray[np.bool_]:
+        """(B, T): the validity of every backbone position for recorded ids, by the adapter's own roles."""
+        tokens, mask = (torch.from_numpy(recorded[name]) for name in ("in_lang_tokens", "in_lang_mask"))
+        return np.stack([row.valid for row in self.packed_roles(tokens, mask.bool())["backbone"]])
+
+    def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
+        """Quantities of a golden reference that only this family has, or has in another form."""
+        del run
+        return {}
 
 
 def checked_steps(steps: int, folder: Path) -> int:

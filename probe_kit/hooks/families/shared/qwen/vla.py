@@ -18,6 +18,7 @@ from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.qwen.text import QwenTokenizer
 from probe_kit.hooks.families.shared.qwen.tower import by_picture, tower_tap
+from probe_kit.hooks.verification.outputs import Arrays
 from probe_kit.models.qwen import QwenInputs, QwenPictures, image_slots, merged_tokens, pack_inputs
 
 CAMERA = "primary"
@@ -166,6 +167,13 @@ class QwenVLA(Policy):
 
     def _by_picture(self, patches: Tensor) -> Tensor:
         return by_picture(patches, self._grid)
+
+
+def recorded_inputs(policy: QwenVLA, recorded: Arrays) -> QwenInputs:
+    """Return the packed prompts of a golden reference."""
+    names = ("in_input_ids", "in_attention_mask", "in_pixel_values", "in_image_grid_thw")
+    ids, mask, pixels, grid = (torch.from_numpy(recorded[name]) for name in names)
+    return QwenInputs(ids, mask, pixels, grid, int(policy.vlm.config.image_token_id))
 
 
 def seeded_noise(seeds: Sequence[int], shape: tuple[int, ...], device: str) -> Tensor:

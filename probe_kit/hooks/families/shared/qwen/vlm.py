@@ -7,8 +7,7 @@ from torch import Tensor
 
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.families.shared.qwen.tower import by_picture, tower_tap
-from probe_kit.hooks.families.shared.vlm.adapter import Pictures
-from probe_kit.hooks.families.shared.vlm.recipe_vlm import RecipeVLM
+from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
 from probe_kit.hooks.families.shared.vlm.text import Frame
 from probe_kit.models.packing import LeftPacked
 from probe_kit.models.qwen import QwenPictures, merged_tokens
@@ -22,7 +21,7 @@ def qwen_frame(system: str = "") -> Frame:
     return Frame(f"{system}{USER}<|vision_start|>", "<|vision_end|>", f"{system}{USER}", ASSISTANT)
 
 
-class QwenVLM(RecipeVLM):
+class QwenVLM(VisionLanguageModel):
     """A VLM on one of transformers' Qwen networks."""
 
     picture_token: ClassVar[str | None] = "<|image_pad|>"

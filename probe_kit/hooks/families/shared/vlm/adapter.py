@@ -5,11 +5,10 @@ the last one, whose logits choose the first token of the answer. Padding stands 
 """
 
 from abc import abstractmethod
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import torch
@@ -25,9 +24,10 @@ from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.contract.views import PADDING
-from probe_kit.hooks.families.shared.network_loading import Filled
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill
+from probe_kit.hooks.families.shared.vlm.loading import Loaded, Recipe, load_vlm
 from probe_kit.hooks.families.shared.vlm.text import Frame, FramedText, TokenPrompt
+from probe_kit.hooks.verification.outputs import Produce
 from probe_kit.models.packing import LeftPacked
 
 CAMERA = "primary"
@@ -37,25 +37,15 @@ _PROMPT, _LAST = slice(None, -1), slice(-1, None)
 Pictures = list[NDArray[np.uint8]]
 
 
-@dataclass(frozen=True)
-class Loaded:
-    """A loaded network and where it is from. checkpoint: as asked for. folder: where its files lie."""
-
-    filled: Filled[Any]
-    checkpoint: str
-    folder: Path
-    device: str
-
-    @property
-    def network(self) -> Any:
-        """The network."""
-        return self.filled.network
-
-
 class VisionLanguageModel(AnswerModel):
-    """A loaded vision-language model. Subclasses say how it is spoken to and how a picture becomes positions."""
+    """A loaded vision-language model. Subclasses say how it is spoken to and how a picture becomes positions.
+
+    recipe: how its network is made of files. stream_tolerance: of activations in golden references, absolute.
+    """
 
     family: ClassVar[str]
+    recipe: ClassVar[Recipe]
+    stream_tolerance: ClassVar[float] = 3e-5
     frame: ClassVar[Frame]
     picture_token: ClassVar[str | None] = None
     """What stands at the positions of a picture, if it is a token of the tokenizer."""
@@ -80,6 +70,25 @@ class VisionLanguageModel(AnswerModel):
         }
         self.role_names = {"backbone": (IMAGE_ROLE, "language", "special", PADDING), ANSWER: (ANSWER,)}
         self.card = self._card({"tokenizer": tokenizer or "the checkpoint's", **settings})
+
+    @classmethod
+    def load(
+        cls,
+        checkpoint: str | None = None,
+        device: str = "cpu",
+        dtype: str | None = None,
+        random_weights: bool = False,
+        *,
+        tokenizer: str | None = None,
+        weights_seed: int = 0,
+        **settings: str,
+    ) -> Self:
+        """Load a model of any size from a folder or hub id; see `load_vlm`.
+
+        tokenizer: folder of another one. settings: further options of the family, for its constructor.
+        """
+        loaded = load_vlm(cls.recipe, checkpoint, device, dtype, random_weights, weights_seed)
+        return cls(loaded, tokenizer, **settings)
 
     def _card(self, settings: dict[str, str]) -> ModelCard:
         loaded, audit = self.loaded, self.loaded.filled.audit
@@ -259,6 +268,16 @@ class VisionLanguageModel(AnswerModel):
             end: Literal["input", "output"] = "output" if site.quantity == "attention" else "input"
             return Tap(block.self_attn.o_proj, 1, end, tokens)
         return Tap(block.input_layernorm, 1, tokens=tokens)
+
+    # -- verification ------------------------------------------------------------------------------------
+
+    def further_outputs(self, first: Prompt, produced: Mapping[str, Produce]) -> dict[str, Produce]:
+        """Quantities of a golden reference that only this family has, or has in another form.
+
+        first: the first question. produced: how the quantities of every family are made.
+        """
+        del first, produced
+        return {}
 
 
 def _labels(prompt: TokenPrompt) -> list[str]:

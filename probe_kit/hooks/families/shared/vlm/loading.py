@@ -15,8 +15,7 @@ from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import read_weights
-from probe_kit.hooks.families.shared.network_loading import fill, twin
-from probe_kit.hooks.families.shared.vlm.adapter import Loaded
+from probe_kit.hooks.families.shared.network_loading import Filled, fill, twin
 from probe_kit.models.building import without_precision
 from probe_kit.models.naming import Renames, renamed
 
@@ -36,6 +35,21 @@ class Recipe:
     config: Callable[[Mapping[str, Any]], Any]
     build: Build
     names: Renames = ()
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A loaded network and where it is from. checkpoint: as asked for. folder: where its files lie."""
+
+    filled: Filled[Any]
+    checkpoint: str
+    folder: Path
+    device: str
+
+    @property
+    def network(self) -> Any:
+        """The network."""
+        return self.filled.network
 
 
 def load_vlm(

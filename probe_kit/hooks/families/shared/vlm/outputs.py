@@ -5,7 +5,7 @@ whole prompts; the adapter is given what stands between their frames.
 """
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -21,47 +21,40 @@ from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.families.shared.module_outputs import numpy_of
 from probe_kit.hooks.families.shared.vlm.adapter import ANSWER, VisionLanguageModel
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill
-from probe_kit.hooks.verification.verify import Comparison, Produce, compare
+from probe_kit.hooks.verification.outputs import Arrays, Outputs, Produce, numpy_of, watch
 from probe_kit.models.packing import LeftPacked
 
-Arrays = Mapping[str, NDArray[Any]]
-PIXELS, STREAMS, LOGITS = 1e-6, 3e-5, 2e-5
+PIXELS, LOGITS = 1e-6, 2e-5
 """Tolerances, absolute."""
 LETTERS = ("A", "B")
-_INPUTS = ("pixel_values_index",)
 DIMS_FILE = "dims.json"
 # How the templates that references were recorded with mark a picture's place.
 _PLACEHOLDER = re.compile(r"<\|vision_end\|>|<IMG_CONTEXT>|<image>")
 
 
-def verify_vlm(
-    model: VisionLanguageModel,
-    folder: Path,
-    recorded: Arrays,
-    further: Mapping[str, Produce] | None = None,
-    streams: float = STREAMS,
-) -> tuple[Comparison, ...]:
-    """Compare a reference. further: outputs that only this family has. streams: tolerance of its activations."""
-    reference = Reference(model, questions_of(folder, recorded, model), recorded)
-    return compare_all(recorded, {**reference.produced(), **(further or {})}, streams)
+def vlm_outputs(load: Callable[..., VisionLanguageModel], folder: Path, recorded: Arrays) -> Outputs:
+    """Ask the recorded questions; see `VisionLanguageModel.further_outputs` for quantities of a family."""
+    model = load(str(folder / "checkpoint"), dtype="float32")
+    questions = questions_of(folder, recorded, model)
+    produced = Reference(model, questions, recorded).produced()
+    produced = {**produced, **model.further_outputs(questions[0], produced)}
+    return answer_outputs(produced, recorded, model.stream_tolerance)
 
 
-def compare_all(
-    recorded: Arrays, produced: Mapping[str, Produce], streams: float = STREAMS
-) -> tuple[Comparison, ...]:
-    """Every recorded output with the tolerance of its kind; streams where `attention_mask` says so."""
-    mask = dict.fromkeys(("backbone_resid", "backbone_final_norm"), recorded["attention_mask"].astype(bool))
-    comparisons: list[Comparison] = []
-    for name in sorted(recorded):
-        if name.startswith("in_") or name in _INPUTS:
-            continue
-        valid = {name: mask[name]} if name in mask else {}
-        absolute = not name.endswith("_sum")
-        comparisons += compare({name: recorded[name]}, produced, _tolerance(name, streams), valid, absolute)
-    return tuple(comparisons)
+def answer_outputs(produced: Mapping[str, Produce], recorded: Arrays, streams: float) -> Outputs:
+    """Give every quantity the tolerance of its kind; streams are compared where `attention_mask` says so."""
+    kinds = {name: _tolerance(name, streams) for name in recorded}
+    mask = recorded["attention_mask"].astype(bool)
+    return Outputs(
+        produced,
+        streams,
+        ("pixel_values_index",),
+        tolerances=kinds,
+        absolute={name for name in recorded if not name.endswith("_sum")},
+        valid=dict.fromkeys(("backbone_resid", "backbone_final_norm"), mask),
+    )
 
 
 def _tolerance(name: str, streams: float) -> float:
@@ -70,21 +63,22 @@ def _tolerance(name: str, streams: float) -> float:
     return LOGITS if "logits" in name else streams
 
 
-def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> list[Prompt]:
-    """The recorded questions with their pictures. Raises UsageError where they do not lie beside the reference."""
+def recorded_texts(folder: Path) -> list[str]:
+    """Return the whole prompts of a reference. Raises UsageError where they do not lie beside it."""
     file = folder / DIMS_FILE
     if not file.is_file():
         raise UsageError(f"{file} is missing: it holds the questions that {folder} was recorded with")
-    rows = load_json(file)["rows"]
+    return [row["text"] for row in load_json(file)["rows"]]
+
+
+def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> list[Prompt]:
+    """Return the recorded questions with their pictures. Raises UsageError as `recorded_texts` does."""
+    letters = tuple(model.lead + letter for letter in LETTERS)
     shown = [recorded[f"in_picture_{int(number)}"] for number in recorded["in_rows_picture"]]
     return [
-        Prompt(Observation(picture, np.zeros(8, np.float32), ""), _between(row["text"], model), _letters(model))
-        for row, picture in zip(rows, shown, strict=True)
+        Prompt(Observation(picture, np.zeros(8, np.float32), ""), _between(text, model), letters)
+        for text, picture in zip(recorded_texts(folder), shown, strict=True)
     ]
-
-
-def _letters(model: VisionLanguageModel) -> tuple[str, ...]:
-    return tuple(model.lead + letter for letter in LETTERS)
 
 
 def _between(text: str, model: VisionLanguageModel) -> str:
@@ -113,9 +107,7 @@ class Reference:
     @cached_property
     def captured(self) -> tuple[ActivationCache, Prefill]:
         """One pass over all rows, with everything that is stored of it."""
-        model = self.model
-        with capture(model, [*model.sites(), *model.sites("final_norm")]) as tape:
-            prefill = model.prefill(self.questions)
+        prefill, tape, _ = watch(self.model, lambda: self.model.prefill(self.questions))
         return tape, prefill
 
     @cached_property

@@ -4,8 +4,7 @@ B batch, S positions, L blocks, N output tokens. References come without a token
 the checkpoint holds what the original processor and evaluation client know.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,15 +15,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit._system.bounded_json import load_json
-from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
+from probe_kit.hooks.capturing.capture_context import ActivationCache
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.families.magma.adapter import BINS, Magma, load_magma
+from probe_kit.hooks.families.magma.adapter import BINS, Magma
 from probe_kit.hooks.families.openvla.actions import ActionTokens
-from probe_kit.hooks.verification.verify import Comparison, Produce, compare
+from probe_kit.hooks.verification.outputs import (
+    Arrays,
+    Outputs,
+    Produce,
+    forward_outputs,
+    generation_outputs,
+    numpy_of,
+    watch,
+)
 from probe_kit.models.magma import Choose, Decoded, Grid, Picture, PictureSettings, choose_grid
 
 TOLERANCE = 2e-5
-Arrays = Mapping[str, NDArray[Any]]
 _CLIENT = "action_config.json"
 _INPUTS = (
     "image1_uint8", "image2_uint8", "input_ids", "attention_mask", "text_input_ids", "batch_input_ids",
@@ -34,26 +40,15 @@ _INPUTS = (
 _RELEASED = PictureSettings(512, 4)
 
 
-def verify_magma(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
-    """Compare a reference."""
+def magma_outputs(load: Callable[..., Magma], folder: Path, recorded: Arrays) -> Outputs:
+    """Run the recorded pictures and prompt through the adapter."""
     file = folder / "checkpoint" / _CLIENT
     client: dict[str, Any] = load_json(file) if file.is_file() else {}
     steps = int(recorded["generated_ids"].size) if "generated_ids" in recorded else 1
-    model = load_magma(
-        str(folder / "checkpoint"), shrink=0, steps=steps, statistics=str(file) if "norm_stats" in client else None
-    )
+    statistics = str(file) if "norm_stats" in client else None
+    model = load(str(folder / "checkpoint"), shrink=0, steps=steps, statistics=statistics)
     reference = _Reference(model, recorded, client)
-    outputs = {name: values for name, values in recorded.items() if name not in _INPUTS}
-    return compare(outputs, reference.produced(), TOLERANCE, reference.valid())
-
-
-@dataclass(frozen=True)
-class _Run:
-    """One picture and the recorded prompt, through the adapter."""
-
-    picture: Picture
-    decoded: Decoded
-    tape: ActivationCache
+    return Outputs(reference.produced(), TOLERANCE, _INPUTS, valid=reference.valid())
 
 
 class _Reference:
@@ -64,20 +59,20 @@ class _Reference:
         self.prompt: list[int] = recorded["input_ids"].ravel().tolist()
 
     @cached_property
-    def first(self) -> _Run:
+    def first(self) -> tuple[Picture, Decoded, ActivationCache]:
+        """The first picture and the recorded prompt, through the adapter."""
         return self._run(self.recorded["image1_uint8"])
 
-    @cached_property
-    def second(self) -> _Run:
-        return self._run(self.recorded["image2_uint8"])
+    def _run(self, image: NDArray[np.uint8]) -> tuple[Picture, Decoded, ActivationCache]:
+        picture = self.model.picture(image)
+        decoded, tape, _ = watch(self.model, lambda: self.model.generate([self.prompt], [picture], self._choose))
+        return picture, decoded, tape
 
-    def _run(self, image: NDArray[np.uint8]) -> _Run:
-        model, picture = self.model, self.model.picture(image)
-        sites = [*model.sites(), *model.sites("final_norm")]
-        sites += [site for stream in model.further_streams.values() for site in stream.sites()]
-        with capture(model, sites) as tape:
-            decoded = model.generate([self.prompt], [picture], self._choose)
-        return _Run(picture, decoded, tape)
+    @cached_property
+    def second(self) -> tuple[Picture, dict[str, Produce]]:
+        """The second picture, and what comes of it and the prompt."""
+        picture, decoded, tape = self._run(self.recorded["image2_uint8"])
+        return picture, generation_outputs(self.model, "action", tape, decoded)
 
     @property
     def _choose(self) -> Choose:
@@ -108,10 +103,10 @@ class _Reference:
             return lambda: self._map(f"vision_{number}", -1)
 
         return {
-            "pixel_values": lambda: _numpy(self.first.picture.crops[None]),
-            "pixel_values_2": lambda: _numpy(self.second.picture.crops[None]),
-            "image_sizes": lambda: _sizes(self.first.picture),
-            "image_sizes_2": lambda: _sizes(self.second.picture),
+            "pixel_values": lambda: numpy_of(self.first[0].crops[None]),
+            "pixel_values_2": lambda: numpy_of(self.second[0].crops[None]),
+            "image_sizes": lambda: _sizes(self.first[0]),
+            "image_sizes_2": lambda: _sizes(self.second[0]),
             "crop_grids_hw": self._grids,
             "stem": lambda: self._map("vision_0", 0),
             **{f"stage{number}": stage(number) for number in range(len(self.model.further_streams))},
@@ -127,73 +122,45 @@ class _Reference:
     def _map(self, stream: str, layer: int) -> NDArray[Any]:
         """(N, C, h, w) of the tokens that a vision stream's tap gives; maps have the shape of what was shown."""
         layers = self.model.further_streams[stream].layers
-        tokens = self.first.tape[Site(stream, layer % layers)]
-        height, width = self.model.network.shown(self.first.picture).shape[-2:]
+        tokens = self.first[2][Site(stream, layer % layers)]
+        height, width = self.model.network.shown(self.first[0]).shape[-2:]
         high = round(np.sqrt(tokens.shape[1] * height / width))
-        return _numpy(tokens.transpose(1, 2).reshape(len(tokens), -1, high, tokens.shape[1] // high))
+        return numpy_of(tokens.transpose(1, 2).reshape(len(tokens), -1, high, tokens.shape[1] // high))
 
     @torch.inference_mode()
     def _projected(self) -> NDArray[Any]:
         network = self.model.network
-        maps = network.vision_tower(network.shown(self.first.picture))
-        return _numpy(network.multi_modal_projector(maps.permute(0, 2, 3, 1)))
+        maps = network.vision_tower(network.shown(self.first[0]))
+        return numpy_of(network.multi_modal_projector(maps.permute(0, 2, 3, 1)))
 
     def _streams(self) -> dict[str, Produce]:
-        steps = range(self.model.steps)
+        _, decoded, tape = self.first
+        made = generation_outputs(self.model, "action", tape, decoded)
         return {
-            "merged_embeds": lambda: _numpy(self._states(self.first)[0]),
-            "hidden_states": lambda: _numpy(self._states(self.first)),
-            "logits": lambda: _numpy(self._head(self._states(self.first)[-1])),
-            "hidden_states_2": lambda: _numpy(self._states(self.second)),
-            "logits_2": lambda: _numpy(self._head(self._states(self.second)[-1])),
-            "generated_ids": lambda: _numpy(self.first.decoded.ids[0]),
-            "generated_step_logits": lambda: _numpy(self.first.decoded.logits[0]),
-            "generated_step_hidden": lambda: _numpy(
-                torch.stack([self._column(self.first.tape, "action", step)[:, 0, 0] for step in steps])
-            ),
+            **made,
+            "merged_embeds": lambda: made["hidden_states"]()[0],
+            "hidden_states_2": lambda: self.second[1]["hidden_states"](),
+            "logits_2": lambda: self.second[1]["logits"](),
         }
 
-    def _states(self, run: _Run) -> Tensor:
-        """(L+1, 1, S, D): every prompt position, from the two streams that share the stack."""
-        parts = [self._column(run.tape, "backbone", None), self._column(run.tape, "action", 0)]
-        return torch.cat(parts, dim=2)
-
-    def _column(self, tape: ActivationCache, stream: str, iteration: int | None) -> Tensor:
-        """(L+1, 1, positions, D) as transformers counts them: the stream at every block, and normed at the end."""
-        blocks = self.model.streams[stream].layers - 1
-        layers = [tape[Site(stream, layer, iteration=iteration)] for layer in range(blocks)]
-        return torch.stack([*layers, tape[Site(stream, blocks, "final_norm", iteration)]])
-
-    @torch.inference_mode()
-    def _head(self, normed: Tensor) -> Tensor:
-        logits: Tensor = self.model.network.language_model.lm_head(normed)
-        return logits
-
     def _passes(self) -> dict[str, Produce]:
-        def forced() -> list[int]:
-            return [*self.prompt, *self.first.decoded.ids[0].tolist()]
+        picture, decoded, _ = self.first
+        forced = [*self.prompt, *decoded.ids[0].tolist()]
+        network = self.model.network
 
         def text() -> list[int]:
             ids: list[int] = self.recorded["text_input_ids"].ravel().tolist()
             return ids
 
         return {
-            "teacher_forced_ids": lambda: np.array([forced()]),
-            "teacher_forced_hidden_states": lambda: self._forward([forced()], [self.first.picture])[0],
-            "teacher_forced_logits": lambda: self._forward([forced()], [self.first.picture])[1],
-            "text_hidden_states": lambda: self._forward([text()], None)[0],
-            "text_logits": lambda: self._forward([text()], None)[1],
+            "teacher_forced_ids": lambda: np.array([forced]),
+            "teacher_forced_hidden_states": lambda: forward_outputs(network, [forced], [picture])[0],
+            "teacher_forced_logits": lambda: forward_outputs(network, [forced], [picture])[1],
+            "text_hidden_states": lambda: forward_outputs(network, [text()], None)[0],
+            "text_logits": lambda: forward_outputs(network, [text()], None)[1],
             "batch_hidden_states": lambda: self._batch[0],
             "batch_logits": lambda: self._batch[1],
         }
-
-    @torch.inference_mode()
-    def _forward(
-        self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Hidden states (L+1, B, S, D) and logits of one pass."""
-        output = self.model.network(prompts, pictures)
-        return _numpy(torch.stack(output.hidden_states)), _numpy(output.logits)
 
     @cached_property
     def _batch_prompts(self) -> list[list[int]]:
@@ -221,7 +188,7 @@ class _Reference:
     @cached_property
     def _batch(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Of the recorded batch, packed as the adapter packs it and reordered to padding in front of every row."""
-        states, logits = self._forward(self._batch_prompts, self._batch_pictures)
+        states, logits = forward_outputs(self.model.network, self._batch_prompts, self._batch_pictures)
         for row, length in enumerate(self._batch_lengths):
             for values in (states[:, row], logits[None, row]):
                 first = values[:, : length - 1].copy()
@@ -243,8 +210,3 @@ class _Reference:
 
 def _sizes(picture: Picture) -> NDArray[np.int64]:
     return np.array([[[picture.grid.rows, picture.grid.columns]]])
-
-
-def _numpy(tensor: Tensor) -> NDArray[Any]:
-    values: NDArray[Any] = tensor.detach().cpu().numpy().copy()
-    return values

@@ -3,7 +3,7 @@
 B batch, P patches, T prompt tokens with the picture's, L blocks, N output tokens.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,16 +14,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
+from probe_kit.hooks.capturing.capture_context import ActivationCache
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.spatialvla.adapter import SCENE, SpatialVLA, choose_statistics
 from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
 from probe_kit.hooks.families.spatialvla.speech import Speech
-from probe_kit.hooks.verification.verify import Comparison, Produce, compare
+from probe_kit.hooks.verification.outputs import (
+    Arrays,
+    Outputs,
+    Produce,
+    generation_outputs,
+    numpy_of,
+    stacked,
+    watch,
+)
 from probe_kit.models.spatialvla import (
     STEP_TOKENS,
-    Decoded,
     Seen,
     depth_input,
     known_cameras,
@@ -32,23 +38,20 @@ from probe_kit.models.spatialvla import (
 )
 
 TOLERANCE = 5e-5
-Arrays = Mapping[str, NDArray[Any]]
 _INPUTS = (
     "image_uint8", "intrinsic_raw", "input_ids", "attention_mask", "batch_input_ids", "batch_attention_mask",
     "batch_pixel_values", "batch_intrinsic", "forced_ids", "tok_actions",
 )  # fmt: skip
 
 
-def verify_spatialvla(folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
+def spatialvla_outputs(_: Callable[..., Any], folder: Path, recorded: Arrays) -> Outputs:
     """Compare a reference of a policy, at the tolerance that ZoeDepth's long chain of convolutions needs."""
     loaded = load_checkpoint(str(folder / "checkpoint"), "cpu", "float32", random_weights=False)
-    reference = _Reference(loaded, recorded)
-    outputs = {name: values for name, values in recorded.items() if name not in _INPUTS}
     valid: dict[str, NDArray[np.bool_]] = {}
     if "batch_attention_mask" in recorded:
         mask = recorded["batch_attention_mask"].astype(bool)
         valid = dict.fromkeys(("batch_hidden_states", "batch_logits"), mask)
-    return compare(outputs, reference.produced(), TOLERANCE, valid)
+    return Outputs(_Reference(loaded, recorded).produced(), TOLERANCE, _INPUTS, valid=valid)
 
 
 class _Reference:
@@ -89,7 +92,7 @@ class _Reference:
             "pixel_values": lambda: _numpy(self.pictures),
             "pixel_values_224": lambda: prepare_picture(image, replace(settings, side=224))[None],
             "intrinsic": lambda: _numpy(self.cameras[0]),
-            "siglip_hidden_states": lambda: _numpy(self._tower_states()),
+            "siglip_hidden_states": lambda: stacked(self._spoken[1], self.policy.further_streams["vision"])[0],
             "siglip_last_hidden_state": lambda: _numpy(self._seen.tower),
             # The original divides by what Gemma-2 multiplies with; see `SpatialVLANetwork.embed`.
             "image_features": lambda: _numpy(self._seen.features) / np.sqrt(config.text.hidden_size),
@@ -114,48 +117,31 @@ class _Reference:
         every = max(1, round(whole.shape[-1] / self.recorded[name].shape[-1]))
         return _numpy(whole[..., ::every, ::every])
 
-    def _tower_states(self) -> Tensor:
-        sites = self.policy.further_streams["vision"].sites()
-        with capture(self.policy, sites) as tape:
-            self._generate(self.policy)
-        return torch.stack([tape[site] for site in sites])
-
     # -- language model ----------------------------------------------------------------------------------
 
-    def _generate(self, policy: SpatialVLA, fed: Tensor | None = None) -> Decoded:
-        return policy.generate(self.pictures, self.cameras, [self.prompt], fed)
+    def _run(self, policy: SpatialVLA, fed: Tensor | None = None) -> tuple[dict[str, Produce], ActivationCache]:
+        """What comes of the prompt, and of output tokens `fed` in the place of the policy's own."""
+        decoded, tape, _ = watch(policy, lambda: policy.generate(self.pictures, self.cameras, [self.prompt], fed))
+        return generation_outputs(policy, "action", tape, decoded), tape
 
     @cached_property
-    def _spoken(self) -> tuple[Decoded, ActivationCache]:
-        with capture(self.policy, [*self.policy.sites(), *self.policy.sites("final_norm")]) as tape:
-            return self._generate(self.policy), tape
+    def _spoken(self) -> tuple[dict[str, Produce], ActivationCache]:
+        return self._run(self.policy)
 
     @cached_property
-    def _forced(self) -> tuple[Decoded, ActivationCache]:
+    def _forced(self) -> dict[str, Produce]:
         fed = torch.from_numpy(self.recorded["forced_ids"].reshape(1, -1))
-        policy = self._policy(fed.shape[1] + 1)
-        with capture(policy, [*policy.sites("residual"), *policy.sites("final_norm")]) as tape:
-            return self._generate(policy, fed), tape
+        return self._run(self._policy(fed.shape[1] + 1), fed)[0]
 
     def _language(self) -> dict[str, Produce]:
         return {
-            "hidden_states": lambda: _numpy(self._prompt_states()),
+            **self._spoken[0],
             "logits": lambda: self._prompt_logits(),
             "batch_hidden_states": lambda: self._batch[0],
             "batch_logits": lambda: self._batch[1],
-            "generated_ids": lambda: self._spoken[0].ids[0].numpy(),
-            "generated_step_logits": lambda: _numpy(self._spoken[0].logits[0]),
-            "generated_step_hidden": lambda: _steps(self._spoken, self.policy),
-            "forced_step_logits": lambda: _numpy(self._forced[0].logits[0]),
-            "forced_step_hidden": lambda: _steps(self._forced, self.policy),
+            "forced_step_logits": lambda: self._forced["generated_step_logits"](),
+            "forced_step_hidden": lambda: self._forced["generated_step_hidden"](),
         }
-
-    def _prompt_states(self) -> Tensor:
-        """(L+1, 1, T, D): every prompt position, from the two streams that share the stack."""
-        tape = self._spoken[1]
-        return torch.cat(
-            [_column(tape, self.policy, "backbone", None), _column(tape, self.policy, "action", 0)], 2
-        )
 
     @torch.inference_mode()
     def _prompt_logits(self) -> NDArray[Any]:
@@ -173,7 +159,7 @@ class _Reference:
         """
         recorded, network = self.recorded, self.policy.network
         mask = recorded["batch_attention_mask"].astype(bool)
-        rows = [ids[seen].tolist() for ids, seen in zip(recorded["batch_input_ids"], mask, strict=True)]
+        rows = [ids[valid].tolist() for ids, valid in zip(recorded["batch_input_ids"], mask, strict=True)]
         packed = self.policy.pack(rows)
         pictures, cameras = (torch.from_numpy(recorded[f"batch_{n}"]) for n in ("pixel_values", "intrinsic"))
         features = network.look(pictures, cameras, vote=True).features
@@ -192,7 +178,7 @@ class _Reference:
         produced: dict[str, Produce] = {
             "decode_table": lambda: bins.values(every),
             "actions_from_generated": lambda: policy.actions(
-                self._spoken[0].ids[0].numpy().reshape(-1, STEP_TOKENS)
+                self._spoken[0]["generated_ids"]().reshape(-1, STEP_TOKENS)
             ),
         }
         if "tok_actions" in self.recorded:
@@ -216,20 +202,6 @@ def _camera(loaded: LoadedSpatialVLA, recorded: Arrays) -> str:
     return SCENE
 
 
-def _steps(spoken: tuple[Decoded, ActivationCache], policy: SpatialVLA) -> NDArray[Any]:
-    """(N, L+1, D) of every output token."""
-    decoded, tape = spoken
-    steps = range(decoded.ids.shape[1])
-    return _numpy(torch.stack([_column(tape, policy, "action", step)[:, 0, 0] for step in steps]))
-
-
-def _column(tape: ActivationCache, policy: SpatialVLA, stream: str, iteration: int | None) -> Tensor:
-    """(L+1, 1, positions, D) as transformers counts them: the stream at every block, and normed at the end."""
-    blocks = policy.streams[stream].layers - 1
-    layers = [tape[Site(stream, layer, iteration=iteration)] for layer in range(blocks)]
-    return torch.stack([*layers, tape[Site(stream, blocks, "final_norm", iteration)]])
-
-
 def _numpy(tensor: Tensor | None) -> NDArray[Any]:
     """NaN for what is not there, which equals nothing."""
-    return np.full(1, np.nan) if tensor is None else np.array(tensor.float().cpu().numpy())
+    return np.full(1, np.nan) if tensor is None else numpy_of(tensor)

@@ -4,9 +4,9 @@ B rows, T text tokens, P patches, L blocks, D width. Recorded rows were read alo
 recorded without the picture's positions and padded behind.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -14,37 +14,32 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_json import load_json
-from probe_kit.errors import UsageError
-from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
+from probe_kit.hooks.capturing.capture_context import ActivationCache
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.prismatic.adapter import Prismatic
 from probe_kit.hooks.families.prismatic.tokenizer import id_behind
-from probe_kit.hooks.families.shared.module_outputs import numpy_of
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill
-from probe_kit.hooks.families.shared.vlm.verify import DIMS_FILE, LETTERS, compare_all, padded_answers
-from probe_kit.hooks.verification.verify import Comparison, Produce
+from probe_kit.hooks.families.shared.vlm.outputs import LETTERS, answer_outputs, padded_answers, recorded_texts
+from probe_kit.hooks.verification.outputs import Arrays, Outputs, Produce, numpy_of, watch
 
-Arrays = Mapping[str, NDArray[Any]]
+STREAMS = 3e-5
+"""Tolerance of activations, absolute."""
 
 
-def verify_asked(model: Prismatic, folder: Path, recorded: Arrays) -> tuple[Comparison, ...]:
-    """Compare a reference. Raises UsageError where its questions do not lie beside it."""
-    file = folder / DIMS_FILE
-    if not file.is_file():
-        raise UsageError(f"{file} is missing: it holds the questions that {folder} was recorded with")
+def asked_outputs(model: Prismatic, folder: Path, recorded: Arrays) -> Outputs:
+    """Ask the recorded questions. Raises UsageError where they do not lie beside the reference."""
     frame = model.frame
     questions = [
         Prompt(
             Observation(recorded[f"in_picture_{int(number)}"], np.zeros(8, np.float32), ""),
-            row["text"].removeprefix(frame.before).removesuffix(frame.behind),
+            text.removeprefix(frame.before).removesuffix(frame.behind),
             tuple(model.lead + letter for letter in LETTERS),
         )
-        for row, number in zip(load_json(file)["rows"], recorded["in_rows_picture"], strict=True)
+        for text, number in zip(recorded_texts(folder), recorded["in_rows_picture"], strict=True)
     ]
-    return compare_all(recorded, _Asked(model, questions, recorded).produced())
+    return answer_outputs(_Asked(model, questions, recorded).produced(), recorded, STREAMS)
 
 
 class _Asked:
@@ -56,12 +51,8 @@ class _Asked:
     @cached_property
     def captured(self) -> list[tuple[ActivationCache, Prefill]]:
         """Every row alone, with everything that is stored of it."""
-        rows = []
-        for question in self.questions:
-            with capture(self.model, [*self.model.sites(), *self.model.sites("final_norm")]) as tape:
-                prefill = self.model.prefill([question])
-            rows.append((tape, prefill))
-        return rows
+        runs = (watch(self.model, partial(self.model.prefill, [question])) for question in self.questions)
+        return [(tape, prefill) for prefill, tape, _ in runs]
 
     @property
     def prompts(self) -> list[list[int]]:
