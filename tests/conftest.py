@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from tests.support.buckets import bad_server, bucket, bucket_elsewhere, deaf_bucket
 from tests.support.made_once import made_once, shared_folder
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from probe_kit.hooks.families.pi0.adapter import Pi0
     from probe_kit.runs import Run
     from probe_kit.suite import Suite
+
+__all__ = ["bad_server", "bucket", "bucket_elsewhere", "deaf_bucket"]
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: every core has a worker

@@ -1,7 +1,7 @@
-"""A prefix in an object store as the location of a run (extra `remote`).
+"""A prefix in an object store as the location of a run, through obstore (extra `remote`).
 
-Single objects appear whole or not at all, and `If-None-Match: *` creates them exclusively: that is all the commit
-protocol needs. What folders have besides, locks and renaming, is missing, and replaced as follows.
+Single objects appear complete or not at all, and `If-None-Match: *` creates them exclusively: that is all the
+commit protocol needs. Folders have locks and renaming besides, which are replaced as follows.
 
 * No process can know that it is alone, so nothing that others may be writing is ever removed. There is little to
   remove: half an upload is no object, and objects without a commit are written again under the same key.
@@ -10,11 +10,12 @@ protocol needs. What folders have besides, locks and renaming, is missing, and r
 * Derived groups carry their stamp in their key, so that processes that saw different commits never mix them.
 
 A store may be busy or away for a while: from its first answer on, every request is repeated for `PATIENCE`. Before
-it has answered once, what is wrong is rather the address, and it is given up within seconds.
+it has answered once, the address is more likely wrong, and it is given up within seconds.
 """
 
+import asyncio
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import timedelta
@@ -24,27 +25,30 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 from urllib.parse import urlsplit
 
-from zarr.abc.store import Store
+from zarr.abc.store import ByteRequest, Store
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import WrapperStore
 
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
 from probe_kit.runs.location import Location, check_size
-from probe_kit.runs.object_stores import LONGEST_PAUSE, BlankStore, PatientStore, pauses_between
 
 if TYPE_CHECKING:
     from obstore import ReadableFile
     from obstore.store import ObjectStore
 
-# Small objects are read side by side, because each of them takes a round trip.
 READERS = 32
+"""Small objects that are read side by side, because each of them takes a round trip."""
 PATIENCE = timedelta(seconds=60)
-"""So long requests are repeated; the last of them may then take its own time, 30 s unless AWS_TIMEOUT says so."""
+"""The time for repeating a request; the last try may then take its own time, 30 s unless AWS_TIMEOUT says so."""
+LONGEST_PAUSE = 5.0
+"""Seconds between two requests of the same thing."""
 _QUICK = timedelta(seconds=5)
-"""For a store that never answered."""
+"""The same for a store that never answered."""
 STAMP_DIGITS = 16
 _NO_BUCKET = "NoSuchBucket"
-# Where a client looks last for credentials: the metadata services of cloud machines.
-_ASKED_FOR_CREDENTIALS = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
+_METADATA_SERVICES = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
+"""Services of cloud machines, where a client looks last for credentials."""
 
 
 class Bucket(Location):
@@ -86,11 +90,8 @@ class Bucket(Location):
 
     def free_bytes(self) -> None:
         """No bound."""
-        return
 
-    @property
-    def _objects(self) -> "ObjectStore":
-        return self._patient if self._answered else self._quick
+    # -- requests --------------------------------------------------------------------------------------
 
     @cached_property
     def _patient(self) -> "ObjectStore":
@@ -114,29 +115,30 @@ class Bucket(Location):
             )
         return store
 
-    def _asked[T](self, ask: Callable[["ObjectStore"], T]) -> T:
-        """What the store answers.
+    def _answer[T](self, request: Callable[["ObjectStore"], T]) -> T:
+        """Return the answer to a request, in our words.
 
-        obstore repeats requests that change nothing, and is repeated here: a listing that breaks off, a
+        obstore repeats requests that change nothing. Repeated here are a listing that breaks off, and a
         conditional put or a deletion without an answer. All of them may be done twice.
         """
-        from obstore.exceptions import AlreadyExistsError, GenericError
+        from obstore.exceptions import GenericError
 
-        pauses, end = pauses_between(), time.monotonic() + PATIENCE.total_seconds()
-        while True:
-            try:
-                answer = ask(self._objects)
-            except (FileNotFoundError, AlreadyExistsError):
-                self._answered = True
-                raise
-            except GenericError:
-                pause = next(pauses)
-                if not self._answered or time.monotonic() + pause > end:
+        pauses = pauses_for(PATIENCE)
+        with self.in_words():
+            while True:
+                try:
+                    answer = request(self._patient if self._answered else self._quick)
+                except FileNotFoundError:
+                    self._answered = True
                     raise
-            else:
-                self._answered = True
-                return answer
-            time.sleep(pause)
+                except GenericError:
+                    pause = next(pauses, None)
+                    if not self._answered or pause is None:
+                        raise
+                else:
+                    self._answered = True
+                    return answer
+                time.sleep(pause)
 
     @contextmanager
     def in_words(self) -> Iterator[None]:
@@ -153,7 +155,7 @@ class Bucket(Location):
             raise self._refused(error) from error
 
     def _refused(self, error: Exception) -> StoreError:
-        """What the store said, and what is to be done about it."""
+        """The error of the store, with the remedy."""
         why = str(error).split("\n\nDebug source", maxsplit=1)[0]
         advice = (
             "Check the bucket, the network, and what the environment says of endpoint and credentials "
@@ -162,20 +164,21 @@ class Bucket(Location):
         if _NO_BUCKET in str(error):
             bucket = urlsplit(self._url).netloc
             why, advice = f"there is no bucket {bucket!r}", "Create it, or correct its name or AWS_ENDPOINT_URL"
-        elif any(place in why for place in _ASKED_FOR_CREDENTIALS):
+        elif any(service in why for service in _METADATA_SERVICES):
             why = "the environment holds no credentials, and this machine has none of its own"
             advice = (
                 "Set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket"
             )
         return StoreError(f"{self} cannot be used: {why}. {advice}; the same command continues")
 
+    # -- objects ---------------------------------------------------------------------------------------
+
     def exists(self, key: str) -> bool:
         """One request for the head of the object."""
         import obstore
 
         try:
-            with self.in_words():
-                self._asked(lambda objects: obstore.head(objects, key))
+            self._answer(lambda objects: obstore.head(objects, key))
         except FileNotFoundError:
             return False
         return True
@@ -184,23 +187,21 @@ class Bucket(Location):
         """One request."""
         import obstore
 
-        def whole(objects: Any) -> bytes:
+        def content(objects: Any) -> bytes:
             answer = obstore.get(objects, key)
             check_size(key, answer.meta["size"], self)
             return bytes(answer.bytes())
 
-        with self.in_words():
-            return self._asked(whole)
+        return self._answer(content)
 
     def open(self, key: str) -> BinaryIO:
         """Reads ranges when they are asked for."""
         import obstore
 
-        with self.in_words():
-            return BufferedReader(_Ranges(self._asked(lambda objects: obstore.open_reader(objects, key)), self))
+        return BufferedReader(_Ranges(self._answer(lambda objects: obstore.open_reader(objects, key)), self))
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
-        """A listing, then many requests side by side. What was listed and is gone by then is left out."""
+        """A listing, then many requests side by side. An object that is gone by then is left out."""
         names = [key.removeprefix(f"{folder}/") for key in self.keys(folder)]
         names = [name for name in names if name.endswith(suffix) and "/" not in name]
         with ThreadPoolExecutor(READERS) as readers:
@@ -220,44 +221,18 @@ class Bucket(Location):
 
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
         """From a listing."""
-        there, wanted = self._listing(folder), {key: f"{folder}/{key}" for key in keys}
-        return {key: there[full] for key, full in wanted.items() if full in there}
-
-    def confirm(self, lengths: Mapping[str, int]) -> None:
-        """A request for the head of each, side by side."""
-        there = self._lengths(lengths)
-        for key, length in lengths.items():
-            if (found := there.get(key, 0)) != length:
-                raise StoreError(
-                    f"{self} confirmed {length:,} bytes of {key} and holds {found:,}. No commit depends on "
-                    "it. Check the store, then run the same command to resume"
-                )
-
-    def _lengths(self, keys: Iterable[str]) -> dict[str, int]:
-        """Bytes of those that are there, of a request for the head of each."""
-        import obstore
-
-        def length(key: str) -> int | None:
-            try:
-                with self.in_words():
-                    return int(self._asked(lambda objects: obstore.head(objects, key))["size"])
-            except FileNotFoundError:
-                return None
-
-        asked = list(keys)
-        with ThreadPoolExecutor(READERS) as readers:
-            found = zip(asked, readers.map(length, asked), strict=True)
-            return {key: size for key, size in found if size is not None}
+        listing = self._listing(folder)
+        return {key: listing[f"{folder}/{key}"] for key in keys if f"{folder}/{key}" in listing}
 
     def _listing(self, folder: str) -> dict[str, int]:
         import obstore
 
-        with self.in_words():
-            return self._asked(
-                lambda objects: {
-                    meta["path"]: meta["size"] for page in obstore.list(objects, folder) for meta in page
-                }
-            )
+        return self._answer(
+            lambda objects: {meta["path"]: meta["size"] for page in obstore.list(objects, folder) for meta in page}
+        )
+
+    def flush(self, keys: Iterable[str]) -> None:
+        """A put that was answered is durable."""
 
     def create(self, key: str, content: bytes) -> bool:
         """A conditional put."""
@@ -270,14 +245,16 @@ class Bucket(Location):
     def _put(self, key: str, content: bytes, mode: Literal["create", "overwrite"]) -> bool:
         import obstore
 
-        with self.in_words():
+        def put(objects: Any) -> bool:
             try:
-                self._asked(lambda objects: obstore.put(objects, key, content, mode=mode))
+                obstore.put(objects, key, content, mode=mode)
             except obstore.exceptions.AlreadyExistsError:
                 return False
             except FileNotFoundError as error:  # no object can be missing here, only the bucket
-                raise obstore.exceptions.GenericError(str(error)) from error
-        return True
+                raise obstore.exceptions.BaseError(str(error)) from error
+            return True
+
+        return self._answer(put)
 
     def delete(self, key: str) -> None:
         """One request."""
@@ -291,15 +268,15 @@ class Bucket(Location):
         import obstore
 
         if keys:
-            with self.in_words():
-                self._asked(lambda objects: obstore.delete(objects, keys))
+            self._answer(lambda objects: obstore.delete(objects, keys))
 
     def store(self, folder: str, read_only: bool = False) -> Store:
         """Zarr's own, over obstore; its errors in our words."""
         from zarr.storage import ObjectStore
 
-        store = ObjectStore(self._below(folder), read_only=read_only)
-        return PatientStore(store, self.in_words, _may_pass, PATIENCE.total_seconds())
+        return _PatientStore(ObjectStore(self._below(folder), read_only=read_only), self)
+
+    # -- runs ------------------------------------------------------------------------------------------
 
     def found(self, objects: Mapping[str, bytes], last: str) -> None:
         """One after another, none over another's."""
@@ -312,9 +289,8 @@ class Bucket(Location):
                     f"{self} holds the beginning of a run with another {key}: one of other settings, killed early "
                     "or beginning now in another process. Choose another --out, or remove it"
                 )
-        self.confirm({key: len(content) for key, content in objects.items() if key != last})
         self.check_exclusive(next(key for key in objects if key != last))
-        self.create_record(last, objects[last])
+        self.create(last, objects[last])
 
     @contextmanager
     def held(self, clear: Callable[[], None]) -> Iterator[None]:
@@ -323,12 +299,7 @@ class Bucket(Location):
         yield
 
     @contextmanager
-    def one_at_a_time(self) -> Iterator[None]:
-        """No lock: a second process writes the same bytes once more."""
-        yield
-
-    @contextmanager
-    def tended(self, folder: str) -> Iterator[None]:  # noqa: ARG002 - nothing lies aside in an object store
+    def tended(self, folder: str) -> Iterator[None]:  # noqa: ARG002 - an object store holds no drafts
         """No lock: files of other content have other names, and the last head counts."""
         yield
 
@@ -338,24 +309,113 @@ class Bucket(Location):
 
     @contextmanager
     def rebuilding(self, folder: str, stamp: str) -> Iterator[Store]:
-        """In its final place, which is not read before its stamp is written, and as if nothing were there.
+        """In its final folder, which is not read before its stamp is written, and as if it were empty.
 
         Two processes that build it at once write the same bytes, and neither removes what the other wrote.
         """
-        here = self.derived(folder, stamp)
-        yield BlankStore(self.store(here))
-        self._delete([key for key in self.keys(folder) if not key.startswith(f"{here}/")])
+        final = self.derived(folder, stamp)
+        yield _BlankStore(self.store(final))
+        self._delete([key for key in self.keys(folder) if not key.startswith(f"{final}/")])
 
 
-def _may_pass(error: StoreError) -> bool:
-    """Whether the store failed, and did not refuse."""
-    from obstore.exceptions import GenericError
+def pauses_for(time_to_repeat: timedelta) -> Iterator[float]:
+    """Seconds to wait before every further try, until the time is over."""
+    pause, end = 0.1, time.monotonic() + time_to_repeat.total_seconds()
+    while time.monotonic() + pause <= end:
+        yield pause
+        pause = min(2 * pause, LONGEST_PAUSE)
 
-    return isinstance(error.__cause__, GenericError)
+
+class _PatientStore(WrapperStore[Store]):
+    """A store of Zarr whose errors are those of its bucket, and that waits for them to pass.
+
+    obstore repeats most requests, but not an answer that breaks off. Of Zarr's operations it covers those that
+    `CheckedStore`, `RecordingStore` and `_BlankStore` pass on.
+    """
+
+    def __init__(self, store: Store, bucket: Bucket) -> None:
+        super().__init__(store)
+        self._bucket = bucket
+
+    def _with_store(self, store: Store) -> "_PatientStore":
+        return _PatientStore(store, self._bucket)
+
+    async def _answer[T](self, request: Callable[[], Awaitable[T]]) -> T:
+        from obstore.exceptions import GenericError
+
+        pauses = pauses_for(PATIENCE)
+        with self._bucket.in_words():
+            while True:
+                try:
+                    return await request()
+                except GenericError:
+                    pause = next(pauses, None)
+                    if pause is None:
+                        raise
+                await asyncio.sleep(pause)
+
+    async def get(
+        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """One object or a part of it."""
+        return await self._answer(lambda: self._store.get(key, prototype, byte_range))
+
+    async def get_ranges(
+        self, key: str, byte_ranges: Sequence[ByteRequest | None], *, prototype: BufferPrototype, **how: Any
+    ) -> AsyncIterator[Sequence[tuple[int, Buffer | None]]]:
+        """Parts of one."""
+        with self._bucket.in_words():
+            async for group in super().get_ranges(key, byte_ranges, prototype=prototype, **how):
+                yield group
+
+    async def exists(self, key: str) -> bool:
+        """Whether it exists."""
+        return await self._answer(lambda: self._store.exists(key))
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Write one."""
+        await self._answer(lambda: self._store.set(key, value))
+
+    async def delete(self, key: str) -> None:
+        """Remove one."""
+        await self._answer(lambda: self._store.delete(key))
+
+
+class _BlankStore(WrapperStore[Store]):
+    """A store that shows only what was written through it."""
+
+    def __init__(self, store: Store) -> None:
+        super().__init__(store)
+        self._written: set[str] = set()
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Write one object, which exists from now on."""
+        self._written.add(key)
+        await super().set(key, value)
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """Write one object over any former one."""
+        if key not in self._written:
+            await self.set(key, value)
+
+    async def get(
+        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """One object or a part of it, if it was written here."""
+        return await super().get(key, prototype, byte_range) if key in self._written else None
+
+    async def exists(self, key: str) -> bool:
+        """Whether it was written here."""
+        return key in self._written
+
+    async def delete_dir(self, prefix: str) -> None:
+        """Remove what was written here below `prefix`."""
+        for key in [key for key in self._written if key.startswith(prefix)]:
+            await self.delete(key)
 
 
 class _Ranges(RawIOBase):
-    """What obstore can read of an object here and there, as Python's own file type."""
+    """An object of obstore as Python's own file type, read by ranges."""
 
     def __init__(self, file: "ReadableFile", bucket: Bucket) -> None:
         self._file, self._bucket = file, bucket

@@ -133,7 +133,7 @@ def write_seal(root: Root, commits: Mapping[int, Commit], sums: Mapping[str, Sum
     """Note the hashes of the columns, and the episodes they are of, which makes them count."""
     stamp, objects = stamp_of(commits), {key: one.to_json() for key, one in sums.items()}
     seal = {"run": root.identity, "stamp": stamp, "episodes": sorted(commits), "objects": objects}
-    root.location.write_record(seal_key(stamp), as_record(seal))
+    root.location.write(seal_key(stamp), as_record(seal))
 
 
 def _read_seals(root: Root, commits: Mapping[int, Commit]) -> Iterator[dict[str, Any]]:

@@ -42,7 +42,7 @@ _PROVENANCE = re.compile(r"[0-9a-f]{16}")
 
 def create_once(location: Location, key: str, content: Mapping[str, Any]) -> bool:
     """Write a record under `key` unless it exists; True if this call wrote it. Exclusive and atomic."""
-    return location.create_record(key, as_record(content))
+    return location.create(key, as_record(content))
 
 
 def write_commit(location: Location, number: int, commit: Commit) -> bool:

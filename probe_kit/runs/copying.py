@@ -73,6 +73,6 @@ def _copied_keys(run: Run, arrays: Collection[str], pictures: bool, directions: 
 
 def _write_copy(run: Run, target: Location, keys: Sequence[str], left_out: Collection[str]) -> None:
     for key in keys:
-        target.write_record(key, run.location.read(key))
-    target.write_record(LEFT_OUT_FILE, left_out_record(run.root.identity, left_out))
-    target.write_record(RUN_FILE, run.location.read(RUN_FILE))  # last: without it there is no run
+        target.write(key, run.location.read(key))
+    target.write(LEFT_OUT_FILE, left_out_record(run.root.identity, left_out))
+    target.write(RUN_FILE, run.location.read(RUN_FILE))  # last: without it there is no run

@@ -6,6 +6,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, BinaryIO
@@ -15,32 +16,24 @@ from zarr.storage import LocalStore
 
 from probe_kit._system.drafts import draft_of
 from probe_kit.errors import FULL_DISK, DiskSpaceError, RunDamagedError, SettingsMismatchError
-from probe_kit.runs.layout import (
-    CERTIFICATES,
-    COLUMNS,
-    COMMITS,
-    DATA,
-    FAILED,
-    FRAMES,
-    PLANS,
-    PROVENANCE,
-    RUN_FILE,
-    SEALED,
-    TIMES,
-    VIDEOS,
-)
+from probe_kit.runs.layout import DATA, RUN_FILE
 from probe_kit.runs.location import Location, check_size
 
-# What a killed process leaves: objects and columns that never got their final name.
-_WRITTEN_ASIDE = (PLANS, COMMITS, TIMES, FAILED, CERTIFICATES, PROVENANCE, SEALED, FRAMES, VIDEOS)
-_ORPHANS = ("*.tmp", *(f"{folder}/*.tmp" for folder in _WRITTEN_ASIDE), f"{DATA}/**/*.partial")
+_DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.partial")
+"""Patterns of what a killed process leaves: objects and columns without their final name."""
 _PIECE = 1 << 20
-_TRIES = 5
+_TRIES = 50
 """Times that a file is written whose folder another process clears or removes meanwhile."""
+_FLUSHERS = 16
+"""Files that are flushed at once, so that the file system writes its journal once for many."""
 
 
 class Folder(Location):
-    """A folder on a file system that knows hard links and `flock`."""
+    """A folder on a file system that knows hard links and `flock`.
+
+    Zarr's own `LocalStore` reads and writes the arrays: the object_store library takes twice the processor time to
+    read them (docs/notes/storage.md).
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -69,8 +62,8 @@ class Folder(Location):
 
     def free_bytes(self) -> int:
         """Of the disk where the folder lies or will lie."""
-        there = next(p for p in (self._path, *self._path.resolve().parents) if p.exists())
-        return shutil.disk_usage(there).free
+        existing = next(p for p in (self._path, *self._path.resolve().parents) if p.exists())
+        return shutil.disk_usage(existing).free
 
     @contextmanager
     def in_words(self) -> Iterator[None]:
@@ -86,8 +79,10 @@ class Folder(Location):
                 "kept. Free some space, then the same command continues"
             ) from error
 
+    # -- objects ---------------------------------------------------------------------------------------
+
     def exists(self, key: str) -> bool:
-        """Whether the file is there."""
+        """Whether the file exists."""
         return _inside(key) and (self._path / key).is_file()
 
     def read(self, key: str) -> bytes:
@@ -109,11 +104,11 @@ class Folder(Location):
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
         """One file after another."""
-        found = {}
+        contents = {}
         for path in sorted((self._path / folder).glob(f"*{suffix}")):
             with suppress(FileNotFoundError):  # no plain file, or removed since: seals and failures come and go
-                found[path.name] = self.read(f"{folder}/{path.name}")
-        return found
+                contents[path.name] = self.read(f"{folder}/{path.name}")
+        return contents
 
     def keys(self, folder: str) -> list[str]:
         """Every file."""
@@ -125,41 +120,39 @@ class Folder(Location):
         paths = {key: self._path / folder / key for key in keys if _inside(key)}
         return {key: path.stat().st_size for key, path in paths.items() if path.is_file()}
 
-    def confirm(self, lengths: Mapping[str, int]) -> None:
-        """A file system says so itself when it is written."""
+    def flush(self, keys: Iterable[str]) -> None:
+        """By `fsync` of each file, many at once."""
+        with ThreadPoolExecutor(_FLUSHERS) as threads:
+            list(threads.map(_flush, [self._path / key for key in keys]))
 
     def create(self, key: str, content: bytes) -> bool:
-        """Written aside, flushed to the disk, then linked to its name."""
-        path = self._place(key)
-        for left in reversed(range(_TRIES)):
-            try:
-                path.parent.mkdir(exist_ok=True)
-                with _written_aside(path, content, flush=True) as aside:
-                    os.link(aside, path)
-                return True
-            except FileExistsError:
-                return False
-            except FileNotFoundError:
-                if not left:  # before: another process began to write here, and cleared what was written aside
-                    raise
-        return False
+        """Linked to its name, which only one process can."""
+        try:
+            self._put(key, content, os.link)
+        except FileExistsError:
+            return False
+        return True
 
     def write(self, key: str, content: bytes) -> None:
-        """Written aside, then renamed."""
-        path = self._place(key)
+        """Renamed to its name."""
+        self._put(key, content, os.replace)
+
+    def _put(self, key: str, content: bytes, give_name: Callable[[Path, Path], None]) -> None:
+        """Write a draft in the same folder, flush it to the disk, and give it its name."""
+        path = self._inner(key)
         for left in reversed(range(_TRIES)):
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with _written_aside(path, content, flush=False) as aside:
-                    aside.replace(path)
+                with _draft(path, content) as draft:
+                    give_name(draft, path)
                 return
-            except (FileNotFoundError, FileExistsError):
-                if not left:  # before: another process was done with the same work, and removed the folder
+            except FileNotFoundError:
+                if not left:  # before: another process cleared the drafts here, or removed the folder
                     raise
 
     def delete(self, key: str) -> None:
         """The file."""
-        self._place(key).unlink(missing_ok=True)
+        self._inner(key).unlink(missing_ok=True)
 
     def remove(self, folder: str) -> None:
         """The folder and all in it."""
@@ -169,13 +162,34 @@ class Folder(Location):
         """Plain files."""
         return LocalStore(self._path / folder, read_only=read_only)
 
+    def _object(self, key: str) -> Path:
+        """The path of an object. Raises FileNotFoundError for what is no plain file, or not in the folder.
+
+        Records of others may name a device, a pipe, which never ends, or a file outside the run.
+        """
+        path = self._path / key
+        if not (_inside(key) and path.is_file()):
+            raise FileNotFoundError(errno.ENOENT, "no file of the run", str(path))
+        return path
+
+    def _inner(self, key: str) -> Path:
+        """The path to write or remove. Raises RunDamagedError for a key that leads out of the folder."""
+        if not _inside(key):
+            raise RunDamagedError(
+                f"{self}: a record of this run names {key!r}, which leads out of its folder; probe_kit writes no "
+                "such name. Take the run from where it was made"
+            )
+        return self._path / key
+
+    # -- runs ------------------------------------------------------------------------------------------
+
     def found(self, objects: Mapping[str, bytes], last: str) -> None:
-        """The folder is made aside and renamed, so that it appears whole or not at all."""
+        """Made as a draft and renamed, so that the folder appears with all objects or not at all."""
         with draft_of(self._path) as draft:
             try:
                 for key, content in objects.items():
                     (draft / key).parent.mkdir(parents=True, exist_ok=True)
-                    with _written_aside(draft / key, content, flush=True) as file:
+                    with _draft(draft / key, content) as file:
                         file.rename(draft / key)
                 draft.rename(self._path)
             except OSError as error:
@@ -193,53 +207,20 @@ class Folder(Location):
         """
         with (self._path / RUN_FILE).open("rb") as file:
             if _alone(file):
-                self._clear_orphans()
+                self._clear_drafts()
                 clear()
             fcntl.flock(file, fcntl.LOCK_SH)
             yield
             if _alone(file):
-                self._clear_orphans()
+                self._clear_drafts()
 
-    def _object(self, key: str) -> Path:
-        """Where an object lies. Raises FileNotFoundError for what is no plain file, or not in the folder.
-
-        Records of others may name a device, a pipe, which never ends, or a file outside the run.
-        """
-        path = self._path / key
-        if not (_inside(key) and path.is_file()):
-            raise FileNotFoundError(errno.ENOENT, "no file of the run", str(path))
-        return path
-
-    def _place(self, key: str) -> Path:
-        """Where an object is written or removed. Raises RunDamagedError for a key that leads out of the folder."""
-        if not _inside(key):
-            raise RunDamagedError(
-                f"{self}: a record of this run names {key!r}, which leads out of its folder; probe_kit writes no "
-                "such name. Take the run from where it was made"
-            )
-        return self._path / key
-
-    def _clear_orphans(self) -> None:
-        for pattern in _ORPHANS:
-            for orphan in self._path.glob(pattern):
-                if orphan.is_dir():
-                    shutil.rmtree(orphan)
+    def _clear_drafts(self) -> None:
+        for pattern in _DRAFTS:
+            for draft in self._path.glob(pattern):
+                if draft.is_dir():
+                    shutil.rmtree(draft)
                 else:
-                    orphan.unlink()
-
-    @contextmanager
-    def one_at_a_time(self) -> Iterator[None]:
-        """By locks; also that of the run, so that no process removes the work as a leftover."""
-        turn = os.open(self._path / DATA, os.O_RDONLY)  # a folder that is never exchanged
-        try:
-            with (self._path / RUN_FILE).open("rb") as run:
-                fcntl.flock(run, fcntl.LOCK_SH)
-                fcntl.flock(turn, fcntl.LOCK_EX)
-                for leftover in self._path.glob(f"{COLUMNS}*.tmp"):  # of a killed seal: a live one holds this lock
-                    shutil.rmtree(leftover, ignore_errors=True)
-                yield
-        finally:
-            os.close(turn)
+                    draft.unlink()
 
     @contextmanager
     def tended(self, folder: str) -> Iterator[None]:
@@ -262,15 +243,15 @@ class Folder(Location):
 
     @contextmanager
     def rebuilding(self, folder: str, stamp: str) -> Iterator[Store]:
-        """Aside; then renamed, so that a crash leaves the old group or none."""
-        aside = self._path / f"{folder}{secrets.token_hex(8)}.tmp"
-        aside.mkdir()
+        """A draft, then renamed, so that a crash leaves the old group or none."""
+        draft = self._path / f"{folder}{secrets.token_hex(8)}.tmp"
+        draft.mkdir()
         try:
-            yield LocalStore(aside)
+            yield LocalStore(draft)
             self.remove(folder)
-            aside.rename(self._path / self.derived(folder, stamp))
+            draft.rename(self._path / self.derived(folder, stamp))
         finally:
-            shutil.rmtree(aside, ignore_errors=True)
+            shutil.rmtree(draft, ignore_errors=True)
 
 
 def _inside(key: str) -> bool:
@@ -287,18 +268,25 @@ def _alone(file: IO[bytes]) -> bool:
     return True
 
 
+def _flush(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
 @contextmanager
-def _written_aside(path: Path, content: bytes, flush: bool) -> Iterator[Path]:
-    """A file of this content beside `path`, gone afterwards; on the disk already if it was flushed."""
-    aside = path.with_name(f"{secrets.token_hex(8)}.tmp")
+def _draft(path: Path, content: bytes) -> Iterator[Path]:
+    """A file of this content in the folder of `path`, already on the disk; gone afterwards."""
+    draft = path.with_name(f"{secrets.token_hex(8)}.tmp")
     # Who may read a run is a matter of the umask; tempfile would keep it from the others of a group.
-    handle = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
-            if flush:
-                file.flush()
-                os.fsync(file.fileno())
-        yield aside
+            file.flush()
+            os.fsync(file.fileno())
+        yield draft
     finally:
-        aside.unlink(missing_ok=True)
+        draft.unlink(missing_ok=True)

@@ -22,7 +22,7 @@ def label_run(path: Path | str | Location, label: str) -> None:
     """
     root = read_root(locate(path))
     check_label(label)
-    root.location.write_record(LABEL_FILE, label_record(root.identity, label))
+    root.location.write(LABEL_FILE, label_record(root.identity, label))
 
 
 def check_label(label: str) -> None:

@@ -1,8 +1,8 @@
 """A location: the folder or object-store prefix of a run, and the operations that a run needs.
 
 Everything in a run is an object with a key such as `commits/00000003.json`. All reads and writes of objects go
-through its location; differences between folders and object stores (locks, renaming, free space) are handled
-in `folder` and `bucket` only.
+through its location; differences between folders and object stores (locks, renaming, free space, flushing) are
+handled in `folder` and `bucket` only.
 """
 
 from abc import ABC, abstractmethod
@@ -16,7 +16,7 @@ from zarr.abc.store import Store
 from probe_kit.errors import RunDamagedError, StoreError
 
 MOST_RECORD_BYTES, MOST_OBJECT_BYTES = 256 << 20, 4 << 30
-"""The largest record, and the largest other object, that is read whole."""
+"""The largest record, and the largest other object, that is read at once."""
 
 
 def check_size(key: str, size: int, where: object) -> None:
@@ -45,7 +45,7 @@ class Location(ABC):
     @property
     @abstractmethod
     def address(self) -> str:
-        """What `locate` finds the same location by in another process, whatever its working directory."""
+        """The text by which `locate` finds the same location in another process, in any working directory."""
 
     @abstractmethod
     def beside(self, name: str) -> Path:
@@ -81,7 +81,7 @@ class Location(ABC):
 
     @abstractmethod
     def open(self, key: str) -> BinaryIO:
-        """One object as a file that can be read here and there. Raises FileNotFoundError."""
+        """One object as a file with random access. Raises FileNotFoundError."""
 
     @abstractmethod
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
@@ -93,44 +93,19 @@ class Location(ABC):
 
     @abstractmethod
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
-        """Bytes of the objects `keys` below `folder`, as far as they are there."""
+        """Bytes of the objects `keys` below `folder`, as far as they exist."""
 
     @abstractmethod
-    def confirm(self, lengths: Mapping[str, int]) -> None:
-        """Ask once more whether these objects, just written, are there, each of so many bytes.
-
-        Called before anything is written that names them. Raises StoreError.
-        """
+    def flush(self, keys: Iterable[str]) -> None:
+        """Bring these objects, just written by Zarr, onto the disk. Called before a record names them."""
 
     @abstractmethod
     def create(self, key: str, content: bytes) -> bool:
-        """Write an object unless it exists; True if this call wrote it. Whole or not at all, and durable."""
+        """Write an object unless it exists; True if this call wrote it. Complete or not at all, and durable."""
 
     @abstractmethod
     def write(self, key: str, content: bytes) -> None:
-        """Write an object over whatever is there. Whole or not at all."""
-
-    def create_record(self, key: str, record: bytes) -> bool:
-        """`create`, of what nothing written later confirms.
-
-        Raises StoreError, and leaves nothing, if the store kept a part of it only.
-        """
-        created = self.create(key, record)
-        if created:
-            self._ascertain(key, record)
-        return created
-
-    def write_record(self, key: str, record: bytes) -> None:
-        """`write`, in the same way."""
-        self.write(key, record)
-        self._ascertain(key, record)
-
-    def _ascertain(self, key: str, record: bytes) -> None:
-        try:
-            self.confirm({key: len(record)})
-        except StoreError:
-            self.delete(key)
-            raise
+        """Write an object over any former one. Complete or not at all, and durable."""
 
     def check_exclusive(self, key: str) -> None:
         """Raise StoreError unless a second `create` of the object `key` is refused, on which commits rely."""
@@ -142,7 +117,7 @@ class Location(ABC):
 
     @abstractmethod
     def delete(self, key: str) -> None:
-        """Remove one object, if it is there."""
+        """Remove one object, if it exists."""
 
     @abstractmethod
     def remove(self, folder: str) -> None:
@@ -150,7 +125,7 @@ class Location(ABC):
 
     @abstractmethod
     def store(self, folder: str, read_only: bool = False) -> Store:
-        """What Zarr calls a store, for the group or array that lies in `folder`."""
+        """Return Zarr's store for the group or array that lies in `folder`."""
 
     # -- runs ------------------------------------------------------------------------------------------
 
@@ -166,17 +141,13 @@ class Location(ABC):
         """Lock the run while the body runs. A process that is alone first calls `clear` to remove leftovers."""
 
     @abstractmethod
-    def one_at_a_time(self) -> AbstractContextManager[None]:
-        """Processes that want to do the same derived work take turns."""
-
-    @abstractmethod
     def tended(self, folder: str) -> AbstractContextManager[None]:
-        """Processes that write right into `folder` take turns; what killed ones left aside there is removed."""
+        """Let processes that work on `folder` take turns; drafts of killed ones in it are removed."""
 
     @abstractmethod
     def derived(self, folder: str, stamp: str) -> str:
-        """Where the group derived from `stamp` lies that belongs to `folder`."""
+        """The folder of the group derived from `stamp` that belongs to `folder`."""
 
     @abstractmethod
     def rebuilding(self, folder: str, stamp: str) -> AbstractContextManager[Store]:
-        """A store to build that group in; it replaces those of other stamps when the body is left."""
+        """Return a store to build that group in; it replaces those of other stamps when the body is left."""

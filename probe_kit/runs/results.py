@@ -164,21 +164,19 @@ def _write_bundle(
 ) -> None:
     before = read_bundle(location, home, key) if location.exists(f"{home}/{key}/{HEAD}") else None
     kept = dict(before.files) if before else {}
-    named, written = dict(kept), dict[str, int]()
+    named = dict(kept)
     for name, content in files.items():
         known = Sum.of(content)
         if name not in kept or kept[name][1] != known:
             actual = name if before is None else _renamed(name, known)
             location.write(f"{home}/{key}/{actual}", content)
-            written[f"{home}/{key}/{actual}"] = known.length
             named[name] = actual, known
-    location.confirm(written)
     stored = {name: [actual, *known.to_json()] for name, (actual, known) in named.items()}
     whose = {"key": key, "run": _identity(location)}
-    location.write_record(f"{home}/{key}/{TIMES}", as_record({**times, **whose}))
+    location.write(f"{home}/{key}/{TIMES}", as_record({**times, **whose}))
     record = as_record({**head, **whose, "files": stored})
     if before is None or location.read(f"{home}/{key}/{HEAD}") != record:
-        location.write_record(f"{home}/{key}/{HEAD}", record)
+        location.write(f"{home}/{key}/{HEAD}", record)
     for name, (actual, _) in kept.items():
         if named[name][0] != actual:
             location.delete(f"{home}/{key}/{actual}")

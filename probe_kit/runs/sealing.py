@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.runs.arrays import codecs
 from probe_kit.runs.columns import STAMP_DIGITS, seal_key, write_seal
-from probe_kit.runs.layout import COLUMNS, SEALED, StoredStream, VectorKind
+from probe_kit.runs.layout import COLUMNS, DATA, SEALED, StoredStream, VectorKind
 from probe_kit.runs.recording import RecordingStore
 from probe_kit.runs.rows import Rows
 from probe_kit.runs.run import Run, read_run
@@ -31,7 +31,7 @@ def seal(path: Path | str | Location) -> bool:
     once take turns, and all but the first find it done.
     """
     location = Run(locate(path)).location
-    with location.one_at_a_time():
+    with location.held(lambda: None), location.tended(DATA):  # a folder that is never exchanged
         return _seal(read_run(location))
 
 
@@ -52,8 +52,8 @@ def _seal(run: Run) -> bool:
                 _write_vectors(run, name, kind, group)
             _write_roles(run, name, group)
         group.attrs["stamp"] = run.stamp
-        folder = run.location.derived(COLUMNS, run.stamp)
-        run.location.confirm({f"{folder}/{key}": one.length for key, one in store.sums.items()})
+    folder = run.location.derived(COLUMNS, run.stamp)
+    run.location.flush(f"{folder}/{key}" for key in store.sums)
     commits = {commit["episode"]: commit for commit in run.commits()}
     write_seal(run.root, commits, store.sums)  # what makes them count, so last
     return True

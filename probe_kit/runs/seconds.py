@@ -40,9 +40,7 @@ def seconds_key(number: int) -> str:
 def write_seconds(root: Root, number: int, seconds: Seconds) -> None:
     """Store them; those of an earlier try of the episode are replaced."""
     rounded = {name: round(value, 6) for name, value in asdict(seconds).items()}
-    root.location.write_record(
-        seconds_key(number), as_record({"run": root.identity, "episode": number, **rounded})
-    )
+    root.location.write(seconds_key(number), as_record({"run": root.identity, "episode": number, **rounded}))
 
 
 def read_seconds(root: Root, commits: Mapping[int, Commit]) -> dict[int, Seconds]:

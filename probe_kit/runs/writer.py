@@ -202,11 +202,11 @@ class RunWriter[PlanT: WrittenPlan]:
         """The root, once the run plans all of this writer's episodes and has room for them. Room is only added."""
         root = read_root(self.location)
         while self._lacks(root):
-            self.location.create_record(plan_key(len(root.stored_plan.extents)), self._record(root))
+            self.location.create(plan_key(len(root.stored_plan.extents)), self._record(root))
             root = read_root(self.location)  # ours, or that of a process that was first
         while root.narrow:
             for key, content in root.widened().items():
-                self.location.write_record(key, content)
+                self.location.write(key, content)
             root = read_root(self.location)  # another process may have let it grow further
         return root
 
@@ -296,7 +296,7 @@ class RunWriter[PlanT: WrittenPlan]:
         with self.location.tended(COMMITS):
             theirs = read_commit(self.root, episode.planned.index, key, self.location.read(key))
             if any(theirs[part] != commit[part] for part in ("objects", "pictures")):
-                self.location.write_record(key, as_record(self._write_objects(episode)))
+                self.location.write(key, as_record(self._write_objects(episode)))
 
     def _write_objects(self, episode: EpisodeRecord) -> Commit:
         """Everything of an episode but its commit, which is returned."""
@@ -316,8 +316,7 @@ class RunWriter[PlanT: WrittenPlan]:
         for key, content in episode.pictures.items():
             self.location.write(key, content)
         pictures = {key: Sum.of(content) for key, content in episode.pictures.items()}
-        written = {**{f"{DATA}/{key}": one for key, one in store.sums.items()}, **pictures}
-        self.location.confirm({key: one.length for key, one in written.items()})
+        self.location.flush(f"{DATA}/{key}" for key in store.sums)
         return {
             "run": self.root.identity,
             "episode": planned.index,

@@ -163,7 +163,7 @@ class Ledger:
             after = before.model_copy(update=changes)
             if after != before:
                 record = as_record(after.model_dump(mode="json"))
-                self._location.write_record(f"{FOLDER}/{name_of(cell)}.json", record)
+                self._location.write(f"{FOLDER}/{name_of(cell)}.json", record)
 
     def speeds(self) -> dict[str, Speed]:
         """What was measured on this machine."""
@@ -176,7 +176,7 @@ class Ledger:
         """Keep what was measured on this machine."""
         with self.opened():
             record = Speeds(machine=machine_name(), models={**self.speeds(), name: speed})
-            self._location.write_record(_speeds_key(), as_record(record.model_dump(mode="json")))
+            self._location.write(_speeds_key(), as_record(record.model_dump(mode="json")))
 
     @contextmanager
     def opened(self) -> Iterator[None]:

@@ -19,8 +19,8 @@ from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.runs.layout import COMMITS
 from probe_kit.runs.store import locate
 from probe_kit.suite import build_suite
-from tests.extract.contents import objects
 from tests.extract.two_nodes import TwoNodes, two_nodes, wait_for
+from tests.runs.contents import objects
 
 
 def test_without_ray_the_error_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

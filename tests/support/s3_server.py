@@ -15,9 +15,7 @@ from pathlib import Path
 from random import Random
 from threading import Event, Thread
 from typing import Any, NoReturn
-from urllib.parse import parse_qs
 from urllib.request import Request, urlopen
-from xml.etree import ElementTree
 
 import pytest
 
@@ -115,8 +113,7 @@ def without_conditions(app: App) -> App:
 class Unreliable:
     """The same server on a bad day: `ail` says of every request what happens to it, None for nothing.
 
-    Every other answer is the name of a method here. seen: how often each happened. lag: so many of the newest keys
-    a stale listing misses; those that were deleted it shows.
+    Every other answer is the name of a method here. seen: how often each happened.
     """
 
     def __init__(self, app: App) -> None:
@@ -124,14 +121,8 @@ class Unreliable:
         self.ail: Callable[[str, str], str | None] = lambda _method, _path: None
         self.seen: Counter[str] = Counter()
         self.over = Event()
-        self.lag = 0
-        self._put: dict[str, int] = {}
 
     def __call__(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
-        if environ["REQUEST_METHOD"] == "PUT":
-            key = environ["PATH_INFO"].removeprefix(f"/{BUCKET}/")
-            self._put.pop(key, None)
-            self._put[key] = _length(environ)
         ill = None if "HTTP_X_TRUSTED" in environ else self.ail(environ["REQUEST_METHOD"], environ["PATH_INFO"])
         if ill is None:
             return self._app(environ, start_response)
@@ -170,39 +161,6 @@ class Unreliable:
         """Accepts the request and does not answer until the end."""
         self.over.wait()
         return _hang_up(environ)
-
-    def half(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
-        """It keeps half of what it is given and says that all is well."""
-        environ["CONTENT_LENGTH"] = str(_length(environ) // 2)
-        return self._app(environ, start_response)
-
-    def stale(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
-        """Its listing is that of a moment ago; what is no listing is answered."""
-        query = parse_qs(environ["QUERY_STRING"])
-        if "list-type" not in query:
-            return self._app(environ, start_response)
-        said: list[Any] = []
-        root = ElementTree.fromstring(b"".join(self._app(environ, lambda *given: said.extend(given))))
-        space = root.tag.partition("}")[0] + "}"
-        entries = {str(one.findtext(f"{space}Key")): one for one in root.findall(f"{space}Contents")}
-        for key in list(self._put)[-self.lag :] if self.lag else ():
-            if key in entries:
-                root.remove(entries[key])
-        for key in self._put.keys() - entries.keys():
-            if key.startswith(query.get("prefix", [""])[0]):
-                root.append(_listed(space, key, self._put[key]))
-        content = ElementTree.tostring(root)
-        headers = [(name, own) for name, own in said[1] if name.lower() != "content-length"]
-        start_response(said[0], [*headers, ("Content-Length", str(len(content)))])
-        return [content]
-
-
-def _listed(space: str, key: str, size: int) -> ElementTree.Element:
-    entry = ElementTree.Element(f"{space}Contents")
-    fields = {"Key": key, "Size": str(size), "ETag": '"0"', "LastModified": "2026-01-01T00:00:00.000Z"}
-    for name, value in fields.items():
-        ElementTree.SubElement(entry, f"{space}{name}").text = value
-    return entry
 
 
 class BadServer(S3Server):

@@ -18,7 +18,7 @@ from probe_kit.runs.layout import COLUMNS
 from probe_kit.runs.store import Location, locate
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import load_results, train_probes
-from tests.extract.contents import objects
+from tests.runs.contents import objects
 
 KILLING = Path(__file__).with_name("killing.py")
 SHORT = SceneSpec(max_steps=2)

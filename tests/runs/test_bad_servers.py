@@ -23,7 +23,7 @@ from probe_kit.runs.run import NotSealedWarning
 from probe_kit.runs.store import locate
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
-from tests.extract.contents import objects
+from tests.runs.contents import objects
 from tests.support.little_run import episode, little_plan, little_writer
 from tests.support.s3_server import BadServer, now_and_then
 
@@ -144,47 +144,6 @@ def test_a_server_that_dies_and_returns_is_waited_for(
     assert objects(run) == whole
 
 
-@pytest.mark.slow
-def test_nothing_is_committed_that_the_server_kept_only_in_part(
-    suite: Suite, whole: dict[str, bytes], bad_server: BadServer
-) -> None:
-    run = f"{bad_server.url}/run"
-    seen = []
-
-    def ail(method: str, path: str) -> str | None:
-        torn = method == "PUT" and "/data.zarr/" in path and "/c/1/" in path and "tokens" in path
-        seen.append(torn)
-        return "half" if torn else None
-
-    bad_server.day.ail = ail
-    with pytest.raises(StoreError, match=r"confirmed .*tokens/c/1/.* and holds"):
-        write(run, suite)
-    assert any(seen)
-    assert verify_run(run, deep=True).ok
-    assert verify_run(run).committed == 1
-    bad_server.day.ail = lambda method, path: "half" if method == "PUT" and "/columns.zarr/" in path else None
-    with pytest.raises(StoreError, match=r"confirmed .*columns\.zarr/.* and holds"):
-        write(run, suite)
-    bad_server.day.ail = lambda *_: None
-    assert not open_run(run).sealed
-    write(run, suite)
-    assert objects(run) == whole
-
-
-@pytest.mark.slow
-def test_a_record_that_the_server_never_keeps_whole_is_an_error_and_gone(
-    suite: Suite, whole: dict[str, bytes], bad_server: BadServer
-) -> None:
-    run = f"{bad_server.url}/run"
-    bad_server.day.ail = lambda method, path: "half" if method == "PUT" and "/commits/" in path else None
-    with pytest.raises(StoreError, match=r"confirmed .*commits/00000000\.json.* and holds"):
-        write(run, suite)
-    bad_server.day.ail = lambda *_: None
-    assert verify_run(run, deep=True).committed == 0
-    write(run, suite)
-    assert objects(run) == whole
-
-
 @pytest.fixture
 def kept(little_runs: Path, bad_server: BadServer) -> Run:
     """A run with probes on a server that was well when it was made."""
@@ -271,7 +230,7 @@ def test_a_third_of_all_requests_failing_changes_no_byte(
     monkeypatch.setenv("AWS_TIMEOUT", "1s")
     run = f"{bad_server.url}/run"
     open_nothing(bad_server)
-    bad_server.day.ail = now_and_then((*TRANSIENT, "half", "silent"), 0.33, seed)
+    bad_server.day.ail = now_and_then((*TRANSIENT, "silent"), 0.33, seed)
     errors = []
     for _ in range(100):
         try:
