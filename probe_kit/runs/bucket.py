@@ -238,7 +238,7 @@ class Bucket(Location):
         """A conditional put."""
         return self._put(key, content, "create")
 
-    def write(self, key: str, content: bytes) -> None:
+    def write(self, key: str, content: bytes, durable: bool = True) -> None:  # noqa: ARG002 - always
         """A put."""
         self._put(key, content, "overwrite")
 

@@ -22,7 +22,7 @@ from probe_kit.runs.location import Location, check_size
 _DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.partial")
 """Patterns of what a killed process leaves: objects and columns without their final name."""
 _PIECE = 1 << 20
-_TRIES = 50
+_TRIES = 5
 """Times that a file is written whose folder another process clears or removes meanwhile."""
 _FLUSHERS = 16
 """Files that are flushed at once, so that the file system writes its journal once for many."""
@@ -133,17 +133,19 @@ class Folder(Location):
             return False
         return True
 
-    def write(self, key: str, content: bytes) -> None:
+    def write(self, key: str, content: bytes, durable: bool = True) -> None:
         """Renamed to its name."""
-        self._put(key, content, os.replace)
+        self._put(key, content, os.replace, durable)
 
-    def _put(self, key: str, content: bytes, give_name: Callable[[Path, Path], None]) -> None:
-        """Write a draft in the same folder, flush it to the disk, and give it its name."""
+    def _put(
+        self, key: str, content: bytes, give_name: Callable[[Path, Path], None], durable: bool = True
+    ) -> None:
+        """Write a draft in the same folder, flush it to the disk if it is to be durable, and give it its name."""
         path = self._inner(key)
         for left in reversed(range(_TRIES)):
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                with _draft(path, content) as draft:
+                with _draft(path, content, durable) as draft:
                     give_name(draft, path)
                 return
             except FileNotFoundError:
@@ -277,16 +279,17 @@ def _flush(path: Path) -> None:
 
 
 @contextmanager
-def _draft(path: Path, content: bytes) -> Iterator[Path]:
-    """A file of this content in the folder of `path`, already on the disk; gone afterwards."""
+def _draft(path: Path, content: bytes, durable: bool = True) -> Iterator[Path]:
+    """A file of this content in the folder of `path`, already on the disk if durable; gone afterwards."""
     draft = path.with_name(f"{secrets.token_hex(8)}.tmp")
     # Who may read a run is a matter of the umask; tempfile would keep it from the others of a group.
     handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+            if durable:
+                file.flush()
+                os.fsync(file.fileno())
         yield draft
     finally:
         draft.unlink(missing_ok=True)

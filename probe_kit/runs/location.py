@@ -104,8 +104,8 @@ class Location(ABC):
         """Write an object unless it exists; True if this call wrote it. Complete or not at all, and durable."""
 
     @abstractmethod
-    def write(self, key: str, content: bytes) -> None:
-        """Write an object over any former one. Complete or not at all, and durable."""
+    def write(self, key: str, content: bytes, durable: bool = True) -> None:
+        """Write an object over any former one. Complete or not at all; durable unless it can be made again."""
 
     def check_exclusive(self, key: str) -> None:
         """Raise StoreError unless a second `create` of the object `key` is refused, on which commits rely."""

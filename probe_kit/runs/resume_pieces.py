@@ -60,7 +60,7 @@ class Pieces:
         with ZipFile(file, "a") as archive:
             archive.comment = bytes(_HEX)  # a zip file may end in a comment: that is where the hash goes
         content = file.getvalue()[:-_HEX]
-        self.run.write(self._key(name), content + self._bound(content, name))
+        self.run.write(self._key(name), content + self._bound(content, name), durable=False)
 
     def discard(self) -> None:
         """Remove everything: the work is complete."""
