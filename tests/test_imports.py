@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[1] / "probe_kit"
 GRAPH = import_graph(PACKAGE)
 
 TOP = {"__init__", "__main__", "cli", "doctor", "doctor_command"}
-BASE = {path.stem for path in PACKAGE.glob("*.py")} - TOP | {"_terminal", "_system", "_execution"}
+BASE = {path.stem for path in PACKAGE.glob("*.py")} - TOP | {"_terminal", "_system", "_execution", "_tables"}
 FOLDERS = {
     **dict.fromkeys(BASE, BASE),
     "statistics": BASE,

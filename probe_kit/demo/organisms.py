@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
+from probe_kit._tables.numbers import number, percent
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.extract.protocols import scene_of
 from probe_kit.extract.vqa.templates import TEMPLATES
@@ -19,7 +20,7 @@ from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.columns.columns import FOLLOWS, MARGIN
 from probe_kit.retention.columns.sentences import readable, verdict
-from probe_kit.retention.columns.text import exceeds_text, number, percent, retention_value
+from probe_kit.retention.columns.text import exceeds_text, retention_value
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes

@@ -12,8 +12,8 @@ from probe_kit.retention import command_options as own
 from probe_kit.retention.label_commands import save_all, say_report
 
 if TYPE_CHECKING:
+    from probe_kit._tables.table import Table
     from probe_kit.retention.choices import Family, Section, TableFormat
-    from probe_kit.retention.formats.numbers_table import NumbersTable
     from probe_kit.retention.table import RetentionTable
     from probe_kit.train.data.run_reader import RunReader
 
@@ -130,10 +130,10 @@ def retention(
         _print_sections(table, style, details)
 
 
-def _print(table: "RetentionTable | NumbersTable", style: "TableFormat", notes: Sequence[str]) -> None:
+def _print(table: "RetentionTable | Table", style: "TableFormat", notes: Sequence[str]) -> None:
     """Print a table in a format, and its notes beside it, where a program does not read them."""
     if style == "table":
-        out.print(table.to_rich())
+        out.print(table)
     else:
         show = print_json_text if style == "json" else print_text
         show(getattr(table, f"to_{style}")())

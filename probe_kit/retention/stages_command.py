@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probe_kit._terminal.console import out, print_json, say
+from probe_kit._terminal.console import marked, out, print_json, say
 from probe_kit.errors import NoProbesError, UsageError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def show_stages(
     Raises UsageError for other runs or views, and what `match_runs` raises.
     """
     from probe_kit.retention.behaviour.vlm_answers import scored
-    from probe_kit.retention.columns.known_used_table import rich_known_used
+    from probe_kit.retention.columns.comparisons import known_used_tables
     from probe_kit.retention.compare.known_used import match_runs
     from probe_kit.runs import open_run
     from probe_kit.train import load_results
@@ -54,7 +54,10 @@ def show_stages(
     if as_json:
         print_json(joined.to_json())
     else:
-        out.print(rich_known_used(joined))
+        for table in known_used_tables(joined):
+            out.print(table)
+        for note in joined.notes:
+            out.print(marked("[yellow]{}[/]", note))
     if figures is not None:
         _save(joined, figures)
 

@@ -5,6 +5,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
 from probe_kit._system.csv_text import csv_of_frame
+from probe_kit._system.markdown_text import markdown_safe
+from probe_kit._tables.table import Table
+from probe_kit._terminal.local_paths import without_places
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
 from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
@@ -15,8 +18,10 @@ from probe_kit.retention.behaviour.vlm_answers import ask_of, left_out, scored
 from probe_kit.retention.behaviour.wordings import WordingPair, correct_wordings, wording_pairs
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import averaged_fields
-from probe_kit.retention.columns.summary import RunSummary, summarise_runs
-from probe_kit.retention.columns.text_table import TextTable, size_table, vlm_vla_tables
+from probe_kit.retention.columns.comparisons import size_table, vlm_vla_tables, wording_tables
+from probe_kit.retention.columns.summary import RunSummary, summarise_runs, summary_table
+from probe_kit.retention.columns.tables import retention_tables
+from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.compare.pairing import PairedRuns, compare_groups, compare_runs
 from probe_kit.retention.compare.vlm_vla import VlmVlaDifference, vlm_vla_differences
@@ -36,8 +41,6 @@ from probe_kit.train.results.store import is_current, load_results
 if TYPE_CHECKING:
     import pandas as pd
     from rich.console import Group
-
-    from probe_kit.retention.formats.numbers_table import NumbersTable
 
 
 @dataclass(frozen=True, repr=False)
@@ -64,14 +67,19 @@ class RetentionTable:
     unpaired: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        from probe_kit.retention.formats.notebook import table_text
-
-        return table_text(self.rows)
+        categories = len({row.category for row in self.rows})
+        models = ", ".join(dict.fromkeys(map(model_name, self.rows))) or "no runs"
+        return f"<RetentionTable of {models}: {categories} categories; print(table.to_markdown()) shows it>"
 
     def _repr_html_(self) -> str:
-        from probe_kit.retention.formats.notebook import table_html
+        """The summary with its sentences, and folded below it the tables; pointing at a heading explains it."""
+        from markupsafe import Markup
 
-        return table_html(self.all_rows, self.differences)
+        sentences = Markup("").join(Markup("<li>{}</li>").format(without_places(one)) for one in self._sentences())
+        tables = [table for title, table in self._tables().items() if title != "Controls"]
+        shown = "".join(own._repr_html_() for table in tables if (own := table.details(False)) is not None)
+        details = f"<details><summary>All tables</summary>{shown}</details>"
+        return f"{self._summary_table()._repr_html_()}<ul>{sentences}</ul>{details}"
 
     @property
     def rule(self) -> str:
@@ -163,28 +171,37 @@ class RetentionTable:
 
     def to_markdown(self) -> str:
         """Success rates, retention, controls and differences as Markdown tables."""
-        from probe_kit.retention.formats.markdown import markdown
-
-        return markdown(
-            self.all_rows, self.differences, self.notes, self.wordings, self.further_tables, self.unpaired
-        )
+        tables = [*self._tables().values(), *wording_tables(self.wordings), *self.further_tables]
+        sentences = [f"* {markdown_safe(sentence)}" for sentence in self._sentences()]
+        parts = [self._summary_table().to_markdown(), *sentences, "", *(table.to_markdown() for table in tables)]
+        return "\n".join([*parts, *(f"> {markdown_safe(note)}\n" for note in self.notes)])
 
     def to_latex(self, details: Collection[Section] | Literal["all"] = ()) -> str:
         """Return the summary in LaTeX with booktabs rules, each table with a caption, a label and a line's width.
 
         details: sections whose tables stand below it, as of `to_rich`; all of them by "all".
         """
-        from probe_kit.retention.columns.conditions import wording_tables
-        from probe_kit.retention.formats.latex import latex
+        from probe_kit._tables.latex import latex_page
 
-        chosen: Collection[Section] = get_args(Section) if details == "all" else details
-        wordings = wording_tables(self.wordings) if "success" in chosen else []
-        further = [*wordings, *self._further(chosen)]
-        return latex(self.all_rows, self.differences, self.notes, further, self.unpaired, chosen)
+        text = latex_page([self._summary_table(), *self._details(details)])
+        return "\n".join([text, *(f"% {note}" for note in (*self.unpaired, *self.notes))])
 
-    def _further(self, sections: Collection[Section]) -> list[TextTable]:
-        """Tables of VLM runs below the tables of some sections."""
-        return self.further_tables if "answers" in sections else vlm_vla_tables(self.vlm_vla)
+    def _tables(self, sections: Collection[Section] | None = None) -> dict[str, Table]:
+        return retention_tables(self.all_rows, self.differences, self.unpaired, sections)
+
+    def _summary_table(self) -> Table:
+        return summary_table(self.summary, self.differences)
+
+    def _sentences(self) -> list[str]:
+        return [sentence for run in self.summary for sentence in run.sentences]
+
+    def _details(self, details: Collection[Section] | Literal["all"]) -> list[Table]:
+        """The tables of some sections, without columns that need room."""
+        sections: Collection[Section] = get_args(Section) if details == "all" else details
+        narrow = (table.details(False) for table in self._tables(sections).values())
+        wordings = wording_tables(self.wordings) if "success" in sections else []
+        further = self.further_tables if "answers" in sections else vlm_vla_tables(self.vlm_vla)
+        return [*(table for table in narrow if table is not None), *wordings, *further]
 
     @property
     def summary(self) -> list[RunSummary]:
@@ -192,29 +209,35 @@ class RetentionTable:
         return summarise_runs(self.all_rows)
 
     @property
-    def as_paper(self) -> "NumbersTable":
+    def as_paper(self) -> Table:
         """The paper's own numbers by its own formulas, see `probe_kit.retention.formats.as_paper`."""
         from probe_kit.retention.formats.as_paper import paper_table
 
         steps = f" over the last {self.last_steps} control steps" if self.last_steps > 1 else ""
         return paper_table(self.rows, self.means, f"outcome rule {self.rule}{steps}")
 
+    def __rich__(self) -> "Group":
+        return self.to_rich()
+
     def to_rich(self, details: Collection[Section] | Literal["all"] = ()) -> "Group":
         """The summary for a rich console: one table, and a sentence per category as the last lines.
 
         details: sections that are shown above it, see `probe_kit.retention.choices.Section`; all of them by "all".
         """
-        from probe_kit.retention.formats.terminal import rich_tables
+        from rich.console import Group
+        from rich.text import Text
 
-        chosen: Collection[Section] = get_args(Section) if details == "all" else details
-        rows, differences, notes = self.all_rows, self.differences, self.notes
-        return rich_tables(rows, differences, notes, self.wordings, self._further(chosen), self.unpaired, chosen)
+        why = self.unpaired if details or len(self.summary) > 1 else ()
+        notes = [Text(sentence, style="yellow") for sentence in (*why, *self.notes)]
+        sentences: list[Text] = []
+        for run in self.summary:
+            sentences += [Text(run.title, style="bold")] * (len(self.summary) > 1) + [*map(Text, run.sentences)]
+        return Group(*self._details(details), self._summary_table(), *notes, *sentences)
 
     @property
-    def further_tables(self) -> list[TextTable]:
+    def further_tables(self) -> list[Table]:
         """Sizes of the picture by prompt, and VLM − VLA, as far as there are VLM runs."""
-        sizes = size_table(self.means)
-        return [*([] if sizes is None else [sizes]), *vlm_vla_tables(self.vlm_vla)]
+        return [*size_table(self.means), *vlm_vla_tables(self.vlm_vla)]
 
 
 def retention_table(

@@ -1,14 +1,14 @@
 """Retention, success and drift of several checkpoints of one training, against the training step."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+from probe_kit._tables.numbers import number, percent, points, with_limits
+from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.columns.text import difference_interval, number, percent, with_limits
-from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.origins import checkpoint_of, split_checkpoint
-from probe_kit.retention.formats.numbers_table import NumbersTable
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.retention.text import spell
@@ -67,7 +67,7 @@ def read_steps(text: str, runs: Sequence[RunReader]) -> dict[str, int]:
     return {str(run.location): step for run, step in zip(runs, steps, strict=True)}
 
 
-def step_table(table: RetentionTable, steps: Mapping[str, int]) -> NumbersTable:
+def step_table(table: RetentionTable, steps: Mapping[str, int]) -> Table:
     """Return success, backbone, action, retention and drift by category and training step.
 
     table: of runs in the order of their steps, the first of which all others are compared with. steps: by
@@ -80,25 +80,19 @@ def step_table(table: RetentionTable, steps: Mapping[str, int]) -> NumbersTable:
     names = sorted(dict.fromkeys(row.category for row in rows), key=lambda name: name == MEAN)
     ordered = sorted(rows, key=lambda row: (names.index(row.category), steps[row.run.location]))
     numbers = [_numbers(row, steps, drifts) for row in ordered]
-    columns = tuple(_COLUMNS)
-    cells = tuple(_cells(one) for one in numbers)
-    shown = [at for at in range(len(columns)) if at < 2 or any(line[at] not in ("–", "n/a") for line in cells)]
     means = [row for row in ordered if row.category == MEAN]
     views = {steps[row.run.location]: row.view for row in means if row.view is not None}
+    made = Table.of(
+        "Training steps", tuple(_COLUMNS), [_cells(row) for row in numbers], names=2, numbers=tuple(numbers),
+        mean=spell(MEAN),
+    ).filled("n/a")  # fmt: skip
     notes = [
-        *(_COLUMNS[columns[at]] for at in shown if _COLUMNS[columns[at]]),
+        *(_COLUMNS[name] for name in made.columns if _COLUMNS[name]),
         "each with its 95 % interval",
         _by_step("view", {step: str(view) for step, view in views.items()}),
         _by_step("mean over", {steps[row.run.location]: ", ".join(map(spell, row.categories)) for row in means}),
     ]
-    text = TextTable(
-        "Training steps",
-        "; ".join(filter(None, notes)),
-        tuple(columns[at] for at in shown),
-        tuple(tuple(line[at] for at in shown) for line in cells),
-        names=2,
-    )
-    return NumbersTable(text, tuple(numbers))
+    return replace(made, notes=("; ".join(filter(None, notes)),))
 
 
 def _by_step(name: str, values: Mapping[int, str]) -> str:
@@ -132,9 +126,9 @@ def _numbers(
     }
 
 
-def _cells(one: Mapping[str, Any]) -> tuple[str, ...]:
-    shares = (with_limits(percent(one[name]), one[f"{name}_ci"], percent) for name in ("sr", "backbone", "action"))
-    ratio = with_limits(number(one["retention"]), one["retention_ci"], number)
-    lacks = one["retention"] is None and one["backbone"] is not None and one["action"] is not None
-    drift = difference_interval(one["drift"], one["drift_ci"])
-    return (spell(one["category"]), str(one["step"]), *shares, "n/a" if lacks else ratio, drift)
+def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
+    shares = (with_limits(row[name], row[f"{name}_ci"], percent) for name in ("sr", "backbone", "action"))
+    ratio = with_limits(row["retention"], row["retention_ci"], number)
+    lacks = row["retention"] is None and row["backbone"] is not None and row["action"] is not None
+    drift = with_limits(row["drift"], row["drift_ci"], points)
+    return (spell(row["category"]), str(row["step"]), *shares, "n/a" if lacks else ratio, drift)

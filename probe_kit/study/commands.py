@@ -243,7 +243,7 @@ def table(
             print_text(own.to_csv().rstrip("\n"))
     elif style == "table":
         for own in made.values():
-            out.print(own.to_rich())
+            out.print(own)
     else:
         texts = (own.to_latex() if style == "latex" else own.to_markdown() for own in made.values())
         print_text("\n\n".join(text.rstrip("\n") for text in texts))

@@ -14,6 +14,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from PIL import Image
 
+from probe_kit._tables.heat import HEAT
 from probe_kit.errors import UsageError
 from probe_kit.retention import RetentionTable, layer_curve, retention_table
 from probe_kit.retention.displays import (
@@ -24,7 +25,6 @@ from probe_kit.retention.displays import (
     save_figures,
 )
 from probe_kit.retention.displays.base.style import FILLED, OPEN
-from probe_kit.retention.formats.heat import HEAT
 from probe_kit.train import ArrayRun, ProbeResults, load_results, save_results
 from tests.retention.conftest import runs_in
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
-from probe_kit.retention.columns.known_used_table import known_used_tables
+from probe_kit.retention.columns.comparisons import known_used_tables
 from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.retention.displays import KnownUsedDisplay, collect_figures
 from probe_kit.retention.joins import joins_of
@@ -48,7 +48,7 @@ def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Pat
     section = page.split('<details class="part" id="join">')[1].split("</details>")[0]
     for plain in known_used_tables(joined):
         assert plain.title in section
-        for cells in plain.cells:
+        for cells in plain.texts:
             assert all(f">{cell}<" in section for cell in cells if "[" not in cell)
     assert section.count("<img") == 1
 

@@ -3,14 +3,16 @@
 import io
 import re
 from collections.abc import Callable
+from html import unescape
 
 import pytest
 from rich.console import Console
 
+from probe_kit._tables.table import Table
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.summary import HEADINGS
+from probe_kit.retention.columns.tables import retention_tables
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.formats.html import HtmlTable, html_tables
 from probe_kit.retention.report.summaries import read_row
 from probe_kit.train import ArrayRun
 
@@ -26,10 +28,6 @@ def table(probed_run: ProbedRun) -> RetentionTable:
     return retention_table({"first": [runs[0]], "second": [runs[1]]})
 
 
-def headings(table: HtmlTable) -> str:
-    return " | ".join(column.name for column in table.columns).replace("\u00a0", " ")
-
-
 def console(table: RetentionTable) -> str:
     screen = Console(width=240, file=io.StringIO())
     screen.print(table.to_rich("all"))
@@ -38,14 +36,18 @@ def console(table: RetentionTable) -> str:
 
 def every_form(table: RetentionTable) -> dict[str, str]:
     """Text from the retention table on, by form; the one of a page is its headings and cells."""
-    html = next(one for one in html_tables(table.all_rows, table.differences) if one.title == "Retention")
-    cells = " | ".join(cell.text for cell in html.body[0])
+    made = retention_tables(table.all_rows, table.differences)["Retention"]
     return {
         "console": console(table).split("Retention, view")[1],
-        "markdown": table.to_markdown().split("**Retention (")[1],
+        "markdown": table.to_markdown().split("**Retention, view")[1],
         "latex": table.to_latex("all").split(r"\caption{Retention")[1],
-        "page": f"{headings(html)}\n{cells}",
+        "page": text_of(made),
     }
+
+
+def text_of(table: Table) -> str:
+    """What a page shows without its markup."""
+    return unescape(re.sub(r"<style.*?</style>|<[^>]+>", " ", table._repr_html_())).replace("\u00a0", " ")
 
 
 def test_every_table_leads_with_the_one_retention_and_the_published_ratio_beside_it(table: RetentionTable) -> None:
@@ -86,12 +88,11 @@ def test_the_margin_that_decides_stands_before_the_papers(table: RetentionTable)
     assert row.success.chance_margin is not None
     assert row.success.chance_margin_episodes < row.success.chance_margin
     deciding, papers = f"{100 * row.success.chance_margin:.1f}", f"{100 * row.success.chance_margin_episodes:.1f}"
-    page = html_tables(table.all_rows)[0]
     texts = {
         "console": console(table),
         "markdown": table.to_markdown(),
         "latex": table.to_latex("all"),
-        "page": " | ".join(cell.text for cell in page.body[0]),
+        "page": text_of(retention_tables(table.all_rows)["Success rate"]),
     }
     for form, text in texts.items():
         assert -1 < text.find(deciding) < text.find(papers), form
@@ -103,7 +104,7 @@ def test_the_summary_quotes_the_retention_of_the_mean(table: RetentionTable) -> 
     assert found.value is not None
     assert f"{found.value:.2f}" != f"{found.published:.2f}"
     first = next(run for run in table.summary if run.mean.row.group == "first")
-    assert first.mean.cells(intervals=False)[HEADINGS.index("retention")] == f"{found.value:.2f}"
+    assert first.mean.cells[HEADINGS.index("retention")].startswith(f"{found.value:.2f} [")
 
 
 def test_differences_hold_one_retention_and_the_call(table: RetentionTable) -> None:

@@ -16,6 +16,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
+from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
 from probe_kit.intervene.kinds.image_swap.verdict import Behaviour
 from probe_kit.intervene.store.settings import FORMAT
@@ -25,8 +26,8 @@ from probe_kit.retention.columns.glossary import TERMS
 from probe_kit.retention.columns.modes import Modes
 from probe_kit.retention.columns.sentences import VERDICT_HELP, Readable
 from probe_kit.retention.columns.summary import HEADING_HELP
+from probe_kit.retention.columns.tables import retention_tables
 from probe_kit.retention.displays.report_figures import collect_figures
-from probe_kit.retention.formats.html import HtmlTable, html_tables
 from probe_kit.retention.report import report_html, write_report
 from probe_kit.retention.report.episodes import BLOCK, episode_grid
 from probe_kit.retention.report.provenance import citation
@@ -145,8 +146,8 @@ print([name for name in ("torch", "pybullet", "lerobot", "transformers") if name
     assert loaded.stdout.strip() == "[]"
 
 
-def titled(rows: Any, title: str) -> HtmlTable | None:
-    return next((one for one in html_tables(rows) if one.title == title), None)
+def titled(rows: Any, title: str) -> Table | None:
+    return retention_tables(rows).get(title)
 
 
 # -- tables and words ------------------------------------------------------------------------------------------
@@ -156,21 +157,19 @@ def test_cells_sort_by_the_rows_numbers_and_show_them_in_percent(probed_run: Pro
     table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
     made = titled(table.all_rows, "Success rate")
     assert made is not None
-    assert [column.name for column in made.columns][:2] == ["category", "SR\u00a0% [95\u00a0%]"], (
-        "one run: no model"
-    )
-    success = made.body[0][1]
+    assert made.columns[:2] == ("category", "SR % [95 %]"), "one run: no model"
+    success = made.rows[0].cells[1]
     assert success.sort == table.rows[0].success.sr == 0.6
     assert success.text.startswith("60.0 [")
     assert not success.strong, "its interval holds one half"
-    assert [row[0].text for row in made.foot] == ["mean"]
+    assert [row.cells[0].text for row in made.rows if row.is_mean] == ["Mean"]
 
 
 def test_retention_without_backbone_signal_is_shown_as_such_and_sorts_last(probed_run: ProbedRun) -> None:
     made = titled(retention_table([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows, "Retention")
     assert made is not None
-    position = [column.name for column in made.columns].index("retention [95\u00a0%]")
-    color, shape = (row[position] for row in made.body)
+    position = made.columns.index("retention [95 %]")
+    color, shape, _ = (row.cells[position] for row in made.rows)
     assert color.heat is not None
     assert (shape.text, shape.sort, shape.heat) == ("n/a", None, None)
     assert shape.note.startswith("n/a (backbone absent, at most ")
@@ -182,15 +181,15 @@ def test_a_leak_is_red_and_named_in_the_warnings(probed_run: ProbedRun) -> None:
     rows = [replace(row, controls=replace(row.controls, **leaking)) for row in table.all_rows]
     made = titled(rows, "Controls")
     assert made is not None
-    assert any(cell.alarm and cell.text.startswith("80.0") for cell in made.body[0])
+    assert any(cell.alarm and cell.text.startswith("80.0") for cell in made.rows[0].cells)
     assert any("pixels" in warning for warning in read_run(rows).warnings)
     assert titled(table.all_rows, "Controls") is None
 
 
 def test_every_heading_says_what_it_means(probed_run: ProbedRun) -> None:
     rows = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})]).all_rows
-    for made in html_tables(rows):
-        assert all(len(column.explanation) > 10 for column in made.columns)
+    for made in retention_tables(rows).values():
+        assert all(len(heading.help) > 10 for heading in made.headings)
 
 
 def test_the_summary_says_in_words_what_the_rows_say(probed_run: ProbedRun) -> None:

@@ -80,19 +80,17 @@ def test_the_main_table_has_a_row_per_system_and_the_printed_numbers(
 ) -> None:
     made = retention_table(list(runs.values()), pairs=())
     main, score = success_table(made), score_table(made)
-    assert len(main.text.cells) == 17
-    assert main.text.columns[:2] == ("system", "Emotion")
-    for name, *cells in main.text.cells:
-        shown = dict(zip(main.text.columns[1:], cells, strict=True))
+    assert len(main.texts) == 17
+    assert main.columns[:2] == ("system", "Emotion")
+    for name, *cells in main.texts:
+        shown = dict(zip(main.columns[1:], cells, strict=True))
         for category, printed in tables["sr_main"]["values"][name].items():
             cell = shown[category_of(category).title]
             assert float(cell.split()[0]) == pytest.approx(printed, abs=0.051)
-    marked = {
-        (name, at): cell for name, *cells in main.text.cells for at, cell in enumerate(cells) if cell[-1] == "↑"
-    }
+    marked = {(name, at): cell for name, *cells in main.texts for at, cell in enumerate(cells) if cell[-1] == "↑"}
     assert ("Magma", 3) in marked
     assert not any(name == "Paligemma-3B" for name, _ in marked)
-    assert {name: float(cell.split()[0]) for name, cell, *_ in score.text.cells} == pytest.approx(
+    assert {name: float(cell.split()[0]) for name, cell, *_ in score.texts} == pytest.approx(
         derived["normalised_score"], abs=0.01
     )
     assert len(main.numbers) == 17 * (13 + 2), "two domains have several categories"
@@ -138,8 +136,8 @@ def test_46_of_48_means_of_left_and_right_are_the_printed_rate(tables: dict[str,
     for name, sides in tables["left_right"]["values"].items():
         rates = {category: (own["left"], own["right"]) for category, own in sides.items()}
         table = retention_table([run_of(name, rates, tables["items"]["values"])])
-        shown = sides_table(table).text
-        assert shown.cells[0][2] == f"{sides['emotion']['left']:.1f} / {sides['emotion']['right']:.1f}"
+        shown = sides_table(table)
+        assert shown.texts[0][2] == f"{sides['emotion']['left']:.1f} / {sides['emotion']['right']:.1f}"
         for category, row in by_category(table).items():
             own = row.success
             assert own.sr is not None
@@ -164,7 +162,7 @@ def test_co_trained_minus_robot_only_is_10_points_and_p_over_models_a_fifth(
     runs: dict[str, SaidRun], derived: dict[str, Any]
 ) -> None:
     table = retention_table({group: [runs[name] for name in names] for group, names in GROUPS.items()})
-    shown = group_table(table, "co-training").text.cells
+    shown = group_table(table, "co-training").texts
     assert shown[-1][:2] == ("co-trained − robot-only", "mean")
     assert shown[-1][2].startswith("0.200 (0.100)")
     assert shown[-1][3].startswith("+10.1 [")
@@ -189,7 +187,7 @@ def test_without_magma_the_difference_is_half(rows: dict[str, RetentionTable]) -
 def test_what_fine_tuning_changes(runs: dict[str, SaidRun], derived: dict[str, Any]) -> None:
     names = ["OpenVLA (SFT)", "OpenVLA (RL)", "OpenVLA"]
     table = retention_table([runs[name] for name in names], against="OpenVLA")
-    shown = difference_table(table, "tuning").text.cells
+    shown = difference_table(table, "tuning").texts
     assert [cells[2].split()[0] for cells in shown if cells[1] == "mean"] == ["-6.2", "-1.1"]
     for name, printed in zip(names[:2], (-6.17, -1.08), strict=True):
         found = {row.category: 100 * (row.sr or 0) for row in table.differences if row.group == name}
@@ -226,7 +224,7 @@ def test_vlm_minus_vla_of_the_two_policies_whose_source_is_there(
     found = {row.category: 100 * row.difference for row in table.vlm_vla if row.category != "mean"}
     assert found == pytest.approx(derived["gap_pairs"][f"{vlm} - {policy}"], abs=0.005)
     assert all(row.paired for row in table.vlm_vla)
-    assert len(vlm_vla_table(table.vlm_vla).text.cells) == 13
+    assert len(vlm_vla_table(table.vlm_vla).texts) == 13
 
 
 def test_the_six_retentions_cannot_be_derived_from_what_is_printed(tables: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
 
+from probe_kit._tables.numbers import number, p_text, percent, points, signed, with_limits
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.modes import Modes
@@ -18,20 +19,14 @@ from probe_kit.retention.columns.text import (
     action_place,
     backbone_place,
     baseline,
-    difference_interval,
     difference_test,
     exceeds_text,
     models_test,
-    number,
-    p_text,
-    percent,
     published_value,
-    ratio_difference,
     regime_value,
     retention_value,
     success_interval,
     verdict_text,
-    with_limits,
 )
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.rows.row import RetentionRow
@@ -110,7 +105,7 @@ def interval(key: str, ci: str, heading: str, meaning: str, **more: Any) -> Colu
     read, limits = attrgetter(key), attrgetter(ci)
 
     def text(row: RetentionRow) -> str:
-        return with_limits(percent(read(row)), limits(row), percent)
+        return with_limits(read(row), limits(row), percent)
 
     return replace(Column(key=key, heading=heading, help=meaning, text=text, averaged=True), **more)
 
@@ -141,7 +136,7 @@ SR = Column(
     help="Success rate: share of episodes in which the cube ended on the correct picture. In brackets the 95 % "
     "interval, groups of questions as the unit. Two pictures: guessing gives 50 %.",
     text=success_interval,
-    difference=lambda row: difference_interval(row.sr, row.sr_ci),
+    difference=lambda row: with_limits(row.sr, row.sr_ci, points),
     heat=True,
     averaged=True,
     strong=lambda row: row.success.regime == Regime.KNOWLEDGE,
@@ -175,13 +170,13 @@ SR_MODELS = Column(
     help=_MODELS,
     text=lambda _: "",
     sort=lambda _: None,
-    difference=lambda row: models_test(row.sr_models, 100, 1),
+    difference=lambda row: models_test(row.sr_models, points),
 )
 RETENTION_MODELS = replace(
     SR_MODELS,
     key="difference.retention_models",
     heading="retention, p over models (least)",
-    difference=lambda row: models_test(row.retention_models, 1, 2),
+    difference=lambda row: models_test(row.retention_models, signed),
 )
 MARGIN = share(
     "success.chance_margin",
@@ -447,7 +442,7 @@ RETENTION = Column(
     "well enough to divide by. n/a: its signal is not shown.",
     text=retention_value,
     sort=_where_defined("retention.value"),
-    difference=lambda row: ratio_difference(row.retention, row.retention_ci),
+    difference=lambda row: with_limits(row.retention, row.retention_ci, signed),
     heat=True,
     note=lambda row: row.retention.note,
     answers=(
@@ -500,7 +495,7 @@ BACKBONE = interval(
     "backbone.ci",
     "backbone % [95 %]",
     f"In the vision-language backbone. {_SCORE}",
-    difference=lambda row: difference_interval(row.backbone, row.backbone_ci),
+    difference=lambda row: with_limits(row.backbone, row.backbone_ci, points),
     strong=lambda row: row.backbone.has_signal,
 )
 BACKBONE_VERDICT = Column(
@@ -527,7 +522,7 @@ ACTION = interval(
     "action % [95 %]",
     f"{_IN_ACTION} {_SCORE}",
     answers=("answer % [95 %]", f"At the position that chooses the first token of the answer. {_SCORE}"),
-    difference=lambda row: difference_interval(row.action, row.action_ci),
+    difference=lambda row: with_limits(row.action, row.action_ci, points),
     strong=lambda row: row.action.has_signal,
 )
 ACTION_VERDICT = Column(

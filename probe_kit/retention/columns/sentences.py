@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from typing import Literal, cast
 
+from probe_kit._tables.numbers import Limits, whole
 from probe_kit.intervene.kinds.image_swap.verdict import UNTESTED, UseVerdict
 from probe_kit.intervene.kinds.image_swap.words import describe_swap
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.text import is_vlm, model_name, percent
-from probe_kit.retention.estimators.stream_scores import Limits
+from probe_kit.retention.columns.text import is_vlm, model_name
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
@@ -231,7 +231,7 @@ def _answered(row: RetentionRow) -> str:
 
 def _rate(row: RetentionRow) -> str:
     """A success rate with its interval and, where these alone would mislead, why it is in its regime."""
-    return f"{_whole(row.success.sr)} %{_range(row.success.ci)}{_regime_reason(row)}"
+    return f"{whole(row.success.sr)} %{_range(row.success.ci)}{_regime_reason(row)}"
 
 
 def _regime_reason(row: RetentionRow) -> str:
@@ -255,8 +255,8 @@ def _regime_reason(row: RetentionRow) -> str:
 def _failure(row: RetentionRow) -> str:
     wrong, outside = row.success.share_wrong or 0.0, row.success.share_outside or 0.0
     if outside >= wrong:
-        return f"{_whole(outside)} % {'unread' if is_vlm(row) else 'on neither picture'}"
-    return f"{_whole(wrong)} % {'name' if is_vlm(row) else 'on'} the other picture"
+        return f"{whole(outside)} % {'unread' if is_vlm(row) else 'on neither picture'}"
+    return f"{whole(wrong)} % {'name' if is_vlm(row) else 'on'} the other picture"
 
 
 # -- streams -------------------------------------------------------------------------------------------------
@@ -281,7 +281,7 @@ def _streams(row: RetentionRow) -> list[str]:
 
 def _in_stream(name: str, part: StreamPart, what: str) -> str:
     """One stream. what: how the answer is called there."""
-    score, most = f"{_whole(part.score)} %", f"{_whole(part.at_most)} %"
+    score, most = f"{whole(part.score)} %", f"{whole(part.at_most)} %"
     open_to = f"{score}; its best site could have up to {most}"
     if part.verdict == "shown":
         return f"{name} holds {what} ({_accuracy(part)})"
@@ -297,7 +297,7 @@ def _in_stream(name: str, part: StreamPart, what: str) -> str:
 def _accuracy(part: StreamPart) -> str:
     """Of a stream with signal; a signal that no control was compared with may be in the pictures themselves."""
     against = "" if part.is_controlled else "; against chance only"
-    return f"{_whole(part.score)} %{_range(part.ci)}{against}"
+    return f"{whole(part.score)} %{_range(part.ci)}{against}"
 
 
 def chance_only(rows: Sequence[RetentionRow]) -> str:
@@ -334,15 +334,8 @@ def _agrees(row: RetentionRow) -> bool:
     return use is None or (use.behaviour == "inconclusive" and not use.is_bounded) or use.is_used == knows(row)
 
 
-# -- text ---------------------------------------------------------------------------------------------------
-
-
-def _whole(value: float | None) -> str:
-    return percent(value, 0)
-
-
 def _range(limits: Limits | None) -> str:
     """Limits of a share in words, with a comma before them."""
     if limits is None or None in limits:
         return ""
-    return f", {_whole(limits[0])} to {_whole(limits[1])}"
+    return f", {whole(limits[0])} to {whole(limits[1])}"

@@ -1,28 +1,23 @@
 """The summary: a row and a sentence per category, the same in every format."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from probe_kit._tables.numbers import Limits, number, points, signed, whole, with_limits
+from probe_kit._tables.table import Cell, Heading, Row, Table
 from probe_kit.intervene.kinds.image_swap.verdict import describe_readouts
 from probe_kit.retention.columns.sentences import chance_only, describe_category, knows, verdict
 from probe_kit.retention.columns.text import (
     P_DECIDES,
-    difference_interval,
     difference_test,
     is_vlm,
     model_name,
     models_p,
-    number,
-    percent,
-    ratio_difference,
-    with_limits,
+    title_of,
 )
-from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.estimators.stream_scores import Limits
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import MEAN, RetentionRow
-from probe_kit.suite.categories import category_of
 
 MARK = "✓"
 """After a share: the stream exceeds chance and a control, or the regime of the behaviour is knowledge."""
@@ -58,18 +53,19 @@ class CategorySummary:
     @property
     def name(self) -> str:
         """The category as it is spelt at the beginning of a sentence."""
-        return _name(self.row.category)
+        return title_of(self.row.category)
 
-    def cells(self, intervals: bool = True) -> tuple[str, ...]:
+    @property
+    def cells(self) -> tuple[str, ...]:
         """What stands under `HEADINGS`."""
         row, asked = self.row, self.row if is_vlm(self.row) else self.asked
         acts = None if is_vlm(row) else row
         return (
-            "–" if asked is None else _share(asked.success.sr, asked.success.ci, knows(asked), intervals),
-            _share(row.backbone.score, row.backbone.ci, _is_marked(row.backbone), intervals),
-            _share(row.action.score, row.action.ci, _is_marked(row.action), intervals),
-            "–" if acts is None else _share(acts.success.sr, acts.success.ci, knows(acts), intervals),
-            _retention(row, intervals),
+            "–" if asked is None else _share(asked.success.sr, asked.success.ci, knows(asked)),
+            _share(row.backbone.score, row.backbone.ci, _is_marked(row.backbone)),
+            _share(row.action.score, row.action.ci, _is_marked(row.action)),
+            "–" if acts is None else _share(acts.success.sr, acts.success.ci, knows(acts)),
+            _retention(row),
             "" if row.category == MEAN else str(verdict(row)),
         )
 
@@ -86,21 +82,17 @@ def _is_marked(part: StreamPart) -> bool:
     return part.has_signal and part.is_controlled
 
 
-def _share(value: float | None, limits: Limits | None, marked: bool, intervals: bool) -> str:
-    text = with_limits(_whole(value), limits if intervals else None, _whole)
+def _share(value: float | None, limits: Limits | None, marked: bool) -> str:
+    text = with_limits(value, limits, whole)
     return f"{text} {MARK}" if marked and value is not None else text
 
 
-def _whole(value: float | None) -> str:
-    return percent(value, 0)
-
-
-def _retention(row: RetentionRow, intervals: bool) -> str:
+def _retention(row: RetentionRow) -> str:
     if row.backbone.score is None or row.action.score is None:
         return "–"
     if not row.retention.defined:
         return "n/a"
-    return with_limits(number(row.retention.value), row.retention.ci if intervals else None, number)
+    return with_limits(row.retention.value, row.retention.ci, number)
 
 
 # -- runs --------------------------------------------------------------------------------------------------------
@@ -126,58 +118,57 @@ class RunSummary:
         return tuple(one.sentence for one in self.categories)
 
 
-def summary_table(
-    found: Sequence[RunSummary], differences: Sequence[Difference] = (), intervals: bool = True
-) -> TextTable:
+def summary_table(found: Sequence[RunSummary], differences: Sequence[Difference] = ()) -> Table:
     """A row per category and run, and the mean; below them the differences of runs. Empty columns are left out."""
-    several = len(found) > 1
     names = list(dict.fromkeys(one.row.category for run in found for one in run.categories))
     if any(len(run.categories) > 1 for run in found):
         names.append(MEAN)
-    lines = []
+    lines: list[Row] = []
     for name in names:
         for run in found:
             own = [one for one in (*run.categories, run.mean) if one.row.category == name]
-            lines += [(one.name, run.run, *one.cells(intervals), *[""] * len(_TESTS)) for one in own]
-        gaps = [row for row in differences if row.category == name]
-        lines += [(_name(name), f"{row.group} − {row.minus}", *_difference_cells(row, intervals)) for row in gaps]
+            lines += [_row(name, run.run, (*one.cells, *[""] * len(_TESTS))) for one in own]
+        for row in differences:
+            if row.category == name:
+                lines.append(_row(name, f"{row.group} − {row.minus}", _difference_cells(row), is_difference=True))
     headings = ("category", "run", *HEADINGS, *_TESTS)
-    shown = [at for at in range(len(headings)) if at == 0 or (at == 1 and (several or differences))]
-    shown += [at for at in range(2, len(headings)) if any(line[at] not in ("–", "") for line in lines)]
-    legends = _LEGENDS | _TESTS
-    legend = [legends[headings[at]] for at in shown if headings[at] in legends]
-    readouts = describe_readouts(one.row.image_swap.use for run in found for one in run.categories)
-    legend += [f"{readouts[0].upper()}{readouts[1:]}"] if readouts else []
-    return TextTable(
-        f"Summary: {' · '.join(dict.fromkeys(run.title for run in found))}",
-        ". ".join([*legend, *_marks(found, lines)]),
-        tuple(headings[at] for at in shown),
-        tuple(tuple(line[at] for at in shown) for line in lines),
-        names=2 if 1 in shown else 1,
+    table = Table(
+        title=f"Summary: {' · '.join(dict.fromkeys(run.title for run in found))}",
+        headings=tuple(Heading(name, HEADING_HELP.get(name, "")) for name in headings),
+        rows=tuple(lines),
+        names=2,
+        overflow="fold",
     )
+    if len(found) < 2 and not differences:
+        table = table.only([at for at in range(len(headings)) if at != 1])
+    table = table.filled()
+    legends = _LEGENDS | _TESTS
+    legend = [legends[name] for name in table.columns if name in legends]
+    readouts = describe_readouts(one.row.image_swap.use for run in found for one in run.categories)
+    return replace(table, notes=(*legend, *filter(None, [readouts]), *_marks(found, table)))
 
 
-def _marks(found: Sequence[RunSummary], lines: Sequence[tuple[str, ...]]) -> list[str]:
+def _row(category: str, run: str, cells: Sequence[str], is_difference: bool = False) -> Row:
+    texts = (title_of(category), run, *cells)
+    return Row(tuple(map(Cell, texts)), category == MEAN, is_difference)
+
+
+def _marks(found: Sequence[RunSummary], table: Table) -> list[str]:
     """What the mark says where it stands, and a warning where it cannot stand because no control was run."""
-    marked = any(MARK in cell for line in lines for cell in line)
+    marked = any(MARK in text for line in table.texts for text in line)
     warning = chance_only([one.row for run in found for one in run.categories])
     return [f"{MARK} above every control that was run"] * marked + [warning] * bool(warning)
 
 
-def _difference_cells(row: Difference, intervals: bool) -> tuple[str, ...]:
+def _difference_cells(row: Difference) -> tuple[str, ...]:
     sr, backbone, action = (
-        difference_interval(value, limits if intervals else None)
+        with_limits(value, limits, points)
         for value, limits in ((row.sr, row.sr_ci), (row.backbone, row.backbone_ci), (row.action, row.action_ci))
     )
     answered, acted = (sr, "") if row.mode == "answers" else ("", sr)
-    ratio = ratio_difference(row.retention, row.retention_ci if intervals else None)
-    models = row.sr_models
-    over_models = "" if models is None else models_p(models)
+    ratio = with_limits(row.retention, row.retention_ci, signed)
+    over_models = "" if row.sr_models is None else models_p(row.sr_models)
     return answered, backbone, action, acted, ratio, "", "" if over_models else difference_test(row), over_models
-
-
-def _name(category: str) -> str:
-    return category_of(category).title
 
 
 def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:

@@ -1,164 +1,206 @@
-"""The tables of runs, as every format shows them: groups of columns, rows and captions."""
+"""The tables of a retention table: groups of columns over the rows of runs, and below them their differences."""
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
 
+from probe_kit._tables.table import Cell, Heading, Row, Table
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, radius_columns
-from probe_kit.retention.columns.conditions import rule_sentences
-from probe_kit.retention.columns.lines import (
-    TableRow,
-    behaviour_lines,
-    compared,
-    difference_legend,
-    probe_lines,
-)
+from probe_kit.retention.columns.glossary import TERMS
 from probe_kit.retention.columns.modes import modes_of
 from probe_kit.retention.columns.sentences import chance_only
-from probe_kit.retention.columns.text import controlled, is_vlm, once_per_category, probed
+from probe_kit.retention.columns.text import (
+    ABOVE_CHANCE,
+    P_DECIDES,
+    call_words,
+    controlled,
+    difference_name,
+    is_vlm,
+    model_name,
+    once_per_category,
+    probed,
+    title_of,
+)
 from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.rows.outcome_rules import rule_sentence
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.statistics.significance import detectable
 
-_ROLES = {
-    "Success rate": "behaviour",
+TableRow = RetentionRow | Difference
+SUBJECTS = {
     "Accuracy of answers": "behaviour",
+    "Success rate": "behaviour",
     "Retention": "retention",
     "Controls": "controls",
 }
+"""By title, what a table is about."""
+BEHAVIOUR = tuple(title for title, subject in SUBJECTS.items() if subject == "behaviour")
+"""Tables that depend on no view of the probes."""
 
 
-@dataclass(frozen=True)
-class Table:
-    """A table of runs. parts: only columns in which some row has something to show.
+def retention_tables(
+    rows: Sequence[RetentionRow],
+    differences: Sequence[Difference] = (),
+    unpaired: Sequence[str] = (),
+    sections: Collection[Section] | None = None,
+) -> dict[str, Table]:
+    """Return by title the answers of VLM runs, success rates of policy runs, retention and controls.
 
-    subject: `behaviour`, `retention` or `controls`. by_view: whether its rows have a view of the tokens and a
-    call, which formats without a column for them say in a title. captions: sentences below it.
-    """
-
-    title: str
-    subject: str
-    parts: tuple[ColumnGroup, ...]
-    rows: tuple[TableRow, ...]
-    captions: tuple[str, ...]
-
-    @property
-    def by_view(self) -> bool:
-        """Whether its rows are of probes in a view."""
-        return self.subject != "behaviour"
-
-    @property
-    def columns(self) -> tuple[Column, ...]:
-        """Of all parts, in order."""
-        return tuple(column for part in self.parts for column in part.columns)
-
-    @property
-    def run_rows(self) -> list[RetentionRow]:
-        """Rows of runs, without differences."""
-        return [row for row in self.rows if isinstance(row, RetentionRow)]
-
-    def only(self, sections: Collection[Section]) -> "Table | None":
-        """The same with the parts of some sections; None without any."""
-        parts = tuple(part for part in self.parts if part.section in sections)
-        return replace(self, parts=parts) if parts else None
-
-    def without_details(self) -> "Table":
-        """The same without columns that need room."""
-        return replace(self, parts=tuple(part for part in self.parts if not part.detail))
-
-    def details(self) -> "Table | None":
-        """Only those columns, without captions; None if there are none."""
-        parts = tuple(part for part in self.parts if part.detail)
-        return replace(self, title=f"{self.title}: details", parts=parts, captions=()) if parts else None
-
-
-def cell_text(column: Column, row: TableRow) -> str:
-    """What stands in a column; nothing where differences have no such number."""
-    if isinstance(row, RetentionRow):
-        return column.text(row)
-    return "" if column.difference is None else column.difference(row)
-
-
-def tables_of(
-    rows: Sequence[RetentionRow], differences: Sequence[Difference] = (), unpaired: Sequence[str] = ()
-) -> list[Table]:
-    """Answers of VLM runs, success rates of policy runs, retention and controls, as far as there are any.
-
-    unpaired: why runs have no differences; captions of the tables of success rates.
+    A table without rows is left out, and a column in which no row has anything to show. unpaired: why runs have no
+    differences; notes of the last table of behaviour. sections: groups of columns that are shown, all by default.
     """
     once = once_per_category(rows)
-    tables = []
-    for title, own in (
-        ("Accuracy of answers", [row for row in once if is_vlm(row)]),
-        ("Success rate", [row for row in once if not is_vlm(row)]),
-    ):
-        if own:
-            extra = [ColumnGroup("By zone radius", radius_columns(own), True)]
-            tables.append(_table(title, behaviour_lines(own, differences), _legend(title, own), extra))
-    if tables:
-        tables[-1] = replace(tables[-1], captions=(*tables[-1].captions, *unpaired))
-    if probed(rows):
-        lines = probe_lines(probed(rows), differences)
-        tables.append(_table("Retention", lines, _legend("Retention", probed(rows))))
-    if controlled(rows):
-        lines = [line for view in _views(rows) for line in compared([r for r in probed(rows) if r.view == view])]
-        tables.append(_table("Controls", lines, _legend("Controls", probed(rows))))
-    return tables
+    own = {
+        "Accuracy of answers": [row for row in once if is_vlm(row)],
+        "Success rate": [row for row in once if not is_vlm(row)],
+        "Retention": probed(rows),
+        "Controls": probed(rows) if controlled(rows) else [],
+    }
+    last = next((title for title in reversed(BEHAVIOUR) if own[title]), None)
+    found = {}
+    for title, of_table in own.items():
+        groups = [group for group in _groups(title, of_table) if sections is None or group.section in sections]
+        if of_table and groups:
+            gaps = [] if title == "Controls" else _differences(of_table, differences, title in BEHAVIOUR)
+            further = unpaired if title == last else ()
+            made = _table(title, groups, of_table, gaps, further)
+            if len(made.headings) > made.names:
+                found[title] = made
+    return found
 
 
-def views_of(table: Table) -> list[Table]:
-    """A table per view, for formats that name the view in the title; the table itself if it has none."""
-    if not table.by_view:
-        return [table]
-    return [
-        _table(table.title, lines, _legend(table.title, [row for row in lines if isinstance(row, RetentionRow)]))
-        for view in _views(table.run_rows)
-        if (lines := [line for line in table.rows if line.view == view])
-    ]
+def _groups(title: str, rows: Sequence[RetentionRow]) -> list[ColumnGroup]:
+    radii = radius_columns(rows) if title in BEHAVIOUR else ()
+    return [*TABLES[title], *[ColumnGroup("By zone radius", radii, True)] * bool(radii)]
 
 
-def _views(rows: Sequence[RetentionRow]) -> list[str | None]:
-    return list(dict.fromkeys(row.view for row in probed(rows)))
+def _differences(
+    rows: Sequence[RetentionRow], differences: Sequence[Difference], behaviour: bool
+) -> list[Difference]:
+    """Return those between runs, or groups, that both have rows; of behaviour once, whatever number of views."""
+    names = {model_name(row) for row in rows} | {row.group for row in rows}
+    among = [row for row in differences if {row.group, row.minus} <= names]
+    if not behaviour:
+        views = {row.view for row in rows}
+        return [row for row in among if row.view in views and not (row.backbone is None and row.action is None)]
+    once = {(row.group, row.minus, row.category): row for row in reversed(among) if row.sr is not None}
+    return list(once.values())[::-1]
 
 
 def _table(
-    title: str, lines: Sequence[TableRow], legend: Sequence[str], extra: Sequence[ColumnGroup] = ()
+    title: str,
+    groups: Sequence[ColumnGroup],
+    rows: Sequence[RetentionRow],
+    differences: Sequence[Difference],
+    further: Sequence[str],
 ) -> Table:
-    modes = modes_of(line for line in lines if isinstance(line, RetentionRow))
-    parts = [
-        replace(part, columns=shown)
-        for part in (*TABLES[title], *extra)
-        if (shown := tuple(column.worded(modes) for column in part.columns if _is_shown(column, lines)))
+    modes = modes_of(rows)
+    lines = _ordered(rows, differences)
+    columns = [
+        (column.worded(modes), group)
+        for group in groups
+        for column in group.columns
+        if any(cell_text(column, line) not in ("–", "") for line in lines)
     ]
-    tested = any(column.key == "difference.p" for part in parts for column in part.columns)
-    differences = difference_legend([line for line in lines if isinstance(line, Difference)], tested)
-    captions = tuple(_sentence(text) for text in (*legend, differences) if text)
-    return Table(title, _ROLES[title], tuple(parts), tuple(lines), captions)
+    names = _name_columns(title, rows, differences)
+    tested = any(column.key == "difference.p" for column, _ in columns)
+    notes = [*_legend(title, rows), _difference_legend(differences, tested), *further, *_sizes(rows)]
+    return Table(
+        title=_title(title, rows),
+        headings=(
+            *(heading for heading, _ in names),
+            *(Heading(column.heading, column.help, group.title, group.detail) for column, group in columns),
+        ),
+        rows=tuple(
+            Row(
+                (*(Cell(text(line)) for _, text in names), *(_cell(column, line) for column, _ in columns)),
+                is_mean=line.category == MEAN,
+                is_difference=isinstance(line, Difference),
+            )
+            for line in lines
+        ),
+        names=len(names),
+        notes=tuple(filter(None, notes)),
+    )
 
 
-def _is_shown(column: Column, lines: Sequence[TableRow]) -> bool:
-    return any(cell_text(column, line) not in ("–", "") for line in lines)
+def _ordered(rows: Sequence[RetentionRow], differences: Sequence[Difference]) -> list[TableRow]:
+    """Return the lines by category, means last; in each the runs of a view, and behind them their differences."""
+    categories = list(dict.fromkeys(row.category for row in rows))
+    views = list(dict.fromkeys(row.view for row in rows))
+    by_view = {view: at for at, view in enumerate(views)}
+    several = len({row.key for row in rows}) > 1
+    lines: list[TableRow] = [*rows, *differences]
+    if not several and len(views) < 2:
+        return lines
+    return sorted(
+        lines,
+        key=lambda line: (
+            line.category == MEAN, categories.index(line.category), by_view.get(line.view, 0),
+            isinstance(line, Difference),
+        ),
+    )  # fmt: skip
 
 
-def _sentence(text: str) -> str:
-    start = text if text.startswith("n/a") else f"{text[:1].upper()}{text[1:]}"
-    return start if start.endswith(".") else f"{start}."
+def _name_columns(
+    title: str, rows: Sequence[RetentionRow], differences: Sequence[Difference]
+) -> list[tuple[Heading, Callable[[TableRow], str]]]:
+    """Return the columns that tell rows apart: the category, and of several runs, views or calls which one."""
+    found: list[tuple[Heading, Callable[[TableRow], str]]] = [
+        (Heading("category", "Kind of question."), lambda line: title_of(line.category))
+    ]
+    if differences or len({row.key for row in rows}) > 1:
+        found.append((Heading("run", "A run, or two of which the second is subtracted."), _run_name))
+    if title in BEHAVIOUR:
+        return found
+    if len({row.view for row in rows}) > 1:
+        help_ = "How the tokens of an episode became one vector."
+        found.append((Heading("view", help_), lambda line: line.view or "–"))
+    if len({row.run.call for row in rows}) > 1:
+        found.append((Heading("call", TERMS["call"]), _call))
+    return found
 
 
-# -- captions ------------------------------------------------------------------------------------------------
+def _run_name(line: TableRow) -> str:
+    return difference_name(line) if isinstance(line, Difference) else model_name(line)
 
 
-def _legend(title: str, rows: Sequence[RetentionRow]) -> list[str]:
-    if title == "Accuracy of answers":
-        scores = ", ".join(dict.fromkeys(str(row.answers.score) for row in rows))
-        return [f"accuracy is by {scores}; a constant answer is right in one half; {_ANSWERS}"]
-    if title == "Success rate":
-        return [_OUTCOMES, *rule_sentences(rows)]
-    if title == "Retention":
-        sites = _ANSWER_SITES if modes_of(rows) == "answers" else _SITES
-        return [*filter(None, (sites, *_undefined(rows), chance_only(rows)))]
-    return [_controls(rows)]
+def _call(line: TableRow) -> str:
+    call = line.call if isinstance(line, Difference) else line.run.call
+    return "–" if call is None else str(call)
 
+
+def _title(title: str, rows: Sequence[RetentionRow]) -> str:
+    """Return what the table shows, of one view and one run by their names, and the suites."""
+    views, runs = ({row.view for row in rows}, {model_name(row): None for row in rows})
+    view = f", view {rows[0].view}" if title not in BEHAVIOUR and len(views) == 1 else ""
+    model = f"{next(iter(runs))} on " if len(runs) == 1 else ""
+    return f"{title}{view}: {model}{', '.join(dict.fromkeys(row.run.suite for row in rows))}"
+
+
+def cell_text(column: Column, line: TableRow) -> str:
+    """Return what stands in a column; nothing where differences have no such number."""
+    if isinstance(line, RetentionRow):
+        return column.text(line)
+    return "" if column.difference is None else column.difference(line)
+
+
+def _cell(column: Column, line: TableRow) -> Cell:
+    text = cell_text(column, line)
+    if isinstance(line, Difference):
+        return Cell(text)
+    value = column.sort_value(line)
+    return Cell(
+        text,
+        sort=value,
+        heat=value if column.heat and isinstance(value, float) else None,
+        strong=column.strong is not None and column.strong(line),
+        alarm=text.endswith(ABOVE_CHANCE),
+        note=column.note(line) if column.note else "",
+    )
+
+
+# -- notes -------------------------------------------------------------------------------------------------------
 
 _ANSWERS = "wrong and unread (no answer, or several) in % of all"
 _OUTCOMES = (
@@ -169,13 +211,25 @@ _SITES = (
     "layer: the first of the best, + as many others that tie; after @ the iteration (flow step or action token), "
     "of which the first sees no action yet; p family-wise"
 )
-
-
 _ANSWER_SITES = "layer: the first of the best, + as many others that tie; p family-wise"
 
 
+def _legend(title: str, rows: Sequence[RetentionRow]) -> list[str]:
+    if title == "Accuracy of answers":
+        scores = ", ".join(dict.fromkeys(str(row.answers.score) for row in rows))
+        return [f"accuracy is by {scores}; a constant answer is right in one half; {_ANSWERS}"]
+    if title == "Success rate":
+        return [_OUTCOMES, *dict.fromkeys(rule_sentence(row.rules) for row in rows if row.category == MEAN)]
+    calls = sorted({row.run.call for row in rows if row.run.call is not None})
+    said = [call_words(calls[0])] if len(calls) == 1 else []
+    if title == "Retention":
+        sites = _ANSWER_SITES if modes_of(rows) == "answers" else _SITES
+        return [sites, *_undefined(rows), chance_only(rows), *said]
+    return [_controls(rows), *said]
+
+
 def _undefined(rows: Sequence[RetentionRow]) -> list[str]:
-    """Why categories have no retention, each reason once with its categories."""
+    """Return why categories have no retention, each reason once with its categories."""
     reasons: dict[str, list[str]] = {}
     for row in rows:
         if not row.retention.defined and row.category != MEAN:
@@ -190,5 +244,51 @@ def _controls(rows: Sequence[RetentionRow]) -> str:
     untrained = f"; untrained: {name}" if name else ""
     fewest = min(row.success.n_items for row in rows if row.category != MEAN)
     share = f"{100 * detectable(fewest):.1f}"
-    seen = f"with {fewest} items a leak of {share} % is found in 4 of 5 suites"
-    return f"held-out accuracy % without the model, {seen}; selectivity: accuracy above random labels{untrained}"
+    findable = f"with {fewest} items a leak of {share} % is found in 4 of 5 suites"
+    return (
+        f"held-out accuracy % without the model, {findable}; selectivity: accuracy above random labels{untrained}"
+    )
+
+
+def _difference_legend(differences: Sequence[Difference], has_tests: bool) -> str:
+    """Return how differences and their intervals are made; empty without any."""
+    if not differences:
+        return ""
+    parts = [
+        "groups of items as pairs" * any(row.paired for row in differences),
+        "of other items: each side's own groups" * (not all(row.paired for row in differences)),
+    ]
+    if has_tests and any(row.p is not None for row in differences):
+        parts.append(
+            "p of the share right: exact, signs of groups flipped, in means over all items (Holm: all categories "
+            f"and pairs); {P_DECIDES}"
+        )
+    parts.append("these models, other items" * any(row.sr_models for row in differences))
+    return "differences: 95 %, " + "; ".join(filter(None, parts))
+
+
+def _sizes(rows: Sequence[RetentionRow]) -> list[str]:
+    """Return per run its folder and the range of its sizes; one sentence where runs have the same."""
+    by_run: dict[tuple[str | None, str], list[RetentionRow]] = {}
+    for row in rows:
+        if row.category != MEAN:
+            by_run.setdefault(row.key, []).append(row)
+    sizes: dict[str, list[str]] = {}
+    for own in by_run.values():
+        sizes.setdefault(_size(own), []).append(Path(own[0].run.location).name)
+    return [f"run{'s' * (len(names) > 1)} {', '.join(names)}: {size}" for size, names in sizes.items()]
+
+
+def _size(rows: Sequence[RetentionRow]) -> str:
+    parts = [
+        f"{_span([row.success.n_episodes for row in rows])} episodes",
+        f"{_span([row.success.n_items for row in rows])} items",
+    ]
+    if groups := [row.controls.n_groups for row in rows if row.controls.n_groups is not None]:
+        parts.append(f"{_span(groups)} groups")
+    return f"per category {', '.join(parts)}"
+
+
+def _span(numbers: Sequence[int]) -> str:
+    low, high = min(numbers), max(numbers)
+    return str(low) if low == high else f"{low}–{high}"

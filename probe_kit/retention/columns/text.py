@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Sequence
 
+from probe_kit._tables.numbers import NONE, Write, number, p_text, percent, with_limits
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.compare.differences import Difference, ModelTest
-from probe_kit.retention.estimators.stream_scores import Limits
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.suite.categories import category_of
 
 NOT_ACTED = "n/a"
 """In place of a success rate, for a model that did not act."""
@@ -19,26 +20,6 @@ _REGIMES = {
     Regime.NO_RELIABLE_KNOWLEDGE: "not reliable",
     Regime.FAILURE: "failure",
 }
-
-# -- numbers -------------------------------------------------------------------------------------------------
-
-
-def percent(value: float | None, digits: int = 1) -> str:
-    """A share as a percentage, by default with one decimal; a dash for None."""
-    return "–" if value is None else f"{100 * value:.{digits}f}"
-
-
-def number(value: float | None, digits: int = 2) -> str:
-    """A number with two decimals; a dash for None."""
-    return "–" if value is None else f"{value:.{digits}f}"
-
-
-def with_limits(value: str, limits: Limits | None, write: Callable[[float | None], str]) -> str:
-    """A value with its interval, if it has one."""
-    if limits is None or value == "–":
-        return value
-    low, high = limits
-    return f"{value} [no limits]" if low is None or high is None else f"{value} [{write(low)}, {write(high)}]"
 
 
 def place(layer: int | None, iteration: int | None = None, ties: int | None = None) -> str:
@@ -63,7 +44,7 @@ def success_interval(row: RetentionRow) -> str:
     """SR in percent with its interval; n/a for a model that did not act, or for a rule that needs trajectories."""
     if row.success.sr is None:
         return NOT_ACTED
-    return with_limits(percent(row.success.sr), row.success.ci, percent)
+    return with_limits(row.success.sr, row.success.ci, percent)
 
 
 def regime_value(row: RetentionRow) -> str:
@@ -79,7 +60,7 @@ def retention_value(row: RetentionRow) -> str:
     """Retention with its interval; n/a where the backbone's signal is not shown."""
     if not row.retention.defined:
         return "n/a"
-    return with_limits(number(row.retention.value), row.retention.ci, number)
+    return with_limits(row.retention.value, row.retention.ci, number)
 
 
 def published_value(row: RetentionRow) -> str:
@@ -153,38 +134,20 @@ def difference_items(row: Difference) -> str:
     return f"{row.n_items} of {row.of_items} items"
 
 
-def difference_interval(value: float | None, limits: Limits | None, scale: float = 100.0, digits: int = 1) -> str:
-    """A signed value with its interval; by default in points."""
-    if value is None:
-        return "–"
-    if limits is None:
-        return f"{scale * value:+.{digits}f}"
-    low, high = limits
-    if low is None or high is None:
-        return f"{scale * value:+.{digits}f} [no limits]"
-    return f"{scale * value:+.{digits}f} [{scale * low:+.{digits}f}, {scale * high:+.{digits}f}]"
-
-
-def ratio_difference(value: float | None, limits: Limits | None) -> str:
-    """The same of ratios."""
-    return difference_interval(value, limits, 1.0, 2)
-
-
 def difference_test(row: Difference) -> str:
     """p of a difference of success rates, and corrected by Holm."""
     return "" if row.p is None else f"{p_text(row.p)} ({p_text(row.p_holm)})"
 
 
-def models_test(test: ModelTest | None, scale: float, digits: int) -> str:
-    """p over models, the least possible one, and Welch's interval; a dash for no p, and for no limits.
+def models_test(test: ModelTest | None, write: Write) -> str:
+    """p over models, the least possible one, and Welch's interval in the format `write`; a dash for none.
 
     Empty without groups of models.
     """
     if test is None:
         return ""
-    limits = "–"
-    if None not in test.ci:
-        limits = with_limits("", test.ci, lambda value: f"{scale * (value or 0):+.{digits}f}").strip()
+    low, high = test.ci
+    limits = NONE if low is None or high is None else f"[{write(low)}, {write(high)}]"
     return f"{models_p(test)} {limits}"
 
 
@@ -193,17 +156,12 @@ def models_p(test: ModelTest) -> str:
     return p_text(None) if test.p is None else f"{p_text(test.p)} ({p_text(test.smallest_p)})"
 
 
-def p_text(value: float | None) -> str:
-    """A p-value with three decimals; a dash for None."""
-    return "< 0.001" if value is not None and value < 0.001 else number(value, 3)
-
-
 # -- tables --------------------------------------------------------------------------------------------------
 
 
-def rule_name(rows: Sequence[RetentionRow]) -> str:
-    """The outcome rule of a table, as its title names it."""
-    return f"outcome rule {', '.join(dict.fromkeys(row.rules.rule for row in rows))}"
+def title_of(category: str) -> str:
+    """The category as it is spelt in a table or at the beginning of a sentence."""
+    return category_of(category).title
 
 
 def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:

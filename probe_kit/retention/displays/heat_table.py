@@ -6,15 +6,15 @@ from functools import partial
 from textwrap import fill
 from typing import TYPE_CHECKING, ClassVar, Self
 
+from probe_kit._tables.heat import HEAT, heat_colour
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.modes import RATE, Modes, modes_of
-from probe_kit.retention.columns.text import model_name, once_per_category, rule_name
+from probe_kit.retention.columns.text import model_name, once_per_category
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import axes_for, caption, legend_above
-from probe_kit.retention.formats.heat import HEAT, heat_colour
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.retention.text import spell
@@ -66,7 +66,8 @@ class HeatTableDisplay(Display):
         modes, acted = modes_of(rows), [row for row in rows if row.run.mode == "acts"]
         found.title = cls.title.replace(RATE["acts"], RATE[modes])
         found.note = cls.notes.get(modes, cls.note)
-        found.rule_words = f", {rule_name(acted)}" if acted else ""
+        rules = ", ".join(dict.fromkeys(row.rules.rule for row in acted))
+        found.rule_words = f", outcome rule {rules}" if acted else ""
         return found
 
     @classmethod

@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from probe_kit._tables.table import Table
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.base.style import caption, legend_above, panels, plain, series
-from probe_kit.retention.formats.numbers_table import NumbersTable
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.retention.text import spell
 from probe_kit.statistics.estimates.balanced import CHANCE
@@ -27,7 +27,7 @@ _SIDESTEP = 0.02
 """Of the range of steps: how far categories stand apart."""
 
 
-def training_step_figure(table: NumbersTable, lines: Sequence[ProvenanceLine]) -> ReportFigure:
+def training_step_figure(table: Table, lines: Sequence[ProvenanceLine]) -> ReportFigure:
     """Return the figure of a table of training steps. Nothing is drawn yet. lines: of the runs, below it."""
     return ReportFigure(
         "training-steps", "Training steps", "retention",
@@ -37,7 +37,7 @@ def training_step_figure(table: NumbersTable, lines: Sequence[ProvenanceLine]) -
     )  # fmt: skip
 
 
-def draw_training_steps(table: NumbersTable, lines: Sequence[ProvenanceLine]) -> "Figure":
+def draw_training_steps(table: Table, lines: Sequence[ProvenanceLine]) -> "Figure":
     """Return a figure with a panel per number and a line per category; a number without a value has a gap."""
     names = [name for name in dict.fromkeys(one["category"] for one in table.numbers) if name != MEAN]
     chosen = [panel for panel in _PANELS if any(one[panel[0]] is not None for one in table.numbers)]

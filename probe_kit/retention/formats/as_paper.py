@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from statistics import fmean
 from typing import Any
 
+from probe_kit._tables.numbers import number, percent
+from probe_kit._tables.table import Table
 from probe_kit.retention.behaviour.success_rate import Regime, normalised_score, regime
-from probe_kit.retention.columns.text import NOT_ACTED, model_name, number, percent
-from probe_kit.retention.columns.text_table import TextTable
-from probe_kit.retention.formats.numbers_table import NumbersTable
+from probe_kit.retention.columns.text import NOT_ACTED, model_name
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.statistics.estimates.balanced import CHANCE
 
@@ -40,7 +40,7 @@ def paper_retention(action: float, backbone: float) -> float:
     return (action - CHANCE) / (backbone - CHANCE + EPSILON)
 
 
-def paper_table(rows: Sequence[RetentionRow], means: Sequence[RetentionRow], outcome_rule: str) -> NumbersTable:
+def paper_table(rows: Sequence[RetentionRow], means: Sequence[RetentionRow], outcome_rule: str) -> Table:
     """Return the paper's numbers, category by category and as a mean.
 
     Keys are `run`, `model`, `view`, `category` (`mean` for the category mean), `episodes`, `sr`, `margin` (Δ over
@@ -53,7 +53,7 @@ def paper_table(rows: Sequence[RetentionRow], means: Sequence[RetentionRow], out
         of_run = [row for row in rows if (*row.key, row.view) == (*mean.key, mean.view)]
         of_categories = [_category_numbers(row) for row in of_run]
         numbers += [*of_categories, _mean_numbers(mean, of_categories)]
-    return NumbersTable(_text(numbers, outcome_rule), tuple(numbers))
+    return _table(numbers, outcome_rule)
 
 
 def _category_numbers(row: RetentionRow) -> dict[str, Any]:
@@ -96,9 +96,9 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return fmean(defined) if defined else None
 
 
-def _text(numbers: Sequence[dict[str, Any]], outcome_rule: str) -> TextTable:
+def _table(numbers: Sequence[dict[str, Any]], outcome_rule: str) -> Table:
     columns = ("model", "category", "SR %", "Δ", "regime", "backbone %", "action %", "retention")
-    cells = tuple(
+    cells = [
         (
             row["model"] if row["view"] is None else f"{row['model']} · {row['view']}",
             row["category"],
@@ -110,5 +110,6 @@ def _text(numbers: Sequence[dict[str, Any]], outcome_rule: str) -> TextTable:
             number(row["retention"]),
         )
         for row in numbers
-    )
-    return TextTable("As the paper has it", f"{_NOTE}; {outcome_rule}", columns, cells, names=2)
+    ]
+    notes = [f"{_NOTE}; {outcome_rule}"]
+    return Table.of("As the paper has it", columns, cells, names=2, mean=MEAN, notes=notes, numbers=tuple(numbers))

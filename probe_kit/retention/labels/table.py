@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit._system.markdown_text import markdown_safe
+from probe_kit._tables.numbers import number, with_limits
+from probe_kit._tables.table import Heading, Table, grouped
+from probe_kit._terminal.local_paths import without_places
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.behaviour.run_labels import full_names
 from probe_kit.retention.choices import Family
-from probe_kit.retention.columns.text import number, with_limits
-from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.labels.estimate import (
     LabelPeak,
@@ -83,33 +84,32 @@ class LabelRetentionTable:
         return replace(self, rows=rows, results=results, tried={})
 
     @property
-    def text(self) -> TextTable:
+    def text(self) -> Table:
         """The table as text."""
         one, several = self.rows[0].retention, len(self.targets) > 1
-        return TextTable(
+        return Table.of(
             "Labels, and what reaches the action"
             if several
             else f"{one.target}: {one.metric}, and what reaches the action",
-            _NOTE,
             (
-                *(("label", "metric") if several else ()),
-                *("run", "view"),
-                *("backbone site", "score", "chance", "above chance"),
-                *("action site", "score", "chance", "above chance"),
-                "retention",
+                *map(Heading, (*(("label", "metric") if several else ()), "run", "view")),
+                *grouped(
+                    ("backbone", ("backbone site", "score", "chance", "above chance")),
+                    ("action", ("action site", "score", "chance", "above chance")),
+                ),
+                Heading("retention"),
             ),
-            tuple(
+            [
                 (*((row.retention.target, row.retention.metric) if several else ()), row.run, row.retention.view,
                  *_peak(row.retention.backbone), *_peak(row.retention.action), _value(row.retention))
                 for row in self.rows
-            ),
-            (("", 2 + 2 * several), ("backbone", 4), ("action", 4), ("", 1)),
+            ],
             names=2 + 2 * several,
-            means=False,
+            notes=[_NOTE],
         )  # fmt: skip
 
     @property
-    def summary(self) -> TextTable:
+    def summary(self) -> Table:
         """The table without sites and chance; runs and views where there are several."""
         named = {
             "label": [row.retention.target for row in self.rows],
@@ -117,17 +117,16 @@ class LabelRetentionTable:
             "view": [row.retention.view for row in self.rows],
         }
         shown = [name for name, cells in named.items() if name == "label" or len(set(cells)) > 1]
-        return TextTable(
+        return Table.of(
             "Labels, and what reaches the action",
-            _NOTE,
             (*shown, "metric", "backbone above chance", "action above chance", "retention"),
-            tuple(
+            [
                 (*(named[name][place] for name in shown), row.retention.metric, _above(row.retention.backbone),
                  _above(row.retention.action), _value(row.retention).partition(" (")[0])
                 for place, row in enumerate(self.rows)
-            ),
+            ],
             names=len(shown),
-            means=False,
+            notes=[_NOTE],
         )  # fmt: skip
 
     @property
@@ -176,30 +175,25 @@ class LabelRetentionTable:
 
     def to_markdown(self) -> str:
         """The table and its sentences in Markdown."""
-        from probe_kit.retention.formats.markdown import markdown_table
-
         said = "\n".join(f"* {markdown_safe(sentence)}" for sentence in self.sentences)
-        return f"{markdown_table(self.text)}\n{_NOTE}\n\n{said}"
+        return f"{self.text.to_markdown()}\n{said}"
 
     def to_latex(self) -> str:
         """The table in LaTeX; needs the package booktabs."""
-        from probe_kit.retention.formats.latex import latex_table
-
-        return "\n".join([latex_table(self.text), *(f"% {sentence}" for sentence in self.sentences)])
+        return "\n".join([self.text.to_latex(), *(f"% {sentence}" for sentence in self.sentences)])
 
     def to_rich(self) -> "Group":
         """The table for a rich console, and a sentence per row."""
         from rich.console import Group
         from rich.text import Text
 
-        from probe_kit.retention.formats.terminal import responsive_table
-
-        return Group(responsive_table(self.text), *map(Text, self.sentences))
+        return Group(self.text, *map(Text, self.sentences))
 
     def _repr_html_(self) -> str:
-        from probe_kit.retention.formats.notebook import text_table_html
+        from markupsafe import Markup
 
-        return text_table_html(self.text, self.sentences)
+        said = Markup("").join(Markup("<li>{}</li>").format(without_places(one)) for one in self.sentences)
+        return f"{self.text._repr_html_()}<ul>{said}</ul>"
 
 
 def label_retention_table(
@@ -276,11 +270,11 @@ def _above(peak: LabelPeak) -> str:
     """Score above chance with its interval, marked where there is signal."""
     if peak.chance != peak.chance:
         return "–"
-    return with_limits(number(peak.above), peak.ci, number) + _SIGNAL * peak.is_marked
+    return with_limits(peak.above, peak.ci, number) + _SIGNAL * peak.is_marked
 
 
 def _value(found: LabelRetention) -> str:
-    return with_limits(number(found.value), found.ci, number) if found.defined else found.note
+    return with_limits(found.value, found.ci, number) if found.defined else found.note
 
 
 def _sentence(row: LabelRow, several: bool) -> str:
@@ -289,7 +283,7 @@ def _sentence(row: LabelRow, several: bool) -> str:
     if not found.defined:
         return f"{where}: retention is not defined: {found.reason}."
     action = label_of(found.action.stream)
-    limits = with_limits(number(found.value), found.ci, number)
+    limits = with_limits(found.value, found.ci, number)
     missed = found.action.missed
     reached = f"not shown to exceed {', '.join(missed)}" if missed else f"signal there (p < {SIGNIFICANCE})"
     return (

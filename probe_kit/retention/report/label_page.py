@@ -5,7 +5,6 @@ from pathlib import Path
 
 from probe_kit._system.drafts import write_whole
 from probe_kit.retention.behaviour.run_labels import full_names
-from probe_kit.retention.formats.html import plain_tables
 from probe_kit.retention.labels.table import LabelRetentionTable
 from probe_kit.retention.report.label_sections import label_sections
 from probe_kit.retention.report.provenance import citation, provenance
@@ -31,7 +30,7 @@ def label_report_html(runs: Sequence[RunReader], table: LabelRetentionTable) -> 
     names = full_names(runs)
     places = tuple(place for run in runs for place in (run.location.address, str(run.location)))
     sections = label_sections(runs, table, names, places)
-    summary = plain_tables([table.summary])
+    summary = table.summary
     sentence, bibtex = citation(runs)
     return render(
         "labels.html.jinja",
@@ -47,7 +46,7 @@ def label_report_html(runs: Sequence[RunReader], table: LabelRetentionTable) -> 
             provenance(name, run, None, [table.results[str(run.location), target] for target in table.targets])
             for name, run in zip(names, runs, strict=True)
         ],
-        words=words_of([*summary, *(one for section in sections for one in section.tables)]),
+        words=words_of([summary, *(one for section in sections for one in section.tables)]),
         sentence=sentence,
         bibtex=bibtex,
     )

@@ -3,10 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from probe_kit._tables.table import Table
 from probe_kit.errors import NoProbesError
-from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.displays.labels import label_figures
-from probe_kit.retention.formats.html import HtmlTable, plain_tables
 from probe_kit.retention.labels.table import LabelRetentionTable, label_retention_table
 from probe_kit.retention.report.pictures import Picture, arranged
 from probe_kit.train.choices import Task
@@ -28,14 +27,14 @@ class LabelSection:
     target: str
     run: str
     measured: str
-    retention: HtmlTable | None
+    retention: Table | None
     sentences: tuple[str, ...]
     pictures: list[list[Picture]]
-    probes: tuple[HtmlTable, ...]
+    probes: tuple[Table, ...]
     notes: tuple[str, ...]
 
     @property
-    def tables(self) -> tuple[HtmlTable, ...]:
+    def tables(self) -> tuple[Table, ...]:
         """All of them."""
         return self.probes if self.retention is None else (self.retention, *self.probes)
 
@@ -52,7 +51,6 @@ def label_sections(
     found = []
     for target in table.targets:
         own = table.of_target(target)
-        (shown,) = plain_tables([own.text])
         probes = {name: table.results[str(run.location), target] for name, run in zip(names, runs, strict=True)}
         several = len(probes) > 1
         found.append(
@@ -60,7 +58,7 @@ def label_sections(
                 target,
                 of_one,
                 _measured(next(iter(probes.values()))),
-                shown,
+                own.text,
                 tuple(own.sentences),
                 arranged(exhibits, target, names, places),
                 tuple(
@@ -110,9 +108,8 @@ def _measured(results: LabelResults) -> str:
 _TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "continuous": "continuous"}
 
 
-def _probes_table(results: LabelResults, title: str) -> HtmlTable:
+def _probes_table(results: LabelResults, title: str) -> Table:
     shown = label_table(results)
     (part,) = shown.parts
     cells = tuple((name, *(cell.text for cell in row)) for name, row in zip(shown.names, part.rows, strict=True))
-    (found,) = plain_tables([TextTable(title, shown.caption, ("stream", *part.headings), cells)])
-    return found
+    return Table.of(title, ("stream", *part.headings), cells, notes=[shown.caption])

@@ -4,16 +4,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from probe_kit._system.drafts import write_whole
+from probe_kit._tables.heat import heat_key
+from probe_kit._tables.table import Table
 from probe_kit._terminal.local_paths import without_places
 from probe_kit.errors import UsageError
-from probe_kit.retention.columns.conditions import wording_tables
-from probe_kit.retention.columns.known_used_table import known_used_tables
+from probe_kit.retention.columns.comparisons import known_used_tables, wording_tables
 from probe_kit.retention.columns.modes import Modes, modes_of
 from probe_kit.retention.columns.summary import summary_table
+from probe_kit.retention.columns.tables import SUBJECTS, retention_tables
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.displays.report_figures import collect_figures
-from probe_kit.retention.formats.heat import heat_key
-from probe_kit.retention.formats.html import HtmlTable, html_tables, plain_tables
 from probe_kit.retention.joins import joins_of
 from probe_kit.retention.report.episodes import PICTURES, EpisodeGrid, episode_grid
 from probe_kit.retention.report.label_sections import stored_label_sections
@@ -24,7 +24,6 @@ from probe_kit.retention.report.render import render
 from probe_kit.retention.report.summaries import RunInWords, read_run
 from probe_kit.retention.report.words import words_of
 from probe_kit.retention.rows.outcome_rules import under_rule
-from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.version import __version__
@@ -64,16 +63,16 @@ def report_html(
     rows = table.all_rows
     modes = modes_of(rows)
     places = tuple(place for run in runs for place in (run.location.address, str(run.location)))
-    tables = {subject: _tables(rows, table, subject) for subject in ("behaviour", "retention", "controls")}
-    summary = plain_tables([summary_table(table.summary, table.differences)])
+    tables = _tables(table)
+    summary = summary_table(table.summary, table.differences)
     shown_names = [without_places(name, places) for name in names]
     grid = episode_grid(as_judged, shown_names, pictures)
     in_words = _in_words(table)
     labels = stored_label_sections(runs, names, places)
     question, curve = _opening(table, runs, shown_names, grid, places)
     label_tables = [table for label in labels for table in label.tables]
-    further = plain_tables(table.further_tables)
-    joined = plain_tables([one for joined in joins.found for one in known_used_tables(joined)])
+    further = table.further_tables
+    joined = [one for joined in joins.found for one in known_used_tables(joined)]
     return render(
         "page.html.jinja",
         places,
@@ -92,7 +91,7 @@ def report_html(
         warnings=[(views[0].name, warning) for views in in_words for warning in views[0].warnings],
         notes=table.notes,
         tables=tables,
-        wordings=plain_tables(wording_tables(table.wordings)),
+        wordings=wording_tables(table.wordings),
         further=further,
         joined=joined,
         join_notes=[*joins.refused, *dict.fromkeys(note for joined in joins.found for note in joined.notes)],
@@ -108,7 +107,7 @@ def report_html(
         ],
         labels=labels,
         words=words_of(
-            [*summary, *(one for own in tables.values() for one in own), *label_tables, *further, *joined]
+            [summary, *(one for own in tables.values() for one in own), *label_tables, *further, *joined]
         ),
         heat=heat_key(),
         sentence=sentence,
@@ -123,8 +122,12 @@ _ANSWERED: dict[Modes, str] = {
 }
 
 
-def _tables(rows: Sequence[RetentionRow], table: RetentionTable, subject: str) -> list[HtmlTable]:
-    return [one for one in html_tables(rows, table.differences, table.unpaired) if one.subject == subject]
+def _tables(table: RetentionTable) -> dict[str, list[Table]]:
+    """By subject its tables."""
+    found: dict[str, list[Table]] = {subject: [] for subject in SUBJECTS.values()}
+    for title, one in retention_tables(table.all_rows, table.differences, table.unpaired).items():
+        found[SUBJECTS[title]].append(one)
+    return found
 
 
 def _opening(

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from probe_kit._tables.numbers import percent
 from probe_kit.retention.columns.modes import RATE, modes_of
 from probe_kit.retention.columns.sentences import chance_only
-from probe_kit.retention.columns.text import is_vlm, model_name, percent
+from probe_kit.retention.columns.text import is_vlm, model_name
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE

@@ -1,11 +1,12 @@
 """The glossary of a page: what the words of its tables mean, and where each is explained."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from probe_kit._tables.table import Table
 from probe_kit.retention.columns.glossary import TERMS
 from probe_kit.retention.columns.sentences import VERDICT_HELP
-from probe_kit.retention.formats.html import HtmlTable
 
 _AGAINST = "against: "
 """Before a verdict of the opposite direction."""
@@ -33,13 +34,13 @@ class Words:
     values: Mapping[str, str]
 
 
-def words_of(tables: Sequence[HtmlTable]) -> Words:
+def words_of(tables: Sequence[Table]) -> Words:
     """The words of all columns of `tables` and of the verdicts in them, and terms that are neither."""
-    cells = {cell.value for table in tables for row in (*table.body, *table.foot) for cell in row}
+    cells = {cell.value for table in tables for row in table.rows for cell in row.cells}
     groups: dict[str, dict[tuple[str, str], None]] = {}
     for table in tables:
-        title, _, _ = table.title.partition(":")
-        own = {(column.word, column.explanation): None for column in table.columns if column.explanation}
+        title = re.split("[:,]", table.title)[0]
+        own = {(column.text, column.help): None for column in table.headings if column.help}
         groups.setdefault(title, {}).update({word: None for word in own if word not in _all(groups)})
     said = {_word(cell) for cell in cells}
     groups["Verdicts"] = {(name, text): None for name, text in VERDICT_HELP.items() if name in said}

@@ -6,10 +6,9 @@ from pathlib import Path
 
 from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.drafts import write_whole
+from probe_kit._tables.table import Table
 from probe_kit.errors import ProbeKitError, UsageError
-from probe_kit.retention.columns.text_table import TextTable
 from probe_kit.retention.displays.base.report_figure import ReportFigure
-from probe_kit.retention.formats.html import plain_tables
 from probe_kit.retention.report.pictures import Picture, data_uri
 from probe_kit.retention.report.provenance import citation, provenance
 from probe_kit.retention.report.render import render
@@ -53,8 +52,7 @@ def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
         raise UsageError(f"no run of {study.file} is stored. Play it with `probe-kit study run {study.file}`")
     labels, plan = runs.labels(study), plan_study(study)
     places = tuple(place for one in runs.found for place in (one.run.location.address, one.place))
-    pages = {name: plain_tables([own.text])[0] for name, own in tables.items()}
-    state = plain_tables([_state(plan)])[0]
+    state = _state(plan)
     drawn = {name: [_picture(one, places) for one in own] for name, own in figures.items()}
     sentence, bibtex = citation([one.run for one in runs.found])
     html = render(
@@ -68,11 +66,11 @@ def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
         state=state,
         missing=missing,
         skipped=plan.skipped(),
-        tables=pages,
+        tables=tables,
         figures=drawn,
         file=read_regular(study.file).decode("utf-8-sig"),
         provenance=[provenance(labels[one.place], one.run, None) for one in runs.found],
-        words=words_of([state, *pages.values()]),
+        words=words_of([state, *tables.values()]),
         sentence=sentence,
         bibtex=bibtex,
     )
@@ -95,9 +93,9 @@ def _made[Made](
     return found
 
 
-def _state(plan: StudyPlan) -> TextTable:
+def _state(plan: StudyPlan) -> Table:
     """A row per run: what is stored of it."""
-    cells = tuple(
+    cells = [
         (
             one.cell.model,
             one.cell.way + (f", seed {one.cell.seed}" if one.cell.seed else ""),
@@ -106,8 +104,8 @@ def _state(plan: StudyPlan) -> TextTable:
             one.words,
         )
         for one in plan.cells
-    )
-    return TextTable("Runs", "", ("model", "run", "blocks", "episodes", "state"), cells, names=2, means=False)
+    ]
+    return Table.of("Runs", ("model", "run", "blocks", "episodes", "state"), cells, names=2)
 
 
 def _picture(figure: ReportFigure, places: tuple[str, ...]) -> Picture:

@@ -3,16 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from probe_kit.retention.columns.text import (
-    P_DECIDES,
-    difference_interval,
-    difference_test,
-    models_test,
-    p_text,
-    percent,
-    with_limits,
-)
-from probe_kit.retention.columns.text_table import TextTable
+from probe_kit._tables.numbers import p_text, percent, points, with_limits
+from probe_kit.retention.columns.text import P_DECIDES, difference_test, models_test
 from probe_kit.retention.compare.common_items import MANY
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.compare.known_used import OVERALL, CategoryCounts, KnownUsedTable, without_signal
@@ -35,20 +27,31 @@ _FEW = "!"
 def difference_table(table: RetentionTable, title: str) -> NamedTable:
     """Differences of success rates, a row per pair and category; the whole comparison is one family of tests."""
     found = _tested(_once(table.differences))
-    cells = tuple(
+    cells = [
         (
             f"{row.group} − {row.minus}",
             _category(row.category),
-            difference_interval(row.sr, row.sr_ci),
+            with_limits(row.sr, row.sr_ci, points),
             difference_test(row),
             _items(row.n_items, row.of_items),
         )
         for row in found
-    )
+    ]
     columns = ("systems", "category", "difference, points [95 %]", "p (Holm)", "items")
-    text = TextTable(title, caption(table, [_TEST]), columns, cells, names=2)
-    made = NamedTable(text, tuple(map(_number, found)))
+    numbers = tuple(map(_number, found))
+    made = _of_pairs(title, columns, cells, caption(table, [_TEST]), numbers)
     return made.with_note([*_remarks(found), *(sentence.removesuffix(".") for sentence in table.unpaired)])
+
+
+def _of_pairs(
+    title: str,
+    columns: Sequence[str],
+    cells: Sequence[Sequence[str]],
+    note: str,
+    numbers: tuple[Number, ...],
+    mean: str = MEAN,
+) -> NamedTable:
+    return NamedTable.of(title, columns, cells, names=2, mean=mean, notes=[note], numbers=numbers)
 
 
 def _tested[Compared: (Difference, VlmVlaDifference)](rows: Sequence[Compared]) -> list[Compared]:
@@ -78,39 +81,39 @@ def _remarks(rows: Sequence[Difference] | Sequence[VlmVlaDifference]) -> list[st
 def group_table(table: RetentionTable, title: str) -> NamedTable:
     """Groups of models: the exact p over models first, the interval of these models apart."""
     found = _once(table.differences)
-    cells = tuple(
+    cells = [
         (
             f"{row.group} − {row.minus}",
             _category(row.category),
-            models_test(row.sr_models, 100, 1),
-            difference_interval(row.sr, row.sr_ci),
+            models_test(row.sr_models, points),
+            with_limits(row.sr, row.sr_ci, points),
         )
         for row in found
-    )
+    ]
     note = (
         "p over models: exact, labels of models exchanged, in brackets the least that so few models allow and "
         "Welch's interval; runs of one model are averaged; the last column is of these models on other items"
     )
     columns = ("groups", "category", "p over models (least)", "these models, points [95 %]")
     numbers = tuple({**_number(row), "p": None, "p_holm": None} for row in found)
-    return NamedTable(TextTable(title, caption(table, [note]), columns, cells, names=2), numbers)
+    return _of_pairs(title, columns, cells, caption(table, [note]), numbers)
 
 
 def vlm_vla_table(differences: Sequence[VlmVlaDifference]) -> NamedTable:
     """Share right of VLMs minus success rate of policies, where the file names the VLM of a policy."""
     found = _tested(differences)
-    cells = tuple(
+    cells = [
         (
             f"{row.asked} − {row.acted}",
             _category(row.category),
             percent(row.accuracy),
             percent(row.sr),
-            with_limits(percent(row.difference), row.difference_ci, percent),
+            with_limits(row.difference, row.difference_ci, percent),
             p_text(row.p_holm),
             _items(row.n_items, row.of_items),
         )
         for row in found
-    )
+    ]
     numbers = [
         {
             "vlm": row.asked,
@@ -133,8 +136,7 @@ def vlm_vla_table(differences: Sequence[VlmVlaDifference]) -> NamedTable:
     other = "; some pairs began with OTHER first frames" if any(row.same_frames is False for row in found) else ""
     note = f"{_TEST.replace('this comparison', 'the table')}{other}"
     columns = ("systems", "category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p (Holm)", "items")
-    text = TextTable("VLM − VLA", note, columns, cells, names=2)
-    return NamedTable(text, tuple(numbers)).with_note(_remarks(found))
+    return _of_pairs("VLM − VLA", columns, cells, note, tuple(numbers)).with_note(_remarks(found))
 
 
 def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
@@ -143,7 +145,7 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
     Items with the probe right are counted where the answer is shown.
     """
     shown = [(join, row) for join in joins for row in join.rows]
-    cells = tuple(
+    cells = [
         (
             f"{join.asked} · {join.acted}",
             row.category if row.category == OVERALL else category_of(row.category).title,
@@ -152,10 +154,10 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
             "not shown" if row.has_signal is False else _count(_encoded(join, row)),
             _count(row.acted_correctly),
             _count(row.answered_and_encoded),
-            with_limits(percent(row.share_not_acted_on), row.share_not_acted_on_ci or (None, None), percent),
+            with_limits(row.share_not_acted_on, row.share_not_acted_on_ci or (None, None), percent),
         )
         for join, row in shown
-    )
+    ]
     numbers = [
         {
             "vlm": join.asked,
@@ -184,7 +186,7 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
         "answer and probe right",
         "of these without success %",
     )
-    made = NamedTable(TextTable("Stages", note, columns, cells, names=2), tuple(numbers))
+    made = _of_pairs("Stages", columns, cells, note, tuple(numbers), mean=OVERALL)
     notes = [text for join in joins for text in join.notes if text not in without_signal(join.rows)]
     dull = any(row.has_signal is False for _, row in shown)
     said = ["not shown: probes are not shown to exceed chance and every control"] if dull else []

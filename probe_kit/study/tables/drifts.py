@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
-from probe_kit.retention.columns.text import difference_interval, p_text, percent, with_limits
-from probe_kit.retention.columns.text_table import TextTable
+from probe_kit._tables.numbers import number, p_text, percent, points, with_limits
+from probe_kit._tables.table import grouped
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.study.drift.measures import VERDICTS, CategoryDrift, SiteDrift
 from probe_kit.study.tables.named_table import NamedTable, Number
@@ -53,9 +53,7 @@ def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title:
     heading = f"Drift: {title}" + (f" ({', '.join(dict.fromkeys(alone.values()))})" if alone else "")
     numbers = tuple(number for names, one in shown for number in _numbers(names, one, view))
     groups = (*_COLUMNS, *[_LENS][:has_lens])
-    columns = tuple(name for _, names in groups for name in names)
-    heads = tuple((head, len(names)) for head, names in groups)
-    return NamedTable(TextTable(heading, "; ".join(note), columns, cells, heads, names=2), numbers)
+    return NamedTable.of(heading, grouped(*groups), cells, names=2, notes=note, numbers=numbers)
 
 
 def _cells(one: CategoryDrift) -> tuple[str, ...]:
@@ -63,7 +61,7 @@ def _cells(one: CategoryDrift) -> tuple[str, ...]:
     own = (
         _own(one.before),
         _own(one.after),
-        "–" if gap is None else difference_interval(gap.backbone, gap.backbone_ci),
+        "–" if gap is None else with_limits(gap.backbone, gap.backbone_ci, points),
     )
     if not one.sites:
         return (*own, *["–"] * 8)
@@ -77,7 +75,7 @@ def _cells(one: CategoryDrift) -> tuple[str, ...]:
         percent(site.raw_back),
         percent(site.recentred_back),
         _cosine(site),
-        f"{site.cka:.2f}",
+        number(site.cka),
     )
 
 
@@ -87,11 +85,11 @@ def _lens(one: CategoryDrift) -> tuple[str, str]:
 
 
 def _own(row: RetentionRow) -> str:
-    return with_limits(percent(row.backbone.score), row.backbone.ci, percent)
+    return with_limits(row.backbone.score, row.backbone.ci, percent)
 
 
 def _cosine(site: SiteDrift) -> str:
-    return "–" if site.agreement is None else f"{site.agreement.raw:.2f} ({site.agreement.ceiling:.2f})"
+    return "–" if site.agreement is None else f"{number(site.agreement.raw)} ({number(site.agreement.ceiling)})"
 
 
 def _numbers(names: tuple[str, str], one: CategoryDrift, view: str) -> list[Number]:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from probe_kit.retention.formats.numbers_table import NumbersTable
+from probe_kit._tables.table import Table
 from probe_kit.retention.table import RetentionTable
 from probe_kit.suite.categories import category_of, in_order
 
@@ -12,8 +12,8 @@ Number = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class NamedTable(NumbersTable):
-    """text: what is printed. numbers: one object per number, with system, category, interval and n.
+class NamedTable(Table):
+    """A table of a study. numbers: one object per number, with system, category, interval and n.
 
     is_partial: whether runs are missing that `study run` would play; the note names them.
     """
@@ -22,8 +22,7 @@ class NamedTable(NumbersTable):
 
     def with_note(self, sentences: Sequence[str]) -> "NamedTable":
         """The same with more sentences below it."""
-        note = "; ".join([self.text.note, *sentences])
-        return replace(self, text=replace(self.text, note=note))
+        return replace(self, notes=(*self.notes, *sentences))
 
     @property
     def n_tests(self) -> int:

@@ -1,13 +1,14 @@
 """Tables with a row per system and a column per category: success rates, sides, scores and probes."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from itertools import groupby
 from statistics import fmean
 
+from probe_kit._tables.numbers import number, percent, with_limits
+from probe_kit._tables.table import Heading
 from probe_kit.retention.behaviour.success_rate import Regime, normalised_score
-from probe_kit.retention.columns.text import percent, published_value, retention_value, with_limits
-from probe_kit.retention.columns.text_table import TextTable
+from probe_kit.retention.columns.text import published_value, retention_value
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.study.tables.named_table import NamedTable, Number, caption, ordered, titles
@@ -38,7 +39,7 @@ def success_table(table: RetentionTable) -> NamedTable:
     """
     columns = [*_by_category(table, success_cell, domain_means=True), _SCORE]
     made = _pivot(table, "Success rate %", [_MARKED, *_disagreement(table), _MEAN], columns)
-    return NamedTable(made.text, (*made.numbers, *_domain_numbers(table)))
+    return replace(made, numbers=(*made.numbers, *_domain_numbers(table)))
 
 
 def vlm_table(table: RetentionTable) -> NamedTable:
@@ -94,9 +95,8 @@ def sides_table(table: RetentionTable) -> NamedTable:
     title = "Success rate % by side and layout"
     sides = _pivot(table, title, note, [by_side, *_by_category(table, _sides)])
     layouts = _pivot(table, title, note, [by_layout, *_by_category(table, _layouts)])
-    cells = tuple(row for both in zip(sides.text.cells, layouts.text.cells, strict=True) for row in both)
-    text = TextTable(sides.text.title, sides.text.note, sides.text.columns, cells, sides.text.heads, names=2)
-    return NamedTable(text, sides.numbers)
+    rows = tuple(row for both in zip(sides.rows, layouts.rows, strict=True) for row in both)
+    return replace(sides, rows=rows, names=2)
 
 
 def _sides(row: RetentionRow) -> str:
@@ -111,11 +111,7 @@ def _two(left: float | None, right: float | None) -> str:
     return "–" if left is None and right is None else f"{percent(left)} / {percent(right)}"
 
 
-def _scored(value: float | None) -> str:
-    return "–" if value is None else f"{value:.2f}"
-
-
-_SCORE = _Column("score", "", lambda own: _scored(own[MEAN].success.normalised_score))
+_SCORE = _Column("score", "", lambda own: number(own[MEAN].success.normalised_score))
 
 
 def score_table(
@@ -130,7 +126,7 @@ def score_table(
     cells = tuple(
         (
             row.run.label,
-            with_limits(_scored(row.success.normalised_score), _score_limits(row), _scored),
+            with_limits(row.success.normalised_score, _score_limits(row), number),
             percent(row.success.sr),
             str(len(row.categories)),
             *(
@@ -156,7 +152,8 @@ def score_table(
     note = ["score = (mean % − 50) / 50 × 100 over the categories of a system, 95 % interval"]
     note += [f"{title}: not measured here, from {source}"] if elsewhere is not None else []
     columns = ("system", "score [95 %]", "mean %", "categories", *([] if elsewhere is None else [title]))
-    return NamedTable(TextTable("Normalised score", caption(table, note), columns, cells), tuple(numbers))
+    notes = [caption(table, note)]
+    return NamedTable.of("Normalised score", columns, cells, notes=notes, numbers=tuple(numbers))
 
 
 def _score_limits(row: RetentionRow) -> tuple[float | None, float | None] | None:
@@ -205,13 +202,14 @@ def probing_table(table: RetentionTable) -> NamedTable:
         "published: the paper's ratio of best accuracies, in the mean its mean over categories",
     ]
     columns = ("system", "view", "category", "backbone %", "action %", "retention [95 %]", "published")
-    return NamedTable(TextTable("Probes", caption(table, note), columns, cells, names=3), tuple(numbers))
+    notes = [caption(table, note)]
+    return NamedTable.of("Probes", columns, cells, names=3, mean=MEAN, notes=notes, numbers=tuple(numbers))
 
 
 def as_paper_table(table: RetentionTable) -> NamedTable:
     """Return the paper's own numbers by its own formulas, see `probe_kit.retention.formats.as_paper`."""
     made = table.as_paper
-    return NamedTable(made.text, made.numbers)
+    return NamedTable(**{field.name: getattr(made, field.name) for field in fields(made)})
 
 
 def once_per_run(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
@@ -273,16 +271,11 @@ def _systems(table: RetentionTable) -> dict[str, OfSystem]:
 
 def _pivot(table: RetentionTable, title: str, note: Sequence[str], columns: Sequence[_Column]) -> NamedTable:
     cells = tuple((name, *(column.cell(own) for column in columns)) for name, own in _systems(table).items())
-    heads = [(domain, len(list(under))) for domain, under in groupby(column.domain for column in columns)]
-    text = TextTable(
-        title,
-        caption(table, note),
-        ("system", *(column.heading for column in columns)),
-        cells,
-        (("", 1), *heads) if any(domain for domain, _ in heads) else (),
-    )
+    headings = [Heading("system"), *(Heading(column.heading, group=column.domain) for column in columns)]
     rows = once_per_run([*table.rows, *table.means])
-    return NamedTable(text, tuple(_number(row) for row in rows))
+    return NamedTable.of(
+        title, headings, cells, notes=[caption(table, note)], numbers=tuple(_number(row) for row in rows)
+    )
 
 
 def _number(row: RetentionRow) -> Number:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from probe_kit.retention.columns.text import p_text, percent, with_limits
+from probe_kit._tables.numbers import p_text, percent, with_limits
 from probe_kit.suite.categories import category_of
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.view.frozen_probes import Values, decisions_toward_correct
@@ -89,7 +89,7 @@ def _shades(scores: pd.DataFrame) -> dict[str, Any]:
 def _cells(row: Mapping[Hashable, Any], quantile: float | None) -> list[str]:
     limits = _or_none(row["ci_low"]), _or_none(row["ci_high"])
     return [
-        with_limits(percent(_or_none(row["accuracy"])), limits, percent),
+        with_limits(_or_none(row["accuracy"]), limits, percent),
         p_text(_or_none(row["p"])),
         p_text(_or_none(row["p_fwe"])),
         percent(quantile),

@@ -6,7 +6,7 @@ import pytest
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import success_rate
 from probe_kit.retention.behaviour.wordings import wording_pairs
-from probe_kit.retention.columns.conditions import wording_tables
+from probe_kit.retention.columns.comparisons import wording_tables
 from probe_kit.train.data.labels import target_labels
 
 
@@ -60,5 +60,5 @@ def test_a_pair_that_shares_no_episode_is_left_out(ladder):
 def test_the_wordings_are_a_table_wherever_plain_tables_are(ladder):
     pairs = wording_pairs(ladder, ("knowledge", "side"), "r", "m")
     (table,) = wording_tables(pairs)
-    assert table.cells[0][0] == "color"
-    assert "0 / 6" in table.cells[0]  # what one wording alone got right, and the other
+    assert table.texts[0][0] == "color"
+    assert "0 / 6" in table.texts[0]  # what one wording alone got right, and the other

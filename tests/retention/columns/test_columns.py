@@ -11,7 +11,7 @@ from rich.console import Console
 
 from probe_kit.retention import Difference, RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, all_columns, averaged_fields, share
-from probe_kit.retention.formats.html import html_tables
+from probe_kit.retention.columns.tables import retention_tables
 from probe_kit.retention.report.words import words_of
 from probe_kit.train import ArrayRun
 
@@ -28,16 +28,11 @@ def table(probed_run: ProbedRun) -> RetentionTable:
 def every_form(table: RetentionTable) -> dict[str, str]:
     console = Console(width=400, file=io.StringIO())
     console.print(table.to_rich("all"))
-    page = "\n".join(
-        f"{column.name} {column.explanation} {' '.join(row[at].text for row in (*one.body, *one.foot))}"
-        for one in html_tables(table.all_rows, table.differences)
-        for at, column in enumerate(one.columns)
-    )
     return {
         "terminal": console.file.getvalue(),  # type: ignore[attr-defined]
         "markdown": table.to_markdown(),
         "latex": table.to_latex("all"),
-        "page": page.replace("\u00a0", " "),
+        "page": table._repr_html_().replace("\u00a0", " "),
     }
 
 
@@ -64,7 +59,7 @@ def test_a_new_column_is_one_declaration_and_stands_in_every_format(
     for form, text in every_form(again).items():
         assert "layout mean" in text, form
     assert again.means[0].success.layout_mean == again.rows[0].success.layout_mean == 0.6, "means average it too"
-    words = words_of(html_tables(again.all_rows)).entries["Success rate"]
+    words = words_of([*retention_tables(again.all_rows).values()]).entries["Success rate"]
     assert [word.meaning for word in words if word.name == "layout mean %"] == [new.help]
     assert json.loads(again.to_json())[0]["success"]["layout_mean"] == 0.6
     assert again.to_frame()["success.layout_mean"].tolist() == [0.6, 0.6]

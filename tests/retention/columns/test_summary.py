@@ -98,7 +98,7 @@ def test_every_number_has_its_interval_and_a_mark_where_it_exceeds_every_control
     (found,) = summarise_runs([*ASKED, *ACTED])
     table = summary_table([found])
     assert table.columns == ("category", *HEADINGS)
-    color, _, counting, mean = table.cells
+    color, _, counting, mean = table.texts
     assert color == (
         "Color", f"100 [90, 100] {MARK}", f"100 [40, 100] {MARK}", f"100 [40, 100] {MARK}", f"94 [84, 100] {MARK}",
         "1.00 [0.80, 1.20]", "used",
@@ -121,13 +121,13 @@ def test_nothing_is_marked_where_no_control_was_run_and_a_warning_names_the_run(
     (found,) = summarise_runs(bare)
     table = summary_table([found])
     backbone, action, success = (table.columns.index(name) for name in ("backbone %", "action %", "success %"))
-    assert MARK not in table.cells[0][backbone] + table.cells[0][action]
-    assert MARK in table.cells[0][success]
-    assert "No control was run: a signal is judged against chance only" in table.note
+    assert MARK not in table.texts[0][backbone] + table.texts[0][action]
+    assert MARK in table.texts[0][success]
+    assert "No control was run: a signal is judged against chance only" in " ".join(table.notes)
     assert "against chance only" in found.sentences[0]
     both = summary_table(summarise_runs([*ACTED, *bare]))
-    assert "No control was run for bare:" in both.note
-    assert "No control" not in summary_table(summarise_runs(ACTED)).note
+    assert "No control was run for bare:" in " ".join(both.notes)
+    assert "No control" not in " ".join(summary_table(summarise_runs(ACTED)).notes)
     deep = [
         replace(one, backbone=replace(one.backbone, depth=0.5), action=replace(one.action, depth=1.0))
         for one in bare
@@ -139,7 +139,7 @@ def test_several_runs_stand_in_one_table_by_category() -> None:
     again = [replace(one, run=replace(one.run, location="b", label="early")) for one in ACTED]
     found = summarise_runs([*ACTED, *again])
     table = summary_table(found)
-    assert [cells[:2] for cells in table.cells[:2]] == [("Color", "pi0-tiny"), ("Color", "early")]
+    assert [cells[:2] for cells in table.texts[:2]] == [("Color", "pi0-tiny"), ("Color", "early")]
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 200])
@@ -202,7 +202,7 @@ def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:
     color, shape = found.sentences
     assert color.endswith("the model did not act. Shown in the backbone.")
     assert shape.endswith("the model did not act. Not shown in the backbone: more items would tell.")
-    assert "success" not in " ".join(cell for line in summary_table([found]).cells for cell in line)
+    assert "success" not in " ".join(cell for line in summary_table([found]).texts for cell in line)
 
 
 def test_a_category_goes_by_its_title() -> None:

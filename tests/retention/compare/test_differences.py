@@ -86,9 +86,9 @@ def test_every_format_shows_groups_and_differences(table: RetentionTable) -> Non
     content = json.loads(table.to_json())
     assert [row["group"] for row in content["rows"]] == ["without"] * 3 + ["with VQA"] * 3
     assert content["differences"][0]["sr_ci"][0] < 0
-    assert "| with VQA − without | color | +0.0 [" in table.to_markdown()
-    assert "| with VQA: vqa |" in table.to_markdown()
-    assert "with VQA $-$ without & mean & 0 & color" in table.to_latex("all")
+    assert "| Color | with VQA − without | +0.0 [" in table.to_markdown()
+    assert "| Color | with VQA: vqa |" in table.to_markdown()
+    assert "Color & with VQA $-$ without & " in table.to_latex("all")
     frame = table.differences_frame()
     assert frame["backbone"].tolist() == [row.backbone for row in table.differences]
     assert frame["backbone"][0] == pytest.approx(0.1, abs=1e-3)

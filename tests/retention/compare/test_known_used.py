@@ -14,7 +14,7 @@ from rich.console import Console
 
 from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.retention.behaviour.vlm_answers import scored
-from probe_kit.retention.columns.known_used_table import rich_known_used
+from probe_kit.retention.columns.comparisons import known_used_tables
 from probe_kit.retention.compare.known_used import CategoryCounts, encoded_decisions, match_runs
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
 
@@ -211,7 +211,7 @@ def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRu
     vlm, policy = runs
     found = match_runs(vlm, policy, probes(policy, {"color": [0.9], "shape": [0.9]}))
     console = Console(width=150, record=True, file=StringIO())
-    console.print(rich_known_used(found))
+    console.print(*known_used_tables(found))
     text = console.export_text()
     titles = ("Answer, probe, success", "of these without success", "Single episodes", "answer − success")
     for words in (*titles, "V P s"):

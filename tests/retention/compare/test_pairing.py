@@ -325,7 +325,7 @@ def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path
     )
     assert retention_table(mixed, vlm_vla=True).unpaired == ()
     assert [row.mode for row in table.differences] == ["answers"] * 3 + ["acts"] * 3
-    (header, _, *lines) = table.to_markdown().splitlines()[2:]
+    (header, _, *lines) = table.to_markdown().split("\n\n")[1].splitlines()
     columns = [cell.strip() for cell in header.split("|")]
     cells = {line.split("|")[2].strip(): line.split("|") for line in lines if line.startswith("| Mean")}
     answered, acted = (cells[f"{name}-1 − {name}-0"] for name in ("vlm", "policy"))

@@ -129,7 +129,7 @@ def test_only_items_in_common_are_compared_and_counted(runs: list[SaidRun]) -> N
     assert replace(color, of_items=19) == vlm_vla_differences([asked_too, fewer])[0]
     assert (color.n_items, color.of_items, mean.n_items, mean.of_items) == (19, 20, 35, 36)
     shown = retention_table([vlm, fewer], vlm_vla=True).further_tables[-1]
-    assert [line[-1] for line in shown.cells] == ["19 of 20", "16", "35 of 36"]
+    assert [line[-1] for line in shown.texts] == ["19 of 20", "16", "35 of 36"]
 
 
 def test_other_items_are_not_paired_and_have_no_p(runs: list[SaidRun]) -> None:
@@ -171,7 +171,6 @@ def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path
     shown = console.export_text()
     for words in (
         "Accuracy of answers",
-        "VLM runs above, policy runs below",
         "VLM − VLA",
         "560x480",
         "letter bias",
@@ -189,4 +188,4 @@ def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path
     assert isinstance(json.loads(retention_table(runs).to_json()), list)
     sizes = next(own for own in table.further_tables if own.columns[:2] == ("model", "prompt"))
     assert sizes.columns == ("model", "prompt", "224x224", "560x480")
-    assert [cells[:2] for cells in sizes.cells] == [("qwen3-vl", "p1"), ("qwen3-vl", "seen")]
+    assert [cells[:2] for cells in sizes.texts] == [("qwen3-vl", "p1"), ("qwen3-vl", "seen")]

@@ -220,7 +220,7 @@ def test_the_command_writes_figures_and_a_page_of_several_labels(run: Run, tmp_p
     assert "control state" in text
     shown = label_retention_table([run], ["sim.tool_y", "a/b: <i>"]).summary
     assert shown.columns == ("label", "metric", "backbone above chance", "action above chance", "retention")
-    assert [cells[-1] for cells in shown.cells] == ["n/a", "n/a"]
+    assert [cells[-1] for cells in shown.texts] == ["n/a", "n/a"]
     for wrong, message in (
         (["--html", str(tmp_path)], "is a folder"),
         (["--figures", str(page)], "is a file"),

@@ -234,7 +234,7 @@ def test_one_table_has_a_binary_label_one_of_classes_and_a_continuous_one_and_no
         assert row["value"] == alone.value, "the same as by itself"
     text = label_retention_table([three], NAMES).text
     assert text.columns[:4] == ("label", "metric", "run", "view")
-    assert len(text.cells) == len(NAMES), "no row is a mean over tasks"
+    assert len(text.rows) == len(NAMES), "no row is a mean over tasks"
     for style in ("table", "csv", "markdown", "latex"):
         done = CliRunner().invoke(app, [*command, "--format", style], env={"COLUMNS": "250"})
         assert done.exit_code == 0, done.output

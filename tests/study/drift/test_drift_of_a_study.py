@@ -103,25 +103,25 @@ def test_a_file_names_pairs_and_an_archive_prints_their_table_without_activation
     assert conduct_study(plan_study(study)) == []
     assert fit_probes(plan_study(study)) == []
     made = make_table(study, "drift")
-    assert [cells[:2] for cells in made.text.cells] == [
+    assert [cells[:2] for cells in made.texts] == [
         ("early → base", "Color"), ("early → base", "Counting"),
         ("base → base", "Color"), ("base → base", "Counting"),
     ]  # fmt: skip
-    color, counting = made.text.cells[2:]
+    color, counting = made.texts[2:]
     assert (color[2], counting[2]) == ("kept", "not shown in either")
-    named = dict(zip(made.text.columns, color, strict=True))
+    named = dict(zip(made.columns, color, strict=True))
     assert named["forth %"] == named["back %"] == named["recentred %"], "a run transfers to itself as it decodes"
     assert named["CKA"] == "1.00"
     _check_vlm(study)
-    chosen = make_table(study, "counting").text.cells
+    chosen = make_table(study, "counting").texts
     assert [cells[1] for cells in chosen] == ["Counting", "Counting"]
-    assert chosen[0] == made.text.cells[1], "probes are those of the whole runs"
+    assert chosen[0] == made.texts[1], "probes are those of the whole runs"
     (curves,) = make_figures(study, "curves")
     with curves.drawn() as figure:
         titles = [axes.get_title(loc="left") for axes in figure.axes if axes.get_visible()]
     assert [title.partition(":")[0] for title in titles] == ["color", "color"], "backbone and action"
     pack_study(study, tmp_path / "study.zip")
-    assert make_table(load_study(tmp_path / "study.zip"), "drift").text == made.text
+    assert make_table(load_study(tmp_path / "study.zip"), "drift") == made
 
 
 def _check_vlm(study: LoadedStudy) -> None:

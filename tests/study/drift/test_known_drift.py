@@ -56,5 +56,5 @@ def test_training_keeps_what_it_used_and_forgets_traffic(seed: int, tmp_path: Pa
     assert conduct_study(plan_study(study)) == []
     assert fit_probes(plan_study(study)) == []
     made = make_table(study, "drift")
-    print(made.text)
+    print(made.to_markdown())
     assert {one["category"]: one["verdict"] for one in made.numbers if "verdict" in one} == TRUTH

@@ -121,12 +121,12 @@ def test_directions_are_compared_only_where_both_sides_have_signal(found: dict[s
 
 def test_the_table_leads_with_transfer_and_says_what_each_verdict_means(found: dict[str, CategoryDrift]) -> None:
     made = drift_table({("before", "after"): list(found.values())}, "training", "mean")
-    assert made.text.title == "Drift: training"
-    rows = {cells[1].lower(): dict(zip(made.text.columns, cells, strict=True)) for cells in made.text.cells}
+    assert made.title == "Drift: training"
+    rows = {cells[1].lower(): dict(zip(made.columns, cells, strict=True)) for cells in made.texts}
     assert list(rows["kept"].values())[:3] == ["before → after", "Kept", "kept"]
     assert rows["forgotten"]["cosine (ceiling)"] == "–", "no cosine without signal on both sides"
-    assert "forgotten: signal in the first alone" in made.text.note
-    assert "it is no measure of loss" in made.text.note
+    assert "forgotten: signal in the first alone" in "; ".join(made.notes)
+    assert "it is no measure of loss" in "; ".join(made.notes)
     assert len(made.numbers) == len(TRUTH) * 3, "one of the category, one of each layer"
     verdicts = {number["category"]: number["verdict"] for number in made.numbers if "verdict" in number}
     assert verdicts == TRUTH
@@ -159,8 +159,8 @@ def test_other_words_or_frames_give_own_accuracies_only(
         (kept, *_) = measure_drift(strange, other)
         assert (kept.sites, kept.verdict) == ((), "not clear")
         made = drift_table({("before", "after"): [kept]}, "training", "mean")
-        assert made.text.title == f"Drift: training ({why})"
-        assert made.text.cells[0][6:] == ("–",) * 8
+        assert made.title == f"Drift: training ({why})"
+        assert made.texts[0][6:] == ("–",) * 8
 
 
 def test_two_runs_that_answer_by_letter_have_the_lens_of_every_layer(pair: tuple[ArrayRun, ArrayRun]) -> None:
@@ -177,13 +177,13 @@ def test_two_runs_that_answer_by_letter_have_the_lens_of_every_layer(pair: tuple
     (kept, *_) = found = measure_drift(sides[0], sides[1])
     assert [site.lens for site in kept.sites] == [(0, 1), (1, 0.875)]
     made = drift_table({("before", "after"): found}, "training", "mean")
-    assert made.text.columns[-2:] == ("lens before %", "lens after %")
-    assert made.text.heads[-1] == ("logit lens", 2)
-    assert "the model's own final norm and head" in made.text.note
+    assert made.columns[-2:] == ("lens before %", "lens after %")
+    assert [one.group for one in made.headings[-2:]] == ["logit lens"] * 2
+    assert "the model's own final norm and head" in "; ".join(made.notes)
     assert [number["lens_after"] for number in made.numbers if number.get("site")][:2] == [1, 0.875]
     (plain, *_) = measure_drift(sides[0], after)
     assert all(site.lens is None for site in plain.sites), "one side has none"
-    assert "logit lens" not in [head for head, _ in drift_table({("a", "b"): [plain]}, "t", "mean").text.heads]
+    assert "logit lens" not in [one.group for one in drift_table({("a", "b"): [plain]}, "t", "mean").headings]
 
 
 def test_backbones_of_another_width_are_refused(pair: tuple[ArrayRun, ArrayRun], tmp_path: Path) -> None:

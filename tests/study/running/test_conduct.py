@@ -131,13 +131,13 @@ def test_tables_are_made_of_stored_runs_alone_and_name_what_is_missing(file: Pat
     with pytest.raises(RunIncompleteError, match=r"broken/short is not whole: .* \(--partial\)"):
         make_table(study, "main")
     made = make_table(study, "main", partial=True)
-    assert made.text.columns == ("system", "Color", "mean", "score")
-    assert [cells[0] for cells in made.text.cells] == ["expert", "idle"]
+    assert made.columns == ("system", "Color", "mean", "score")
+    assert [cells[0] for cells in made.texts] == ["expert", "idle"]
     (failure,) = (one.failure for one in plan_study(study).cells if one.failure)
-    assert made.text.note.endswith(f"broken · short is missing: {failure.reason}")
+    assert "; ".join(made.notes).endswith(f"broken · short is missing: {failure.reason}")
     assert made.is_partial
     light = make_table(study, "light")
-    assert [cells[:3] for cells in light.text.cells] == [
+    assert [cells[:3] for cells in light.texts] == [
         ("idle · dark − idle · short", name, "+0.0 [-100.0, +100.0]") for name in ("Color", "mean")
     ]
     with pytest.raises(UsageError, match=r"unknown table 'man'; known: main, light\. Did you mean 'main'"):
@@ -211,8 +211,8 @@ def test_equal_runs_elsewhere_serve_a_study_and_stay_where_they_lie(file: Path) 
     assert served == {"expert/short": True, "broken/short": False, "idle/short": True, "idle/dark": False}
     assert {one.cell.name: one.state for one in plan.cells}["idle/dark"] == "whole"
     assert not list(Path(f"{out}-other").glob("expert/*"))
-    shown = make_table(load_study(other), "main", partial=True).text.cells
-    assert shown == make_table(load_study(file), "main", partial=True).text.cells
+    shown = make_table(load_study(other), "main", partial=True).texts
+    assert shown == make_table(load_study(file), "main", partial=True).texts
     assert {path: path.stat().st_mtime_ns for path in Path(out).rglob("*") if path.is_file()} == before
 
 
@@ -298,7 +298,7 @@ def test_probes_of_the_file_are_fitted_once_and_shown(small_suite: Suite, tmp_pa
     (missing,) = fit_probes(plan_study(study))
     assert (missing.run, missing.stage) == ("broken/short", "waiting")
     made = make_table(study, "probing", partial=True)
-    assert [cells[:3] for cells in made.text.cells] == [
+    assert [cells[:3] for cells in made.texts] == [
         (name, "mean", category) for name in ("expert", "idle") for category in ("Color", "mean")
     ]
     stored = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("probes/*/*") if path.name == "scores.csv"}

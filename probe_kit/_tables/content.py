@@ -1,0 +1,173 @@
+"""The content of a table, which renderers read: headings, rows of cells, notes.
+
+A renderer knows no subject: a cell says what is bold, red, coloured or sorted, and a heading says what it means.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self
+
+from probe_kit._tables.numbers import NONE
+
+_LIMITS = re.compile(r"(?<!^) ?(\[[^\]]*\])")
+"""An interval behind its value."""
+_NUMBER = re.compile(r"[-+−±]?\d|< \d|n/a|–|$")
+"""The beginning of a cell of numbers."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Text, and how formats that can show it do.
+
+    sort: by which a page sorts, the text by default. heat: a share that colours the ground. strong: bold. alarm:
+    red. note: shown on a page by pointing at the cell.
+    """
+
+    text: str
+    sort: float | str | None = None
+    heat: float | None = None
+    strong: bool = False
+    alarm: bool = False
+    note: str = ""
+
+    @property
+    def limits(self) -> str:
+        """The interval in square brackets behind the value, empty without one."""
+        match = _LIMITS.search(self.text)
+        return match[1] if match else ""
+
+    @property
+    def value(self) -> str:
+        """The text without that interval."""
+        return _LIMITS.sub("", self.text, count=1)
+
+
+@dataclass(frozen=True)
+class Heading:
+    """The text over a column. help: its entry in a glossary. group: a name over adjoining columns.
+
+    is_detail: whether the column needs room, and is left out of terminals and LaTeX.
+    """
+
+    text: str
+    help: str = ""
+    group: str = ""
+    is_detail: bool = False
+
+
+@dataclass(frozen=True)
+class Row:
+    """The cells of a line.
+
+    is_mean: it averages others; is_difference: it compares them. Pages keep both below the others when they sort.
+    """
+
+    cells: tuple[Cell, ...]
+    is_mean: bool = False
+    is_difference: bool = False
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a renderer reads: a table of text, and the numbers behind it.
+
+    names: how many of the first columns name the rows. notes: sentences below it, which need no capital letter and
+    no stop. numbers: an object per row or per number, shares in [0, 1], None where unknown. overflow: of a
+    terminal, what is done with columns that do not fit: `split` into further tables, `leave out` by name, or
+    first `fold` intervals below their values.
+    """
+
+    title: str
+    headings: tuple[Heading, ...]
+    rows: tuple[Row, ...]
+    names: int = 1
+    notes: tuple[str, ...] = ()
+    numbers: tuple[Mapping[str, Any], ...] = ()
+    overflow: Literal["split", "leave out", "fold"] = "split"
+
+    @classmethod
+    def of(
+        cls,
+        title: str,
+        headings: Sequence[Heading | str],
+        rows: Sequence[Sequence[Cell | str]],
+        *,
+        mean: str | None = None,
+        notes: Sequence[str] = (),
+        **more: Any,
+    ) -> Self:
+        """Return a table of text. mean: what a row that averages others is called. more: further fields."""
+        names = int(more.get("names", 1))
+        cells = [tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in row) for row in rows]
+        lines = [Row(row, mean is not None and mean in [cell.text for cell in row[:names]]) for row in cells]
+        heads = tuple(one if isinstance(one, Heading) else Heading(one) for one in headings)
+        return cls(title, heads, tuple(lines), notes=tuple(filter(None, notes)), **more)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The headings as text."""
+        return tuple(heading.text for heading in self.headings)
+
+    @property
+    def full_headings(self) -> tuple[str, ...]:
+        """The headings as text, with the name over them where two columns have one heading."""
+        texts = self.columns
+        return tuple(
+            f"{one.group} {one.text}" if one.group and texts.count(one.text) > 1 else one.text
+            for one in self.headings
+        )
+
+    @property
+    def texts(self) -> tuple[tuple[str, ...], ...]:
+        """The cells as text."""
+        return tuple(tuple(cell.text for cell in row.cells) for row in self.rows)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """The notes as sentences."""
+        return tuple(map(_sentence, self.notes))
+
+    def is_numeric(self, column: int) -> bool:
+        """Return whether the column holds numbers, which stand to the right."""
+        texts = [row.cells[column].text for row in self.rows]
+        return column >= self.names and any(texts) and all(map(_NUMBER.match, texts))
+
+    def only(self, columns: Sequence[int]) -> Self:
+        """Return the table with some of its columns, those that name the rows first."""
+        rows = tuple(replace(row, cells=tuple(row.cells[at] for at in columns)) for row in self.rows)
+        return replace(
+            self,
+            headings=tuple(self.headings[at] for at in columns),
+            rows=rows,
+            names=sum(at < self.names for at in columns),
+        )
+
+    def filled(self, *empty: str) -> Self:
+        """Return the table without columns in which no row has anything to show; `empty`: or one of these texts."""
+        texts = [*zip(*self.texts, strict=True)] or [("",)] * len(self.headings)
+        return self.only(
+            [
+                at
+                for at, column in enumerate(texts)
+                if at < self.names or any(text not in (NONE, "", *empty) for text in column)
+            ]
+        )
+
+    def details(self, shown: bool) -> Self | None:
+        """Return the columns that need room, or those that do not; None where there are none of them."""
+        columns = [at for at, one in enumerate(self.headings) if at >= self.names and one.is_detail == shown]
+        return self.only([*range(self.names), *columns]) if columns else None
+
+
+def grouped(*groups: tuple[str, Sequence[str]]) -> tuple[Heading, ...]:
+    """Return headings under names over adjoining columns."""
+    return tuple(Heading(text, group=group) for group, texts in groups for text in texts)
+
+
+def _sentence(note: str) -> str:
+    """Return a note as a sentence; one that is a sentence may begin with a name, which stays as it is."""
+    if note.endswith("."):
+        return note
+    start = note if note.startswith("n/a") else f"{note[:1].upper()}{note[1:]}"
+    return f"{start}."

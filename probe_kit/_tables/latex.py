@@ -1,0 +1,139 @@
+"""Tables in LaTeX: booktabs rules, five heat colours, and no tabular wider than its line."""
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import cast
+
+from probe_kit._tables.content import Cell, Content, Row
+from probe_kit._tables.heat import HEAT
+
+_GREEK = {
+    "α": "alpha", "β": "beta", "γ": "gamma", "δ": "delta", "ε": "epsilon", "θ": "theta", "λ": "lambda", "μ": "mu",
+    "π": "pi", "ρ": "rho", "σ": "sigma", "τ": "tau", "φ": "phi", "ψ": "psi", "ω": "omega", "Δ": "Delta",
+}  # fmt: skip
+_SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
+    "–": "--",
+    "−": "$-$",
+    "<": "$<$",
+    ">": "$>$",
+    "|": r"\textbar{}",
+    "×": r"$\times$",
+    "·": r"$\cdot$",
+    "✓": r"$^{*}$",
+    "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$",
+    "→": r"$\rightarrow$",
+    "\0": "{}",
+    "\n": " ",
+    "\r": " ",
+    **{letter: f"$\\{name}$" for letter, name in _GREEK.items()},
+}
+MOST_COLUMNS = 13
+"""Of a tabular; a wider table is printed as several below each other, each with the names of the rows."""
+_FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
+"""Before a tabular: one that is wider than its line becomes as wide as it."""
+
+
+def preamble(tables: Sequence[Content]) -> str:
+    """Return the packages that the tables need as a comment, and their colours."""
+    coloured = any(_css(cell) for table in tables for row in table.rows for cell in row.cells if not cell.strong)
+    needs = r"% needs: \usepackage{booktabs} \usepackage{graphicx}" + r" \usepackage[table]{xcolor}" * coloured
+    colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT] if coloured else []
+    return "\n".join([needs, *colours])
+
+
+def latex_page(tables: Sequence[Content]) -> str:
+    """Return several tables behind their preamble, each with a label of its own."""
+    texts: list[str] = []
+    labels: dict[str, int] = {}
+    for table in tables:
+        text = latex(table)
+        label = _label(table)
+        labels[label] = labels.get(label, 0) + 1
+        again = f"{label}-{labels[label]}" if labels[label] > 1 else label
+        texts.append(text.replace(rf"\label{{{label}}}", rf"\label{{{again}}}"))
+    return "\n".join([preamble(tables), *texts])
+
+
+def latex(table: Content) -> str:
+    """Return a `table` environment with a caption and a label; it needs the packages booktabs and graphicx."""
+    pieces = [piece for part in _parts(table) for piece in (r"\par\medskip", *_tabular(part))][1:]
+    caption = " ".join([f"{table.title}.", *table.sentences])
+    head = [r"\begin{table}", r"\centering", rf"\caption{{{escape(caption)}}}", rf"\label{{{_label(table)}}}"]
+    return "\n".join([*head, *pieces, r"\end{table}", ""])
+
+
+def escape(text: str) -> str:
+    """Return `text` with LaTeX's special characters made harmless."""
+    apart = re.sub("-(?=-)", "-\0", text)  # two hyphens would become one dash
+    return "".join(_SPECIAL.get(character, character) for character in apart)
+
+
+def _label(table: Content) -> str:
+    words = re.sub(r"[^a-z0-9]+", "-", re.split("[:,]", table.title)[0].lower()).strip("-")
+    return f"tab:{words or 'table'}"
+
+
+def _parts(table: Content) -> Iterator[Content]:
+    """Yield the table in pieces of at most MOST_COLUMNS, divided between names over columns where it has any."""
+    names, columns = list(range(table.names)), range(table.names, len(table.headings))
+    heads: list[list[int]] = []
+    for at in columns:
+        group = table.headings[at].group
+        if heads and group and group == table.headings[heads[-1][-1]].group:
+            heads[-1].append(at)
+        else:
+            heads.append([at])
+    piece: list[int] = []
+    for head in heads:
+        if piece and len(names) + len(piece) + len(head) > MOST_COLUMNS:
+            yield table.only([*names, *piece])
+            piece = []
+        piece += head
+    yield table.only([*names, *piece])
+
+
+def _tabular(table: Content) -> list[str]:
+    """Return the lines of a tabular, by pandas' Styler; columns go by number, since two may have one heading."""
+    import pandas as pd
+
+    several = any(one.group for one in table.headings)
+    numbers = range(len(table.headings))
+    columns: pd.Index = pd.Index(numbers)
+    if several:
+        columns = pd.MultiIndex.from_arrays([[one.group for one in table.headings], numbers])
+    texts = [[escape(cell.text) for cell in row.cells] for row in table.rows]
+    styles = [[_css(cell, row) for cell in row.cells] for row in table.rows]
+    frame = pd.DataFrame(texts, columns=columns, dtype=object)
+    look = pd.DataFrame(styles, columns=columns, dtype=object)
+    styler = frame.style.hide(axis="index").apply(lambda _: look, axis=None)
+    styler = styler.format_index(
+        lambda at: _heading(table.columns[cast("int", at)]), axis="columns", level=int(several)
+    )
+    if several:
+        styler = styler.format_index(lambda name: escape(str(name)), axis="columns", level=0)
+    aligned = "".join("r" if table.is_numeric(at) else "l" for at in range(len(table.headings)))
+    text = styler.to_latex(hrules=True, column_format=aligned, multicol_align="c")
+    begin, *inside, end = text.strip().splitlines()
+    return [_FITTED, begin, *inside, f"{end}}}"]
+
+
+def _css(cell: Cell, row: Row | None = None) -> str:
+    """Return the commands around a cell as Styler has them."""
+    heat = [] if cell.heat is None else [f"cellcolor:{{{heat_name(cell.heat)}}}"]
+    bold = ["textbf:--rwrap"] * (row is not None and row.is_mean and bool(cell.text))
+    return ";".join([*heat, *["textcolor:{red}--rwrap"] * cell.alarm, *bold])
+
+
+def heat_name(value: float) -> str:
+    """Return the name of the colour of a share or ratio."""
+    return next(name for bound, name, _ in HEAT if value < bound)
+
+
+def _heading(text: str) -> str:
+    """Return a heading with percent close to its number."""
+    return escape(text).replace(r" \%", r"\,\%")

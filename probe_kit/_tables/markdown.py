@@ -1,0 +1,30 @@
+"""Tables in Markdown."""
+
+from collections.abc import Iterable
+
+from probe_kit._system.markdown_text import markdown_safe
+from probe_kit._tables.content import Cell, Content
+
+
+def markdown(table: Content) -> str:
+    """Return a bold title, the table, and its notes as quotations."""
+    lines = [
+        f"**{markdown_safe(table.title)}**",
+        "",
+        _line(map(markdown_safe, table.full_headings)),
+        _line(["---"] * len(table.headings)),
+        *(_line(map(_cell, row.cells)) for row in table.rows),
+        "",
+        *(f"> {markdown_safe(sentence)}\n" for sentence in table.sentences),
+    ]
+    return "\n".join(lines)
+
+
+def _cell(cell: Cell) -> str:
+    """Return a cell; Markdown has no colour that renders everywhere, so that red is a sign and bold type."""
+    safe = markdown_safe(cell.text)
+    return f"🔴 **{safe}**" if cell.alarm else safe
+
+
+def _line(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,50 @@
+"""Number formats of tables, sentences and figures: a dash stands for a number that there is not."""
+
+from collections.abc import Callable
+from math import isfinite
+
+NONE = "–"
+"""In place of a number."""
+Limits = tuple[float | None, float | None]
+"""A 95 % interval; (None, None) where the data set no limits."""
+Write = Callable[[float | None], str]
+
+
+def percent(value: float | None, digits: int = 1) -> str:
+    """Return a share as a percentage, by default with one decimal."""
+    return number(None if value is None else 100 * value, digits)
+
+
+def whole(value: float | None) -> str:
+    """Return a share as a percentage without decimals."""
+    return percent(value, 0)
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """Return a number with two decimals by default, and zero without a sign; a dash for None and NaN."""
+    return NONE if value is None or value != value else f"{round(value, digits) + 0.0:.{digits}f}"
+
+
+def signed(value: float | None, digits: int = 2) -> str:
+    """Return the same with its sign."""
+    return NONE if value is None or value != value else f"{value:+.{digits}f}"
+
+
+def points(value: float | None) -> str:
+    """Return a difference of shares in percentage points, with its sign and one decimal."""
+    return signed(None if value is None else 100 * value, 1)
+
+
+def p_text(value: float | None) -> str:
+    """Return a p-value with three decimals."""
+    return "< 0.001" if value is not None and value < 0.001 else number(value, 3)
+
+
+def with_limits(value: float | None, limits: Limits | None, write: Write) -> str:
+    """Return a value with its interval in brackets, if it has one, both in the format `write`."""
+    if limits is None or value is None or value != value:
+        return write(value)
+    low, high = limits
+    if low is None or high is None or not (isfinite(low) and isfinite(high)):
+        return f"{write(value)} [no limits]"
+    return f"{write(value)} [{write(low)}, {write(high)}]"

@@ -1,0 +1,74 @@
+"""The table that every command prints: text for people, the numbers behind it, and a method per format."""
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from probe_kit._system.csv_text import csv_of_rows
+from probe_kit._tables.content import Cell, Content, Heading, Row, grouped
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.console import Console, ConsoleOptions, RenderResult
+
+__all__ = ["Cell", "Heading", "Row", "Table", "grouped"]
+
+
+@dataclass(frozen=True)
+class Table(Content):
+    """A table with its formats; see `Content` for its fields. A rich console and a notebook print it as it is."""
+
+    def __rich_console__(self, console: "Console", options: "ConsoleOptions") -> "RenderResult":
+        from probe_kit._tables.terminal import lines
+
+        yield from lines(self, options.max_width)
+
+    def _repr_html_(self) -> str:
+        from probe_kit._tables.html import html
+
+        return html(self)
+
+    def to_markdown(self) -> str:
+        """Return the table in Markdown, its notes below it."""
+        from probe_kit._tables.markdown import markdown
+
+        return markdown(self)
+
+    def to_latex(self) -> str:
+        """Return a LaTeX `table` environment, see `probe_kit._tables.latex`."""
+        from probe_kit._tables.latex import latex
+
+        return latex(self)
+
+    def to_frame(self) -> "pd.DataFrame":
+        """Return the text as a data frame."""
+        import pandas as pd
+
+        return pd.DataFrame(self.texts, columns=self.columns)
+
+    def to_json(self) -> str:
+        """Return the numbers as a JSON list of objects."""
+        return json.dumps(self.numbers, indent=1, ensure_ascii=False)
+
+    def to_csv(self) -> str:
+        """Return the numbers as comma-separated values with a header.
+
+        An interval is two columns, `…_low` and `…_high`, empty where there is none.
+        """
+        intervals = {name for number in self.numbers for name, value in number.items() if _is_interval(value)}
+        rows = [dict(_flat(number, intervals)) for number in self.numbers]
+        return csv_of_rows(list(dict.fromkeys(name for row in rows for name in row)), rows)
+
+
+def _is_interval(value: Any) -> bool:
+    return isinstance(value, list | tuple) and len(value) == 2 and not any(isinstance(end, str) for end in value)
+
+
+def _flat(number: Mapping[str, Any], intervals: set[str]) -> Iterator[tuple[str, Any]]:
+    for name, value in number.items():
+        if name in intervals:
+            low, high = value or (None, None)
+            yield from ((f"{name}_low", low), (f"{name}_high", high))
+        else:
+            yield name, value

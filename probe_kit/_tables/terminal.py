@@ -1,0 +1,200 @@
+"""Tables on a console that never truncate numbers: columns that do not fit move below, or are left out by name."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import groupby, pairwise
+from typing import TYPE_CHECKING
+
+from probe_kit._tables.content import Cell, Content, Row
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+GAP = 2
+"""Blanks between columns."""
+_INDENT = "  "
+"""Of a row's name below that of its section."""
+
+
+def lines(table: Content, width: int) -> "Iterator[RenderableType]":
+    """Yield what a console of so many columns shows: the title, one table or several, and the notes."""
+    from rich.text import Text
+
+    left_out: list[str] = []
+    if table.overflow == "leave out":
+        table, left_out = _fitting(table, width)
+    elif table.overflow == "fold" and width_of(table) > width:
+        table = _folded(table)
+    yield Text(table.title, style="italic")
+    yield from _tables(table, width)
+    notes = [*table.sentences, *[f"With --details or more room: {', '.join(left_out)}."] * bool(left_out)]
+    if notes:
+        yield Text(" ".join(notes), style="dim")
+    yield Text()
+
+
+def width_of(table: Content) -> int:
+    """Return the columns of a console on which the table is one."""
+    return _name_width(table) + sum(_column_widths(table)[table.names :])
+
+
+def _folded(table: Content) -> Content:
+    """Return the table with intervals below their values, and words broken at commas."""
+    rows = [replace(row, cells=tuple(map(_two_lines, row.cells))) for row in table.rows]
+    return replace(table, rows=tuple(rows))
+
+
+def _two_lines(cell: Cell) -> Cell:
+    text = f"{cell.value}\n{cell.limits}" if cell.limits else cell.text.replace(", ", ",\n")
+    return replace(cell, text=text)
+
+
+def _fitting(table: Content, width: int) -> tuple[Content, list[str]]:
+    """Return the table with the columns that fit, the first ones first, and the headings of the others."""
+    room, fitting, left_out = width - _name_width(table), [], []
+    needed = _column_widths(table)
+    for at in range(table.names, len(table.headings)):
+        if needed[at] <= room:
+            fitting.append(at)
+            room -= needed[at]
+        else:
+            left_out.append(table.headings[at].text)
+    return (table.only([*range(table.names), *fitting]), left_out) if fitting else (table, [])
+
+
+# -- names of rows ---------------------------------------------------------------------------------------------
+
+
+def _sections(table: Content) -> list[str]:
+    """Return the section of every row: its first name where names of the first column repeat, else nothing."""
+    firsts = [row.cells[0].text for row in table.rows]
+    is_divided = table.names > 1 and any(one == other for one, other in pairwise(firsts))
+    return firsts if is_divided else [""] * len(firsts)
+
+
+def _names(table: Content) -> list[str]:
+    """Return what stands before every row: its names, and below a section those behind the first."""
+    found = []
+    for row, section in zip(table.rows, _sections(table), strict=True):
+        texts = [cell.text for cell in row.cells[: table.names]]
+        found.append(f"{_INDENT}{' · '.join(texts[1:])}" if section else " · ".join(texts))
+    return found
+
+
+def _name_heading(table: Content) -> str:
+    return " · ".join(table.columns[: table.names])
+
+
+def _name_width(table: Content) -> int:
+    return max(map(_text_width, (_name_heading(table), *_names(table))))
+
+
+def _text_width(text: str) -> int:
+    from rich.cells import cell_len
+
+    return max(map(cell_len, text.split("\n")), default=0)
+
+
+def _column_widths(table: Content) -> list[int]:
+    """Return the width of every column with the gap before it."""
+    return [GAP + max(map(_text_width, column)) for column in zip(table.columns, *table.texts, strict=True)]
+
+
+# -- tables ----------------------------------------------------------------------------------------------------
+
+
+def _tables(table: Content, width: int) -> "Iterator[RenderableType]":
+    """Yield one table, or several that each repeat the names of the rows; columns of one head stay together."""
+    from rich.text import Text
+
+    room, needed = width - _name_width(table), _column_widths(table)
+    columns = range(table.names, len(table.headings))
+    if any(needed[at] > room for at in columns):
+        yield from _lists(table)
+        return
+    heads = [list(own) for _, own in groupby(columns, key=lambda at: table.headings[at].group)]
+    blocks: list[list[int]] = []
+    for piece in (piece for head in heads for piece in _pieces(head, needed, room)):
+        if blocks and sum(needed[at] for at in (*blocks[-1], *piece)) <= room:
+            blocks[-1] += piece
+        else:
+            blocks.append(list(piece))
+    for block in blocks:
+        if len(blocks) > 1:
+            yield Text(f"\n{' · '.join(dict.fromkeys(table.headings[at].group for at in block))}".rstrip())
+        yield from _table(table, block)
+
+
+def _pieces(head: Sequence[int], needed: Sequence[int], room: int) -> Iterator[list[int]]:
+    """Yield the columns below a head in as few pieces as fit into `room`."""
+    columns: list[int] = []
+    for at in head:
+        if columns and sum(needed[column] for column in (*columns, at)) > room:
+            yield columns
+            columns = []
+        columns.append(at)
+    yield columns
+
+
+def _table(table: Content, columns: Sequence[int]) -> "Iterator[RenderableType]":
+    """Yield one table. A row that has nothing to say in these columns is left out."""
+    from rich.text import Text
+
+    rows = [
+        (section, name, row)
+        for section, name, row in zip(_sections(table), _names(table), table.rows, strict=True)
+        if any(row.cells[at].text for at in columns)
+    ]
+    is_divided = any(section for section, _, _ in rows)
+    if is_divided:
+        yield _empty(table, columns)
+    for section, below in groupby(rows, key=lambda row: row[0]):
+        if is_divided:
+            yield Text(section, style="bold")
+        made = _empty(table, columns, has_headings=not is_divided)
+        for _, name, row in below:
+            cells = [row.cells[at] for at in columns]
+            height = max(cell.text.count("\n") for cell in cells)
+            made.add_row(Text(name + "\n" * height), *map(_text, cells), style=_style(row))
+        yield made
+
+
+def _empty(table: Content, columns: Sequence[int], has_headings: bool = True) -> "RichTable":
+    """Return a table without rows, whose columns have the same width with and without their headings."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    needed = _column_widths(table)
+    made = RichTable(
+        box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False, show_header=has_headings
+    )
+    made.add_column(Text(_name_heading(table)), no_wrap=True, vertical="bottom", min_width=_name_width(table))
+    for at in columns:
+        made.add_column(Text(table.headings[at].text), no_wrap=True, min_width=needed[at] - GAP)
+    return made
+
+
+def _text(cell: Cell) -> "Text":
+    from rich.text import Text
+
+    return Text(cell.text, style="bold red" if cell.alarm else "bold" if cell.strong else "")
+
+
+def _style(row: Row) -> str:
+    return " ".join(["bold"] * row.is_mean + ["italic"] * row.is_difference)
+
+
+def _lists(table: Content) -> "Iterator[RenderableType]":
+    """Yield a line per value, for consoles on which not even one column fits beside the names."""
+    from rich.text import Text
+
+    for section, name, row in zip(_sections(table), _names(table), table.rows, strict=True):
+        before = f"{section}: " if section else ""
+        yield Text(f"{before}{_name_heading(table)} {name}", style=_style(row) or "underline")
+        for heading, cell in zip(table.headings[table.names :], row.cells[table.names :], strict=True):
+            if cell.text:
+                yield Text(" ".join(f"{heading.text}:".split()), style="dim")
+                yield Text(f"  {cell.text}", style=_text(cell).style, overflow="fold")

@@ -1,0 +1,214 @@
+"""Tables of what was compared: wordings, sizes of the picture, VLM − VLA, and answers with probes and success."""
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
+
+from probe_kit._tables.numbers import number, percent, with_limits
+from probe_kit._tables.table import Heading, Table
+from probe_kit.retention.behaviour.wordings import EVERY, WordingPair
+from probe_kit.retention.columns.text import P_DECIDES, is_vlm, model_name, once_per_category, success_interval
+from probe_kit.retention.compare.known_used import OVERALL, PAIRS, CategoryCounts, Comparison, KnownUsedTable
+from probe_kit.retention.compare.source_weights import Relation
+from probe_kit.retention.compare.vlm_vla import VlmVlaDifference
+from probe_kit.retention.rows.row import MEAN, RetentionRow
+
+_LADDER = (
+    "same items, same seeds; only one: episodes right in the first wording alone, and in the second alone; p: "
+    "McNemar, exact; by group: items that share pictures count once; Holm: that, over all categories, pairs and "
+    "runs shown"
+)
+
+
+def wording_tables(wordings: Sequence[WordingPair]) -> list[Table]:
+    """The wordings of each run against each other."""
+    return [
+        Table.of(
+            title,
+            ("category", "wordings", "n", "SR %", "only one", "p", "p by group", "Holm"),
+            [
+                (
+                    row.category,
+                    f"{row.wording} / {row.other}",
+                    str(row.n_episodes),
+                    f"{percent(row.sr)} / {percent(row.other_sr)}",
+                    f"{row.only} / {row.only_other}",
+                    *(number(p, 3) for p in (row.p, row.p_groups, row.p_holm)),
+                )
+                for row in pairs
+            ],
+            mean=EVERY,
+            notes=[_LADDER],
+        )
+        for title, pairs in groupby(wordings, key=lambda pair: f"Wordings, {pair.label}")
+    ]
+
+
+def size_table(means: Sequence[RetentionRow]) -> list[Table]:
+    """Mean accuracy by model and prompt, a column per size of the picture; none for fewer than two VLM runs."""
+    asked = [row for row in once_per_category(means) if is_vlm(row) and row.category == MEAN]
+    if len(asked) < 2:
+        return []
+    sizes = sorted(
+        {str(row.answers.picture_size) for row in asked}, key=lambda size: [int(n) for n in size.split("x")]
+    )
+    lines: dict[tuple[str, str], dict[str, str]] = {}
+    for row in asked:
+        name = f"{row.run.model} (random weights)" if row.run.random_weights else row.run.model
+        extras = [
+            str(part) for part in (row.answers.picture, row.answers.asked_for) if part not in ("frame", "target")
+        ]
+        prompt = " · ".join([str(row.answers.prompt), *extras])
+        # Two runs of one model, prompt and size, such as two checkpoints, stand in lines of their own.
+        while str(row.answers.picture_size) in lines.get((name, prompt), {}):
+            name = model_name(row) if name != model_name(row) else f"{name} '"
+        lines.setdefault((name, prompt), {})[str(row.answers.picture_size)] = success_interval(row)
+    cells = [(*name, *(found.get(size, "–") for size in sizes)) for name, found in lines.items()]
+    title, note = "Accuracy by prompt and size of the picture", "mean over categories in %, with its 95 % interval"
+    return [Table.of(title, ("model", "prompt", *sizes), cells, names=2, notes=[note])]
+
+
+# -- VLM − VLA ---------------------------------------------------------------------------------------------------
+
+_SOURCES: Mapping[Relation, str] = {
+    "yes": "the policy grew from these weights",
+    "no": "the policy did NOT grow from these weights",
+    "unknown": "unknown whether the policy grew from these weights",
+}
+
+
+def vlm_vla_tables(gaps: Sequence[VlmVlaDifference]) -> list[Table]:
+    """One table per pair of a VLM run and a policy run."""
+    return [
+        _gap_table(asked, acted, list(rows))
+        for (asked, acted), rows in groupby(gaps, key=lambda gap: (gap.asked, gap.acted))
+    ]
+
+
+def _gap_table(asked: str, acted: str, rows: Sequence[VlmVlaDifference]) -> Table:
+    frames = {row.same_frames for row in rows}
+    first = (
+        "the same first frames" if frames == {True} else "OTHER first frames" if False in frames else "no hashes"
+    )
+    items = "the same items" if all(row.paired for row in rows) else "OTHER items: not paired, no p"
+    tests = (
+        "p: exact, whole groups of items flipped; (Holm): over the categories of all pairs shown, means by "
+        f"themselves; {P_DECIDES}"
+    )
+    cells = [
+        (
+            row.category,
+            percent(row.accuracy),
+            percent(row.sr),
+            with_limits(row.difference, row.difference_ci, percent),
+            number(row.p, 4),
+            number(row.p_holm, 4),
+            str(row.n_items) if row.of_items in (None, row.n_items) else f"{row.n_items} of {row.of_items}",
+        )
+        for row in rows
+    ]
+    columns = ("category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p", "p (Holm)", "items")
+    notes = [items, first, _SOURCES[rows[0].source], tests]
+    return Table.of(f"VLM − VLA: {asked} − {acted}", columns, cells, mean=MEAN, notes=["; ".join(notes)])
+
+
+# -- answer, probe, success --------------------------------------------------------------------------------------
+
+Columns = Sequence[tuple[str, Callable[[CategoryCounts], str]]]
+_LEGEND = (
+    "answer: the VLM answers right; probe: its held-out decision is right; success: the cube ends right; each in "
+    "both layouts of an item, which a coin manages in 25 %"
+)
+_NAMES = {"answered": "answer", "encoded": "probe", "acted": "success"}
+_CODES = "a capital letter for what is right, a small one for what is not"
+_TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) over all categories and pairs shown"
+
+
+def known_used_tables(joined: KnownUsedTable) -> list[Table]:
+    """Counts of items, which of them, tests, and counts of single episodes."""
+    probes = f"probes in view {joined.view}" if joined.view else "no probes: answer and success only"
+    title = f"Answer, probe, success: {joined.asked} (by {joined.score}) · {joined.acted}"
+    rows = joined.rows
+    which = "Which of them: VLM · probe · success (expected of coins)"
+    return [
+        _counts(title, f"{_LEGEND}; {probes}", rows, ("Items", _SHARES), ("Answer right, without success", _LOST)),
+        _counts(which, _CODES, rows, ("", _codes(rows))),
+        _counts("Equally many?", _TESTS, rows, ("", _tests())),
+        _counts("Single episodes (nothing is tested)", "", rows, ("", _episodes(rows))),
+    ]
+
+
+def _counts(title: str, note: str, rows: Sequence[CategoryCounts], *groups: tuple[str, Columns]) -> Table:
+    headings = [Heading(name, group=group) for group, columns in groups for name, _ in columns]
+    cells = [(row.category, *(cell(row) for _, columns in groups for _, cell in columns)) for row in rows]
+    return Table.of(title, ("category", *headings), cells, mean=OVERALL, notes=[note]).filled()
+
+
+def _share(count: int | None, row: CategoryCounts) -> str:
+    return "–" if count is None else f"{count} ({percent(count / row.n_items, 0)} %)"
+
+
+_SHARES: Columns = [
+    ("items (groups)", lambda row: f"{row.n_items} ({row.n_groups})"),
+    ("answer right", lambda row: _share(row.answered_correctly, row)),
+    ("probe right", lambda row: _share(row.encoded, row)),
+    ("success", lambda row: _share(row.acted_correctly, row)),
+    ("shown", lambda row: {True: "yes", False: "no", None: "–"}[row.has_signal]),
+]
+_LOST: Columns = [
+    (
+        "answer and probe right",
+        lambda row: "–" if row.answered_and_encoded is None else str(row.answered_and_encoded),
+    ),
+    (
+        "of these without success % [95 %]",
+        lambda row: with_limits(row.share_not_acted_on, row.share_not_acted_on_ci, percent),
+    ),
+    ("answer with success, p", lambda row: number(row.p_linked, 4)),
+]
+
+
+def _codes(rows: Sequence[CategoryCounts]) -> Columns:
+    codes = dict.fromkeys(code for row in rows for code in row.counts)
+    return [(_spelt(code), _count_of(code)) for code in codes]
+
+
+def _count_of(code: str) -> Callable[[CategoryCounts], str]:
+    def cell(row: CategoryCounts) -> str:
+        return f"{row.counts[code]} ({row.guessed[code]:.1f})" if code in row.counts else "–"
+
+    return cell
+
+
+def _episodes(rows: Sequence[CategoryCounts]) -> Columns:
+    codes = dict.fromkeys(code for row in rows for code in row.episodes)
+    return [(_spelt(code), _episodes_of(code)) for code in codes]
+
+
+def _episodes_of(code: str) -> Callable[[CategoryCounts], str]:
+    return lambda row: str(row.episodes.get(code, "–"))
+
+
+def _spelt(code: str) -> str:
+    """`101` as V p S: a capital for what is right, a small letter for what is not."""
+    letters = zip("VPS", code, strict=True)
+    return " ".join(letter if mark == "1" else letter.lower() for letter, mark in letters if mark != "-")
+
+
+def _tests() -> Columns:
+    return [
+        (f"{_NAMES[first]} − {_NAMES[second]}: only one of them, p (Holm)", _test_of(first, second))
+        for first, second in PAIRS
+    ]
+
+
+def _test_of(first: str, second: str) -> Callable[[CategoryCounts], str]:
+    def cell(row: CategoryCounts) -> str:
+        found = [one for one in row.comparisons if (one.first, one.second) == (first, second)]
+        return _spell_test(found[0]) if found else "–"
+
+    return cell
+
+
+def _spell_test(one: Comparison) -> str:
+    corrected = "" if one.p_holm is None else f" ({number(one.p_holm, 4)})"
+    return f"{one.only_first} against {one.only_second}, {number(one.p, 4)}{corrected}"

@@ -1,0 +1,262 @@
+"""Every format shows every cell of a table as the text that it is: a parser of each format reads it."""
+
+import csv
+import io
+import json
+import re
+from html.parser import HTMLParser
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from markdown_it import MarkdownIt
+from rich.console import Console
+
+from probe_kit._tables.latex import _SPECIAL, MOST_COLUMNS, latex_page
+from probe_kit._tables.table import Cell, Heading, Row, Table, grouped
+
+HOSTILE = [
+    "<img src=x onerror=alert(1)>", "</script><b>", "[text](https://evil.example)", "**bold**", "a | b",
+    "&lt;b&gt;", "\\input{secret}", "100 % & $x$ #1 {a}_b^c~", "[red]x[/red]", "[/]", "=1+1", "a_b", "x\\",
+    "λ|π × 2", "'; DROP", "–",
+]  # fmt: skip
+CELLS = st.one_of(
+    st.sampled_from(HOSTILE),
+    st.text("abX1 _*~<>[]()!#|\\&;:/.@-+=$'\"%{}^αΔ±", min_size=1, max_size=14).map(str.strip).filter(bool),
+)
+SETTINGS = settings(max_examples=40, deadline=None)
+
+
+@st.composite
+def tables(draw: st.DrawFn) -> Table:
+    """Tables of hostile names: some means, differences, bold, red and coloured cells, equal headings."""
+    width, names = draw(st.integers(2, 5)), draw(st.integers(1, 2))
+    headings = [Heading(draw(CELLS), group=draw(st.sampled_from(["", "first", "a|b"]))) for _ in range(width)]
+    rows = [
+        Row(
+            tuple(
+                Cell(draw(CELLS), heat=draw(st.sampled_from([None, 0.1, 0.9])), alarm=draw(st.booleans()))
+                for _ in range(width)
+            ),
+            is_mean=draw(st.booleans()),
+            is_difference=draw(st.booleans()),
+        )
+        for _ in range(draw(st.integers(1, 4)))
+    ]
+    return Table(draw(CELLS), tuple(headings), tuple(rows), min(names, width - 1), (draw(CELLS),))
+
+
+def words(text: str) -> str:
+    return "".join(text.split())
+
+
+# -- one property per format -------------------------------------------------------------------------------------
+
+
+@SETTINGS
+@given(tables())
+def test_markdown_is_one_table_of_the_same_cells(table: Table) -> None:
+    parser = MarkdownIt("commonmark", {"html": True}).enable("table")
+    tokens = parser.parse(table.to_markdown())
+    assert [token.type for token in tokens].count("table_open") == 1
+    inside = [token for token in tokens if token.type == "inline"]
+    plain = [
+        "".join(
+            child.content
+            for child in token.children or []
+            if child.type in ("text", "text_special", "code_inline")
+        )
+        for token in inside
+    ]
+    assert all({child.type for child in token.children or []} <= ALLOWED for token in inside)
+    count, rows = len(table.headings), len(table.rows)
+    cells = plain[1 + count : 1 + count + rows * count]
+    shown = [cell.text if not cell.alarm else f"🔴 {cell.text}" for row in table.rows for cell in row.cells]
+    assert [words(cell).replace("`", "") for cell in cells] == [words(cell).replace("`", "") for cell in shown]
+
+
+ALLOWED = {"text", "text_special", "strong_open", "strong_close", "softbreak"}
+
+
+@SETTINGS
+@given(tables())
+def test_latex_has_a_line_per_row_whose_cells_read_back(table: Table) -> None:
+    text = table.to_latex()
+    body = text.partition(r"\midrule")[2].partition(r"\bottomrule")[0]
+    lines = [line.removesuffix(r" \\").strip() for line in body.strip().splitlines()]
+    assert len(lines) == len(table.rows)
+    back = {code: character for character, code in _SPECIAL.items() if character not in "\n\r\0"} | {"-{}": "-"}
+    pattern = re.compile("|".join(re.escape(code) for code in sorted(back, key=len, reverse=True)))
+    for line, row in zip(lines, table.rows, strict=True):
+        cells = re.split(r"(?<!\\) ?& ?", line)
+        assert len(cells) == len(row.cells)
+        for found, cell in zip(cells, row.cells, strict=True):
+            bare = re.sub(r"\\cellcolor\{\w+\} ?", "", found)
+            for wrap in (r"\textcolor{red}{", r"\textbf{"):
+                if wrap in bare:
+                    bare = bare.replace(wrap, "", 1).removesuffix("}")
+            assert words(pattern.sub(lambda match: back[match[0]], bare)) == words(cell.text)
+    assert bool(re.search(r"\\cellcolor", text)) == any(
+        c.heat is not None for row in table.rows for c in row.cells
+    )
+
+
+class Reader(HTMLParser):
+    """The texts of cells and headings, and the names of all elements."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.elements: list[str] = []
+        self.cells: list[str] = []
+        self._inside = False
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append(tag)
+        assert not [name for name, _ in attrs if name.startswith("on")]
+        self._inside |= tag in ("td", "th")
+        if tag in ("td", "th"):
+            self.cells.append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        self._inside &= tag not in ("td", "th")
+
+    def handle_data(self, data: str) -> None:
+        if self._inside:
+            self.cells[-1] += data
+
+
+@SETTINGS
+@given(tables())
+def test_html_holds_the_cells_as_text_and_no_element_of_theirs(table: Table) -> None:
+    reader = Reader()
+    reader.feed(table._repr_html_())
+    assert set(reader.elements) <= {
+        "style", "div", "table", "caption", "thead", "tbody", "tfoot", "tr", "th", "td", "span", "button",
+    }  # fmt: skip
+    ordered = [*(row for row in table.rows if not row.is_mean), *(row for row in table.rows if row.is_mean)]
+    cells = [words(text).replace("\u00a0", "") for text in reader.cells[len(table.headings) :]]
+    assert sorted("".join(sorted(cell)) for cell in cells) == sorted(
+        "".join(sorted(words(cell.text))) for row in ordered for cell in row.cells
+    )
+
+
+@SETTINGS
+@given(tables(), st.sampled_from([20, 40, 80, 200]))
+def test_a_console_of_any_width_truncates_nothing_and_runs_markup_as_text(table: Table, width: int) -> None:
+    console = Console(width=width, file=io.StringIO())
+    console.print(table)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert max(map(len, text.splitlines())) <= width
+    shown = words(text)
+    for row in table.rows:
+        for cell in row.cells[table.names :]:
+            assert words(cell.text) in shown
+
+
+@SETTINGS
+@given(st.lists(st.fixed_dictionaries({"name": CELLS, "ci": st.sampled_from([(0.1, 0.2), None])}), min_size=1))
+def test_json_and_csv_hold_the_numbers_and_no_cell_that_a_spreadsheet_computes(numbers: list[dict]) -> None:
+    table = Table.of("t", ("name",), [("x",)], numbers=tuple(numbers))
+    plain = [{"name": one["name"], "ci": one["ci"] and list(one["ci"])} for one in numbers]
+    assert json.loads(table.to_json()) == plain
+    for line, one in zip(csv.DictReader(io.StringIO(table.to_csv())), numbers, strict=True):
+        assert line["name"].lstrip("'") == one["name"].lstrip("'")
+        assert line["name"][0] not in "=+-@"
+        if any(other["ci"] for other in numbers):
+            assert (line["ci_low"], line["ci_high"]) == (("0.1", "0.2") if one["ci"] else ("", ""))
+
+
+# -- what single formats promise ---------------------------------------------------------------------------------
+
+WIDE = Table.of(
+    "Rates: a model",
+    (Heading("system"), Heading("category"), *grouped(("first", ("rate %",)), ("second", ("interval",)))),
+    [
+        ("a policy with a long name", "color", "98.1", "[90, 99]"),
+        ("a policy with a long name", "mean", "72.5", "[60, 80]"),
+        ("another", "color", "3.4", "[1, 9]"),
+    ],
+    names=2,
+    mean="mean",
+    notes=["a note"],
+)
+
+
+def printed(table: Table, width: int) -> list[str]:
+    console = Console(width=width, file=io.StringIO())
+    console.print(table)
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
+
+
+def test_rows_stand_below_the_name_of_their_section_which_is_written_once() -> None:
+    assert printed(WIDE, 80)[3:10] == [
+        "a policy with a long name",
+        "  color            98.1    [90, 99]",
+        "  mean             72.5    [60, 80]",
+        "another",
+        "  color            3.4     [1, 9]",
+        "A note.",
+        "",
+    ]
+
+
+@pytest.mark.parametrize("width", [20, 30, 36, 44, 80])
+def test_sections_are_named_and_no_value_is_cut_at_any_width(width: int) -> None:
+    text = " ".join(" ".join(printed(WIDE, width)).split())
+    for value in ("98.1", "72.5", "3.4", "[90, 99]", "[60, 80]", "[1, 9]"):
+        assert text.count(value) == 1
+    assert "another" in text
+    assert "a policy with a long name" in text
+
+
+def test_intervals_fold_below_their_values_before_a_table_is_divided() -> None:
+    table = Table.of("t", ("category", "rate %", "verdict"), [("color", "98 [90, 99] ✓", "a, b")], overflow="fold")
+    assert printed(table, 80)[3] == "color     98 [90, 99] ✓  a, b"
+    assert printed(table, 30)[3:5] == ["color     98 ✓      a,", "          [90, 99]  b"]
+
+
+def test_columns_that_do_not_fit_are_left_out_by_name() -> None:
+    columns = ("category", *(f"column {number}" for number in range(9)))
+    table = Table.of("t", columns, [("color", *"123456789")], overflow="leave out")
+    text = " ".join(printed(table, 40))
+    assert "column 2" in text.partition("With --details")[0]
+    assert text.endswith("more room: column 3, column 4, column 5, column 6, column 7, column 8. ")
+
+
+def test_a_wide_tabular_is_divided_between_groups_and_each_has_its_lines_width() -> None:
+    heads = (("a", 6), ("b", 6), ("c", 2), ("", 2))
+    names = iter(f"c{at}" for at in range(1, 17))
+    columns = (Heading("c0"), *grouped(*((head, [next(names) for _ in range(count)]) for head, count in heads)))
+    text = Table.of("wide", columns, [tuple(map(str, range(17)))]).to_latex()
+    counts = [line.count("&") + 1 for line in text.splitlines() if line.startswith(("c0", "0 "))]
+    assert counts == [MOST_COLUMNS, MOST_COLUMNS, 5, 5]
+    assert text.count(r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%") == 2
+    assert text.count(r"\begin{table}") == 1
+    assert r"\multicolumn{6}{c}{a}" in text
+    assert r"\begin{tabular}{lrrrrrrrrrrrr}" in text, "words to the left, numbers to the right"
+
+
+def test_every_table_of_a_page_has_a_label_of_its_own_and_colours_are_asked_for_where_they_are_used() -> None:
+    bare, coloured = (
+        Table.of("Rates", ("a", "b"), [("x", "1")]),
+        Table.of("Rates", ("a", "b"), [("x", Cell("1", heat=0.5))]),
+    )
+    assert re.findall(r"\\label\{(.*)\}", latex_page([bare, bare])) == ["tab:rates", "tab:rates-2"]
+    assert "xcolor" not in latex_page([bare])
+    assert r"\usepackage[table]{xcolor}" in latex_page([coloured])
+    assert r"\definecolor{pkheat3}" in latex_page([coloured])
+
+
+def test_columns_without_content_and_those_that_need_room_are_left_out() -> None:
+    table = Table.of("t", ("a", Heading("b", is_detail=True), "c"), [("x", "1", "–"), ("y", "2", "")]).filled()
+    assert table.columns == ("a", "b")
+    assert table.details(False) is None
+    assert (shown := table.details(True)) is not None
+    assert shown.columns == ("a", "b")
+
+
+def test_equal_headings_are_told_apart_by_the_name_over_them_where_a_page_has_one_line() -> None:
+    table = Table.of(
+        "t", grouped(("", ["n"]), ("left", ["rate"]), ("right", ["rate", "p"])), [("x", "1", "2", "3")]
+    )
+    assert table.full_headings == ("n", "left rate", "right rate", "p")
