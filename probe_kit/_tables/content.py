@@ -144,7 +144,7 @@ class Content:
         )
 
     def filled(self, *empty: str) -> Self:
-        """Return the table without columns in which no row has anything to show; `empty`: or one of these texts."""
+        """Return the table without columns in which no row has anything to show; or only these texts."""
         texts = [*zip(*self.texts, strict=True)] or [("",)] * len(self.headings)
         return self.only(
             [
