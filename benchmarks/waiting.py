@@ -116,13 +116,13 @@ def main() -> None:
                 settings = replace(
                     base, model="pi0", checkpoint=checkpoint, random_weights=True, options={"statistics": "bridge"}
                 )
-            chosen = prepare(replace(settings, calibrate=True))
+            chosen = prepare(settings.changed(batch="auto"))
             print(f"{subject}: {chosen.calibration.words}", flush=True)
             print(
                 f"  simulators beside it: {measure(chosen, folder / f'{subject}-beside', options.spread)}",
                 flush=True,
             )
-            alone = prepare(replace(settings, env_workers=0))
+            alone = prepare(settings.changed(env_workers=0))
             print(f"  none beside it:       {measure(alone, folder / f'{subject}-alone', False)}", flush=True)
 
 

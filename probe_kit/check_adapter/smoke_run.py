@@ -1,7 +1,6 @@
 """A run of two episodes, as `probe-kit extract` or `probe-kit ask` makes it, in a folder that is removed."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -33,9 +32,9 @@ def act_twice(model: str, chosen: Mapping[str, Any], instruction: str, capture_o
         env_workers=0,
         capture_only=capture_only,
         accept_units=True,  # a tiny checkpoint may have any statistics
+        max_steps=STEPS,
         **chosen,
     )
-    settings = replace(settings, scene=replace(settings.scene, max_steps=STEPS))
     _read_back(extract_run(settings, folder / "run"))
 
 

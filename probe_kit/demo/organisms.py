@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 from probe_kit._tables.numbers import number, percent
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
-from probe_kit.extract.protocols import scene_of
 from probe_kit.extract.vqa.templates import TEMPLATES
 from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
 from probe_kit.retention import RetentionRow, retention_table
@@ -125,15 +124,12 @@ class Finding:
 
 def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
     """How an organism that acts plays `suite`."""
-    scene = scene_of(organism.model)
-    if organism.max_steps is not None:
-        scene = scene_of(organism.model, max_steps=organism.max_steps)
     return ExtractSettings(
         organism.model,
         suite=suite.folder,
         random_weights=organism.random_weights,
         weights_seed=organism.weights_seed,
-        scene=scene,
+        max_steps=organism.max_steps,
         video="first",
     )
 

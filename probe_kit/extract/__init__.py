@@ -7,10 +7,10 @@ from probe_kit._system.lazy import lazy_names
 if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction, ask_run, extract_run, prepare, prepare_asks
     from probe_kit.extract.own_environments.contract import EnvEpisode, OwnEnvironment, Step
-    from probe_kit.extract.own_environments.env_source import EnvSource
     from probe_kit.extract.own_environments.source_contract import check_environment
-    from probe_kit.extract.recordings.lerobot_source import LeRobotSource
     from probe_kit.extract.settings import AskSettings, ExtractSettings
+    from probe_kit.extract.sources.environment import EnvSource
+    from probe_kit.extract.sources.recording import LeRobotSource
     from probe_kit.extract.vqa.templates import TEMPLATES
 
 __all__ = [
@@ -38,11 +38,11 @@ __getattr__, __dir__ = lazy_names(
         "ExtractSettings": "settings",
         "Extraction": "extraction",
         "EnvEpisode": "own_environments.contract",
-        "EnvSource": "own_environments.env_source",
+        "EnvSource": "sources.environment",
         "OwnEnvironment": "own_environments.contract",
         "Step": "own_environments.contract",
         "check_environment": "own_environments.source_contract",
-        "LeRobotSource": "recordings.lerobot_source",
+        "LeRobotSource": "sources.recording",
         "ask_run": "extraction",
         "extract_run": "extraction",
         "prepare": "extraction",

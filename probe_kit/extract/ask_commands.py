@@ -1,47 +1,31 @@
 """`probe-kit ask`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, out, progress, say
-from probe_kit.extract import command_options as own
+from probe_kit._terminal.field_options import command_with
+from probe_kit.extract import command_options as start
 from probe_kit.extract.commands import print_plan, print_sufficiency
+from probe_kit.extract.settings import AskSettings
+from probe_kit.extract.sources.scene import SceneOptions
 
 if TYPE_CHECKING:
     from probe_kit.runs import Run
 
+OWN_SCENE = frozenset(SceneOptions.model_fields) - {"scene"} | {"wordings"}
+"""Fields of a scene that questions leave as they are."""
 
+
+@command_with(*AskSettings.options(), offers=lambda name: name not in OWN_SCENE)
 def ask(
-    model: common.ModelName,
-    prompt: own.Prompts = own.P1_P2_SEEN,
-    picture_size: own.PictureSizes = own.SIZE_224,
-    out_folder: own.AskOutFolder = None,
-    checkpoint: common.Checkpoint = None,
-    options: common.ModelOptions = None,
-    suite: common.SuiteFolder = None,
-    categories: common.Categories = None,
-    items: own.EvenItems = None,
-    protocol: own.AskProtocol = None,
-    scene: common.Scene = None,
-    seed: common.Seed = 0,
-    device: common.Device = "cpu",
-    dtype: own.Dtype = None,
-    label: own.Label = None,
-    tokens: own.AskStoredTokens = "none",
-    frames: own.Frames = "ends",
-    picture: own.ShownPicture = "frame",
-    query: own.AskedObject = "target",
-    random_weights: common.RandomWeights = False,
-    weights_seed: common.WeightsSeed = 0,
-    batch: own.AskBatch = 1,
-    env_workers: common.EnvWorkers = None,
-    workers: common.Workers = 0,
-    ray: common.RayAddress = None,
-    inference_limit: common.InferenceLimit = None,
+    typed: Mapping[str, Any],
+    prompt: start.Prompts = start.P1_P2_SEEN,
+    picture_size: start.PictureSizes = start.SIZE_224,
+    out_folder: start.AskOutFolder = None,
     dry_run: common.DryRun = False,
-    allow_mixed: common.AllowMixed = False,
     force: common.Force = False,
 ) -> None:
     """Ask a vision-language model about the first frame of every episode.
@@ -53,12 +37,10 @@ def ask(
     The same command resumes interrupted runs. With more items or categories they grow and keep what they have.
     Other settings in the same folder are an error.
     """
-    chosen = own.settings_of(locals())
     from probe_kit.extract.extraction import prepare_asks
-    from probe_kit.extract.settings import AskSettings
     from probe_kit.runs.store import locate
 
-    wanted = AskSettings.per_prompt_and_size(chosen.pop("prompt"), chosen.pop("picture_size"), **chosen)
+    wanted = AskSettings.per_prompt_and_size(prompt, picture_size, typed)
     places = [None if out_folder is None else f"{out_folder.rstrip('/')}/{one.short_name}" for one in wanted]
     runs: list[Run] = []
     prepared = prepare_asks(wanted, places, fetch=not dry_run)

@@ -6,7 +6,7 @@ which batching changes more says so on its card and is never given more than the
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
 
@@ -18,7 +18,7 @@ from probe_kit.extract.rollout.controllers import PolicyController
 from probe_kit.extract.rollout.examples import example_observations
 from probe_kit.extract.rollout.stage import Ending, Stage
 from probe_kit.extract.rollout.worker import torch_threads
-from probe_kit.extract.settings import RunSettings
+from probe_kit.extract.settings import ExtractSettings
 from probe_kit.hooks.contract.observation import Observation
 
 LARGEST = 64
@@ -61,21 +61,21 @@ class Calibration:
         )
 
 
-def calibrated[Settings: RunSettings](
-    settings: Settings, controller: PolicyController, plan: Plan
-) -> tuple[Settings, Calibration]:
+def calibrated(
+    settings: ExtractSettings, controller: PolicyController, plan: Plan
+) -> tuple[ExtractSettings, Calibration]:
     """`settings` with a batch and simulating processes chosen for this machine, and what led to them.
 
     Takes BUDGET_S or a little more. Raises UsageError for settings that choose either by themselves.
     """
-    if settings.batch != 1 or settings.env_workers is not None:
+    if settings.machine.env_workers is not None:
         raise UsageError("--batch auto chooses batch and simulating processes: leave out --env-workers")
     example = example_observations(settings.scene, [plan.episodes[0].instruction])[0]
     most = largest_batch(controller.policy.card.batch, len(plan.episodes))
     with torch_threads(controller.threads):
         times = inference_times(lambda batch: _infer(controller, example, batch), most)
     found = choose(times, _turn(settings, controller, plan), cores_here())
-    return replace(settings, batch=found.batch, env_workers=found.env_workers), found
+    return settings.changed(batch=found.batch, env_workers=found.env_workers), found
 
 
 def largest_batch(of_card: int | None, episodes: int) -> int:
@@ -143,7 +143,7 @@ def _infer(controller: PolicyController, example: Observation, batch: int) -> No
         raise MemoryError(str(error)) from error
 
 
-def _turn(settings: RunSettings, controller: PolicyController, plan: Plan) -> float:
+def _turn(settings: ExtractSettings, controller: PolicyController, plan: Plan) -> float:
     """Seconds per inference that a simulator takes, with zero actions; setting up counts once per episode."""
     stage = Stage(settings.scene, None)
     try:

@@ -5,20 +5,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import counter, err, marked, out, progress, say
+from probe_kit._terminal.console import counter, err, marked, out, print_json, progress, say
+from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.plain_text import terminal_safe
-from probe_kit.extract import command_options as own
-from probe_kit.extract.own_environments import options as played
-from probe_kit.extract.recordings import options as recorded
+from probe_kit.extract import command_options as start
+from probe_kit.extract.config_files import read_config
+from probe_kit.extract.settings import ExtractSettings
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
     from probe_kit.extract import Extraction
     from probe_kit.extract.own_environments.environment_plan import EnvironmentPlan
     from probe_kit.extract.recordings.recorded_plan import RecordedPlan
-    from probe_kit.extract.settings import RunSettings
+    from probe_kit.extract.settings import Settings
     from probe_kit.runs import Run
-    from probe_kit.runs.store import Location
+    from probe_kit.runs.location import Location
     from probe_kit.suite.ladder import Wording
 
 
@@ -26,62 +27,15 @@ LARGE = 64 * 10**9
 """Bytes above which a run is begun with --yes only."""
 
 
+@command_with(*ExtractSettings.options())
 def extract(
-    model: common.ModelName,
-    out_folder: own.OutFolder = None,
-    checkpoint: common.Checkpoint = None,
-    options: common.ModelOptions = None,
-    suite: common.SuiteFolder = None,
-    categories: common.Categories = None,
-    items: own.EvenItems = None,
-    wordings: own.Wordings = None,
-    protocol: own.Protocol = None,
-    scene: common.Scene = None,
-    seed: common.Seed = 0,
-    device: common.Device = "cpu",
-    dtype: own.Dtype = None,
-    execute: own.Execute = None,
-    rotation: own.RotationOfActions = None,
-    capture_only: own.CaptureOnly = False,
-    accept_units: own.AcceptUnits = False,
-    label: own.Label = None,
-    tokens: own.StoredTokens = "pooled",
-    captured_calls: own.CapturedCalls = 1,
-    later_views: own.LaterViewsKept = "all",
-    frames: own.Frames = "ends",
-    video: own.Video = "none",
-    codec: own.StorageCodec = "zstd",
-    dataset: recorded.Dataset = None,
-    episodes: recorded.Episodes = None,
-    select: recorded.Select = None,
-    cameras: recorded.Cameras = None,
-    rotations: recorded.Rotations = None,
-    instruction: recorded.Instruction = None,
-    no_pixels: recorded.NoPixels = False,
-    env: played.Env = None,
-    env_options: played.EnvOptions = None,
-    max_steps: own.MaxSteps = None,
-    tile_side: own.TileSide = None,
-    light_level: own.LightLevel = None,
-    rendering: own.RenderingStyle = None,
-    background: own.Background = None,
-    picture_size: own.PictureSize = None,
-    epsilon: own.Epsilon = None,
-    arm: own.Arm = None,
-    arm_urdf: own.ArmUrdf = None,
-    start_grasped: own.StartGrasped = False,
-    early_stop: own.EarlyStop = False,
-    random_weights: common.RandomWeights = False,
-    weights_seed: common.WeightsSeed = 0,
-    batch: own.Batch = None,
-    env_workers: common.EnvWorkers = None,
-    workers: common.Workers = 0,
-    ray: common.RayAddress = None,
-    inference_limit: common.InferenceLimit = None,
+    typed: Mapping[str, Any],
+    out_folder: start.OutFolder = None,
+    config: start.ConfigFile = None,
+    print_config: start.PrintConfig = False,
     dry_run: common.DryRun = False,
-    allow_mixed: common.AllowMixed = False,
     force: common.Force = False,
-    large: own.Large = False,
+    large: start.Large = False,
 ) -> None:
     """Run a model in every episode and store its activations.
 
@@ -94,12 +48,14 @@ def extract(
     probe-kit extract --model pi0 --checkpoint DIR --dataset FOLDER --episodes 0:5 --select every:5
     probe-kit extract --model pi0 --checkpoint DIR --env kitchen:Kitchen --captured-calls 8
     """
-    chosen = own.settings_of(locals())
-    from probe_kit.extract import ExtractSettings, prepare
+    settings = ExtractSettings.of_command(typed, None if config is None else read_config(config))
+    if print_config:
+        print_json(settings.config())
+        return
+    from probe_kit.extract import prepare
     from probe_kit.runs.store import locate
 
-    settings = ExtractSettings.from_options(**chosen)
-    with err.status(f"loading {'recordings' if dataset else 'environment' if env else 'suite'} and model"):
+    with err.status(f"loading {settings.source.loads} and model"):
         extraction = prepare(settings, out_folder, fetch=not dry_run)
     location = locate(out_folder or Path("runs") / extraction.default_name())
     print_plan(extraction, location)
@@ -155,16 +111,21 @@ def _weights_row(extraction: "Extraction") -> dict[str, str]:
     settings, controller = extraction.settings, extraction.controller
     model: Any = getattr(controller, "policy", None) or getattr(controller, "model", None)
     loaded = None if model is None else model.card.parameters
-    words = weights_needed(settings.model, settings.checkpoint, settings.options, settings.dtype, loaded)
+    wanted = settings.model
+    words = weights_needed(wanted.family, wanted.checkpoint, wanted.options, wanted.dtype, loaded)
     return {"weights": words} if words else {}
 
 
-def _units_row(settings: "RunSettings") -> dict[str, str]:
+def _units_row(settings: "Settings") -> dict[str, str]:
     """Whose units the actions get, of a family whose checkpoints have several."""
     from probe_kit.hooks.registry import get_family
 
-    family = get_family(settings.model)
-    units = "" if family is None else family.whose_units(settings.checkpoint, settings.options, fetch=False)
+    family = get_family(settings.model.family)
+    units = (
+        ""
+        if family is None
+        else family.whose_units(settings.model.checkpoint, settings.model.options, fetch=False)
+    )
     return {"units": units} if units else {}
 
 
@@ -252,7 +213,7 @@ def print_sufficiency(extraction: "Extraction") -> None:
     from probe_kit.extract.recordings.recorded_plan import RecordedPlan
     from probe_kit.suite.validation.sufficiency import GROUPS_FOR_PROBES, Smallest, sufficiencies
 
-    plan, scored = extraction.plan, not getattr(extraction.settings, "capture_only", False)
+    plan, scored = extraction.plan, not extraction.identity().get("capture_only")
     if not isinstance(plan, Plan):
         groups = len({row.to_json()["group_id"] for row in plan.episodes})
         if groups < GROUPS_FOR_PROBES:
@@ -284,7 +245,9 @@ def _pace_row(extraction: "Extraction") -> dict[str, str]:
     """What a calibration chose; nothing where batch and processes were given."""
     if extraction.calibration is not None:
         return {"pace": extraction.calibration.words}
-    return {"pace": "batch auto: chosen when the model runs"} if extraction.settings.calibrate else {}
+    return (
+        {"pace": "batch auto: chosen when the model runs"} if extraction.settings.machine.batch == "auto" else {}
+    )
 
 
 def _protocol_row(identity: dict[str, Any]) -> dict[str, str]:

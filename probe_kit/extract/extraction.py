@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ from probe_kit.extract.rollout.events import Done, Event
 from probe_kit.extract.settings import (
     AskSettings,
     ExtractSettings,
-    RunSettings,
+    Settings,
     run_label,
 )
 from probe_kit.extract.workers.local import run_here
@@ -28,10 +28,11 @@ from probe_kit.runs.disk import check_if_full
 from probe_kit.runs.growth import check_other_settings, further_rows
 from probe_kit.runs.label import label_run
 from probe_kit.runs.layout import RUN_FILE
+from probe_kit.runs.location import Location
 from probe_kit.runs.root import read_root
 from probe_kit.runs.run import Run, open_run
 from probe_kit.runs.sealing import seal
-from probe_kit.runs.store import Location, locate
+from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ class Extraction(Prepared):
                     label_run(location, run_label(self.settings))
                 remaining = writer.remaining()
                 if remaining:
-                    writer.begin(self.settings.allow_mixed)
+                    writer.begin(self.settings.machine.allow_mixed)
                     self._play(writer, remaining, progress or notebook_progress("episodes"))
                 seal(location)
         return open_run(location)
@@ -108,9 +109,9 @@ class Extraction(Prepared):
             if len(scheduler.given_up) >= HOPELESS and not scheduler.done:
                 raise self._failure(scheduler, writer)
 
-        if self.settings.ray:
+        if self.settings.machine.ray:
             run_on_ray(self.settings, writer.location.address, scheduler, on_event)
-        elif self.settings.workers:
+        elif self.settings.machine.workers:
             run_in_processes(self.settings, writer.location.address, scheduler, on_event)
         else:
             run_here(self, writer, scheduler, on_event)
@@ -130,7 +131,7 @@ class Extraction(Prepared):
 
 
 def prepare(
-    settings: RunSettings,
+    settings: Settings,
     out: Path | str | Location | None = None,
     answer_model: "AnswerModel | None" = None,
     policy: "Policy | None" = None,
@@ -146,11 +147,13 @@ def prepare(
     """
     settings = as_protocol(settings)
     location = None if out is None else locate(out)
-    if settings.workers or settings.ray:
+    if settings.machine.workers or settings.machine.ray:
         # This process only plans; the GPUs belong to the workers.
-        here = replace(settings, device="cpu", calibrate=False)  # each worker calibrates on its own device
+        # Each worker calibrates on its own device.
+        measures = {"batch": 1} if settings.machine.batch == "auto" else {}
+        here = settings.changed(device="cpu", **measures)
         planned = load(here, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
-        chosen = replace(planned.settings, device=settings.device, calibrate=settings.calibrate)
+        chosen = planned.settings.changed(device=settings.machine.device, batch=settings.machine.batch)
         return Extraction(chosen, planned.plan, planned.card, None, declared=planned.declared)
     prepared = load(settings, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
     return Extraction(**{field.name: getattr(prepared, field.name) for field in fields(prepared)})
@@ -181,7 +184,7 @@ def prepare_asks(
         yield from (prepare(own, out, fetch=False) for own, out in zip(settings, outs, strict=True))
         return
     first = settings[0]
-    elsewhere = bool(first.workers or first.ray)
-    answer_model = load_answer_model(replace(first, device="cpu") if elsewhere else first)
+    elsewhere = first.machine.elsewhere
+    answer_model = load_answer_model(first.changed(device="cpu") if elsewhere else first)
     for own, out in zip(settings, outs, strict=True):
         yield prepare(own, out, answer_model)

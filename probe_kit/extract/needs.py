@@ -8,7 +8,7 @@ import numpy as np
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import RowPlan
-from probe_kit.extract.settings import RunSettings
+from probe_kit.extract.settings import Settings
 from probe_kit.hooks.contract.views import view_names
 from probe_kit.hooks.family import DTYPES
 from probe_kit.runs.layout import StoredStream
@@ -33,16 +33,21 @@ REPORT = 5_000_000
 """Bytes of a report with its figures."""
 
 
-def space_needed(plan: RowPlan, settings: RunSettings) -> dict[str, int]:
+def space_needed(plan: RowPlan, settings: Settings) -> dict[str, int]:
     """Bytes by part, uncompressed. Probes are those of one view; more views take as much again each."""
     return space_of(plan.streams, len(plan.episodes), settings)
 
 
-def space_of(streams: Sequence[StoredStream], episodes: int, settings: RunSettings) -> dict[str, int]:
+def space_of(streams: Sequence[StoredStream], episodes: int, settings: Settings) -> dict[str, int]:
     """The same for a number of episodes that store these streams."""
-    calls, later, with_tokens = settings.stored_calls, settings.stored_later, settings.tokens == "all"
-    films = {"all": episodes, "first": 1}.get(str(getattr(settings, "video", "none")), 0)
-    pictures = {"none": 0, "ends": THUMBNAILS, "all": FRAME * (settings.scene.max_steps + 1)}[settings.frames]
+    calls, later, with_tokens = (
+        settings.capture.calls,
+        settings.capture.later_views,
+        settings.capture.tokens == "all",
+    )
+    machine, frames = settings.machine, settings.source.steps() + 1
+    films = {"all": episodes, "first": 1, "none": 0}[machine.video]
+    pictures = {"none": 0, "ends": THUMBNAILS, "all": FRAME * frames}[machine.frames]
     sites = sum(len(stream.stream.sites()) for stream in streams)
     return {
         "activations": sum(stream.raw_bytes(with_tokens, calls, later) for stream in streams) * episodes,
@@ -71,7 +76,7 @@ class PlannedSizes:
         return 1 if model is None else max(1, model.card.execute)
 
 
-def planned_sizes(settings: RunSettings, instructions: Sequence[str] = ()) -> PlannedSizes | None:
+def planned_sizes(settings: Settings, instructions: Sequence[str] = ()) -> PlannedSizes | None:
     """The streams of a model by its configuration, where that is here, else as its family declares them.
 
     instructions: texts that it will read, for the number of tokens; else one of about ten words.
@@ -80,11 +85,11 @@ def planned_sizes(settings: RunSettings, instructions: Sequence[str] = ()) -> Pl
     """
     from probe_kit.hooks.registry import get_family
 
-    family = get_family(settings.model)
-    declared = None if family is None else family.declared_streams(settings.options)
+    family = get_family(settings.model.family)
+    declared = None if family is None else family.declared_streams(settings.model.options)
     if family is None or declared is None:
         return None
-    outline = family.outline(settings.checkpoint, settings.options, settings.dtype)
+    outline = family.outline(settings.model.checkpoint, settings.model.options, settings.model.dtype)
     if outline is None or outline.model is None:
         streams = [StoredStream.of(one.stream, one.tokens, view_names(one.roles)) for one in declared]
         why = "" if outline is None else f", because its own configuration cannot be read here: {outline.reason}"
@@ -101,7 +106,7 @@ def planned_sizes(settings: RunSettings, instructions: Sequence[str] = ()) -> Pl
             "" if tokens else "; its tokenizer is not here, so that numbers of tokens are of the released size"
         )
         source = f"of the checkpoint's configuration{counted}"
-    return PlannedSizes(tuple(streams) if settings.tokens != "none" else (), source, outline)
+    return PlannedSizes(tuple(streams) if settings.capture.tokens != "none" else (), source, outline)
 
 
 def _tokens(model: "Model", instructions: Sequence[str]) -> dict[str, int]:

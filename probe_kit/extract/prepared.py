@@ -8,7 +8,6 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.calibration import Calibration, calibrated
 from probe_kit.extract.early import asked_objects, check_model, check_place, check_words, check_writable
 from probe_kit.extract.needs import PlannedSizes, planned_sizes
-from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.plan import (
     Plan,
     PlannedEpisode,
@@ -18,10 +17,8 @@ from probe_kit.extract.plan import (
     plan_episodes,
     skipped_items,
 )
-from probe_kit.extract.protocols import protocol_identity
 from probe_kit.extract.recordings.early_fit import check_state_width, declared_inputs, raise_together
 from probe_kit.extract.recordings.lerobot_folder import fetched, open_lerobot
-from probe_kit.extract.recordings.lerobot_source import LeRobotSource
 from probe_kit.extract.recordings.recorded_plan import RecordedPlan, Recording
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import SCRIPTED, ActingController, PolicyController, ScriptedController
@@ -47,12 +44,15 @@ from probe_kit.extract.rollout.settings_checks import (
     check_misfit,
     check_unreachable,
 )
-from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings, run_label
+from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings, run_label
+from probe_kit.extract.sources.environment import EnvSource
+from probe_kit.extract.sources.recording import LeRobotSource
+from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.vqa.phrases import phrases
 from probe_kit.hashing import sha256_json
 from probe_kit.runs.layout import RUN_FILE, StoredStream
+from probe_kit.runs.location import Location
 from probe_kit.runs.provenance import provenance_here
-from probe_kit.runs.store import Location
 from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite, default_suite, load_suite
 from probe_kit.suite.build import ITEMS, default_folder
@@ -71,7 +71,7 @@ class Prepared:
     was loaded and the run has no name yet; empty where one was.
     """
 
-    settings: RunSettings
+    settings: Settings
     plan: RowPlan
     card: dict[str, Any]
     controller: ActingController | AnswerController | None
@@ -84,18 +84,17 @@ class Prepared:
         Runs with equal identity have equal numbers in the episodes that both have.
         """
         return {
-            **self.settings.choices(),
+            **self.settings.identity(),
             **self.card,
             **self.plan.identity,
             **({"scene": self.settings.scene.to_json()} if isinstance(self.plan, Plan) else {}),
-            **(protocol_identity(self.settings) if isinstance(self.settings, ExtractSettings) else {}),
         }
 
     def provenance(self) -> dict[str, Any]:
         """That of a process that plays with these settings here; with the decoder of recorded videos."""
         dtype: str | None = self.card.get("dtype")
         decoder = {} if self.plan.decoder is None else {"decoder": self.plan.decoder}
-        return provenance_here(self.settings.device, dtype) | decoder
+        return provenance_here(self.settings.machine.device, dtype) | decoder
 
     def writer(self, location: Location) -> RunWriter[RowPlan]:
         """A writer of the run at `location`, which it begins or continues.
@@ -109,16 +108,16 @@ class Prepared:
 
         A command with more items finds it too; one with other categories, wordings or another suite does not.
         """
-        named = [self.identity(), *self.plan.name_parts, self.settings.asked_wordings]
+        named = [self.identity(), *self.plan.name_parts, self.settings.wordings]
         # Without the weights' hash there is no name yet.
-        name = [self.settings.model, "…" if self.declared else sha256_json(named)[:8]]
+        name = [self.settings.model.family, "…" if self.declared else sha256_json(named)[:8]]
         if isinstance(self.settings, AskSettings):
             name = ["ask", name[0], self.settings.short_name, name[1]]
         return "-".join(name)
 
 
 def load(
-    settings: RunSettings,
+    settings: Settings,
     rehearsed: bool = False,
     location: Location | None = None,
     answer_model: "AnswerModel | None" = None,
@@ -136,12 +135,12 @@ def load(
     raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     settings = as_protocol(settings)
-    if isinstance(settings, ExtractSettings) and settings.source is not None:
+    if isinstance(settings, ExtractSettings) and isinstance(settings.source, LeRobotSource | EnvSource):
         return _load_source(settings, settings.source, location, policy, fetch)
     suite = check_run(settings, location, loaded=not (answer_model is None and policy is None), fetch=fetch)
     if not rehearsed:
         run_preflight(settings.scene, plan_episodes(suite, settings.seed))
-    wordings, objects = settings.asked_wordings, asked_objects(settings, suite)
+    wordings, objects = settings.wordings, asked_objects(settings, suite)
     asked = list(plan_episodes(suite, settings.seed, wordings, objects))
     if wordings is not None:
         skipped_items(suite, asked, wordings)
@@ -160,27 +159,33 @@ def load(
     if isinstance(settings, ExtractSettings) and isinstance(controller, PolicyController):
         settings = settings.with_every_call(controller.execute)
     plan = _plan(suite, controller.streams, settings, objects)
-    if settings.calibrate and isinstance(controller, PolicyController):
+    if (
+        isinstance(settings, ExtractSettings)
+        and isinstance(controller, PolicyController)
+        and settings.machine.batch == "auto"
+    ):
         settings, calibration = calibrated(settings, controller, plan)
         return Prepared(settings, plan, controller.identity, controller, calibration)
     return Prepared(settings, plan, controller.identity, controller)
 
 
-def _plan(suite: Suite, streams: list[StoredStream], settings: RunSettings, objects: Mapping[str, str]) -> Plan:
+def _plan(suite: Suite, streams: list[StoredStream], settings: Settings, objects: Mapping[str, str]) -> Plan:
     return make_plan(
-        suite, streams, settings.seed, settings.stored_calls, settings.tokens == "all", settings.asked_wordings,
-        objects, settings.stored_later,
+        suite, streams, settings.seed, settings.capture.calls, settings.capture.tokens == "all", settings.wordings,
+        objects, settings.capture.later_views,
     )  # fmt: skip
 
 
-def as_protocol(settings: RunSettings) -> RunSettings:
+def as_protocol(settings: Settings) -> Settings:
     """The settings with what their protocol or recording decides; see `ExtractSettings.followed`."""
     if not isinstance(settings, ExtractSettings):
         return settings
     if isinstance(settings.source, EnvSource):
         check_meaningless(settings)
         return settings
-    return settings.followed() if settings.source is None else _with_recording(settings, settings.source)
+    if isinstance(settings.source, LeRobotSource):
+        return _with_recording(settings, settings.source)
+    return settings.followed()
 
 
 def _with_recording(settings: ExtractSettings, source: LeRobotSource) -> ExtractSettings:
@@ -191,9 +196,9 @@ def _with_recording(settings: ExtractSettings, source: LeRobotSource) -> Extract
     check_meaningless(settings)
     folder = open_lerobot(source)
     if folder.repo is not None:
-        source = replace(source, folder=f"{folder.repo}@{folder.revision}")
+        source = source.model_copy(update={"folder": f"{folder.repo}@{folder.revision}"})
     calls = Recording.of(folder, source).most_frames
-    return replace(settings, source=source, captured_calls=calls, capture_only=True, frames="none")
+    return settings.changed(source=source, captured_calls=calls, capture_only=True, frames="none")
 
 
 def _load_source(
@@ -214,7 +219,7 @@ def _load_source(
     if not fetch and (sizes := planned_sizes(settings, opened.instructions)) is not None:
         streams = list(sizes.streams)
         if isinstance(opened, OpenedEnvironment):
-            execute = settings.execute or sizes.execute
+            execute = settings.task.execute or sizes.execute
             settings = settings.with_every_call(execute)
             planned: RowPlan = environment_plan(opened, None, streams, settings, execute)
         else:
@@ -234,18 +239,18 @@ def _before_loading(
     """Checks of words, and of cameras and state where the checkpoint's files declare them."""
     from probe_kit.hooks.registry import get_family
 
-    instructions, family = opened.instructions, get_family(settings.model)
+    instructions, family = opened.instructions, get_family(settings.model.family)
     checks: list[Callable[[], object]] = [
         lambda: check_words(settings, instructions, tuple(SCRIPTED)),
         lambda: _check_instructions(settings, instructions, fetch),
     ]
     if family is None or not isinstance(opened, Recording):
         return checks
-    declared = declared_inputs(family, settings.checkpoint, settings.options)
+    declared = declared_inputs(family, settings.model.checkpoint, settings.model.options)
     if declared is None:
         return checks
     cameras, state = declared
-    named = settings.checkpoint or settings.model
+    named = settings.model.checkpoint or settings.model.family
     return [
         lambda: opened.mapped(cameras),
         *checks,
@@ -257,10 +262,10 @@ def _prepared_environment(settings: ExtractSettings, opened: OpenedEnvironment, 
     fitted = fit_environment(opened, policy)
     names = [str(place) for place in range(fitted.example.state.size)]
     where = f"{opened.source.name}, the state after reset()"
-    check_units(fitted.unusual, names, where, fitted.policy, settings.accept_units)
+    check_units(fitted.unusual, names, where, fitted.policy, settings.machine.accept_units)
     controller = environment_controller(fitted, settings)
     settings = settings.with_every_call(controller.execute)
-    check_unfit(fitted.policy.card, settings.batch, fitted.example)
+    check_unfit(fitted.policy.card, settings.machine.observations, fitted.example)
     check_unreachable(settings, fitted.policy.card)
     planned = environment_plan(opened, fitted, controller.streams, settings, controller.execute)
     return Prepared(settings, planned, controller.identity, controller)
@@ -268,10 +273,12 @@ def _prepared_environment(settings: ExtractSettings, opened: OpenedEnvironment, 
 
 def _prepared_recording(settings: ExtractSettings, recording: Recording, policy: "Policy") -> Prepared:
     fitted = fit(recording, policy)
-    check_recorded_units(fitted, settings.accept_units)
-    settings = replace(settings, source=fitted.recording.source)
+    check_recorded_units(fitted, settings.machine.accept_units)
+    settings = settings.changed(source=fitted.recording.source)
     controller = recorded_controller(fitted, settings)
-    check_unfit(fitted.policy.card, settings.batch, example_of(fitted.recording, recording.instructions[0]))
+    check_unfit(
+        fitted.policy.card, settings.machine.observations, example_of(fitted.recording, recording.instructions[0])
+    )
     planned = recorded_plan(fitted.recording, controller.streams, settings, fitted.prediction)
     planned = replace(planned, other_actions=fitted.other_actions)
     return Prepared(settings, planned, controller.identity, controller)
@@ -298,8 +305,8 @@ def recorded_plan(
 ) -> RecordedPlan:
     """The rows of a recording. prediction: (chunk, D) of the model."""
     rows = tuple(recording.stretches(settings.seed))
-    per_call = sum(stream.raw_bytes(settings.tokens == "all") for stream in streams)
-    size = per_call * settings.stored_calls * len(rows)
+    per_call = sum(stream.raw_bytes(settings.capture.tokens == "all") for stream in streams)
+    size = per_call * settings.capture.calls * len(rows)
     return RecordedPlan(
         rows, tuple(streams), size, recording.dataset(prediction), recording.source.name,
         len(recording.folder.lengths),
@@ -307,7 +314,7 @@ def recorded_plan(
 
 
 def check_run(
-    settings: RunSettings, location: Location | None = None, loaded: bool = False, fetch: bool = True
+    settings: Settings, location: Location | None = None, loaded: bool = False, fetch: bool = True
 ) -> Suite:
     """The suite of a run, once everything was checked that can be without scene and model. Raises as `load`.
 
@@ -325,36 +332,42 @@ def check_run(
     return suite
 
 
-def _check_instructions(settings: RunSettings, instructions: Sequence[str], fetch: bool) -> None:
+def _check_instructions(settings: Settings, instructions: Sequence[str], fetch: bool) -> None:
     """Raise InstructionError for what a policy cannot read, and UsageError for units that have to be chosen.
 
     Before its network is loaded.
     """
     from probe_kit.hooks.registry import get_family
 
-    family = get_family(settings.model)
+    family = get_family(settings.model.family)
     if family is not None and isinstance(settings, ExtractSettings):
-        family.whose_units(settings.checkpoint, settings.options, fetch)
-        family.check_instructions(settings.checkpoint, instructions, settings.options, fetch)
+        family.whose_units(settings.model.checkpoint, settings.model.options, fetch)
+        family.check_instructions(settings.model.checkpoint, instructions, settings.model.options, fetch)
 
 
-def _planned_settings(settings: RunSettings, sizes: PlannedSizes) -> RunSettings:
+def _planned_settings(settings: Settings, sizes: PlannedSizes) -> Settings:
     """The settings with the inferences of an episode counted. Raises CheckpointError for who cannot act."""
     if not isinstance(settings, ExtractSettings):
         return settings
-    if settings.source is None and sizes.outline is not None:
+    if isinstance(settings.source, SceneSettings) and sizes.outline is not None:
         check_misfit(settings, sizes.outline.misfit(), sizes.outline.checkpoint)
-    return settings.with_every_call(settings.execute or sizes.execute)
+    return settings.with_every_call(settings.task.execute or sizes.execute)
 
 
-def _declared_card(settings: RunSettings) -> dict[str, Any]:
+def _declared_card(settings: Settings) -> dict[str, Any]:
     """What is known of a model that was not loaded."""
-    given = {"dtype": settings.dtype, "execute": getattr(settings, "execute", None)}
+    execute = settings.task.execute if isinstance(settings, ExtractSettings) else None
+    given = {"dtype": settings.model.dtype, "execute": execute}
     known = {name: value for name, value in given.items() if value is not None}
-    return {"model": settings.model, "random_weights": settings.random_weights, "weights_sha256": None, **known}
+    return {
+        "model": settings.model.family,
+        "random_weights": settings.model.random_weights,
+        "weights_sha256": None,
+        **known,
+    }
 
 
-def _is_only_planned(settings: RunSettings, location: Location | None) -> bool:
+def _is_only_planned(settings: Settings, location: Location | None) -> bool:
     """Whether nothing but the items themselves is asked of the suite.
 
     Names of runs that are known before they are played hold the hash of the whole suite, and so does a run that is
@@ -364,21 +377,23 @@ def _is_only_planned(settings: RunSettings, location: Location | None) -> bool:
         return False
     from probe_kit.hooks.registry import get_family
 
-    family = get_family(settings.model)
+    family = get_family(settings.model.family)
     if location is None:
         return family is not None and bool(family.declared)
     with location.in_words():
         return not location.exists(RUN_FILE)
 
 
-def _suite(settings: RunSettings, planned: bool = False) -> Suite:
+def _suite(settings: Settings, planned: bool = False) -> Suite:
     """The suite of these settings. planned: its first items alone are needed."""
-    if settings.suite is None:
+    source = settings.source
+    assert isinstance(source, SceneSettings)
+    if source.suite is None:
         # Of a category drawn alone every item is the same: drawing all eleven takes minutes.
-        if planned and settings.items is not None and not default_folder(settings.categories).is_dir():
-            return _first_items(settings.categories, settings.items)
-        return default_suite(settings.categories).select(None, settings.items)
-    return load_suite(settings.suite).select(settings.categories, settings.items)
+        if planned and source.items is not None and not default_folder(source.categories).is_dir():
+            return _first_items(source.categories, source.items)
+        return default_suite(source.categories).select(None, source.items)
+    return load_suite(source.suite).select(source.categories, source.items)
 
 
 def _first_items(categories: Sequence[str] | None, count: int) -> Suite:
@@ -391,17 +406,19 @@ def _first_items(categories: Sequence[str] | None, count: int) -> Suite:
     return replace(suite, selected_from=default_suite((Smallest.of(suite).category,)))
 
 
-def _texts(settings: RunSettings, suite: Suite) -> tuple[str, ...]:
+def _texts(settings: Settings, suite: Suite) -> tuple[str, ...]:
     """What the model will read: instructions, or the objects of questions."""
     if not isinstance(settings, AskSettings):
-        return instructions_of(plan_episodes(suite, settings.seed, settings.asked_wordings))
-    return tuple(dict.fromkeys(phrase.text for phrase in phrases(suite, settings.query, settings.seed).values()))
+        return instructions_of(plan_episodes(suite, settings.seed, settings.wordings))
+    return tuple(
+        dict.fromkeys(phrase.text for phrase in phrases(suite, settings.task.query, settings.seed).values())
+    )
 
 
 def _asking(settings: AskSettings, suite: Suite, answer_model: "AnswerModel | None") -> AnswerController:
     blank = example_observations(settings.scene, [min(item.instruction for item in suite.items)])[0]
     model = load_answer_model(settings) if answer_model is None else answer_model
-    check_unfit(model.card, settings.batch, blank)
+    check_unfit(model.card, settings.machine.observations, blank)
     return AnswerController(model, settings, suite, blank)
 
 
@@ -410,48 +427,50 @@ def load_answer_model(settings: AskSettings) -> "AnswerModel":
     from probe_kit.hooks import AnswerModel, load_model
 
     model = load_model(
-        settings.model,
-        settings.checkpoint,
-        settings.device,
-        settings.dtype,
-        settings.random_weights,
-        settings.weights_seed,
-        **settings.options,
+        settings.model.family,
+        settings.model.checkpoint,
+        settings.machine.device,
+        settings.model.dtype,
+        settings.model.random_weights,
+        settings.model.weights_seed,
+        **settings.model.options,
     )
     if not isinstance(model, AnswerModel):
-        raise UsageError(f"{settings.model} returned a {type(model).__name__}, not a AnswerModel; fix the loader")
+        raise UsageError(
+            f"{settings.model.family} returned a {type(model).__name__}, not a AnswerModel; fix the loader"
+        )
     return model
 
 
-def _acting(settings: RunSettings, instructions: Sequence[str], loaded: "Policy | None") -> ActingController:
+def _acting(settings: Settings, instructions: Sequence[str], loaded: "Policy | None") -> ActingController:
     assert isinstance(settings, ExtractSettings)
-    if settings.model in SCRIPTED:
-        return ScriptedController(settings.model)
+    if settings.model.family in SCRIPTED:
+        return ScriptedController(settings.model.family)
     if loaded is not None:
         _check_loaded(settings, loaded)
     policy = load_acting_policy(settings) if loaded is None else loaded
     examples = example_observations(settings.scene, instructions)
     check_embodiment(settings, policy)
-    check_unfit(policy.card, settings.batch, examples[0])
+    check_unfit(policy.card, settings.machine.observations, examples[0])
     check_unreachable(settings, policy.card)
     return PolicyController(
         policy,
-        settings.model,
+        settings.model.family,
         examples,
-        settings.execute,
-        settings.with_every_call(settings.execute or policy.card.execute).stored_calls,
-        settings.tokens == "all",
-        settings.edits,
-        settings.vectors,
-        settings.capture_only,
-        settings.inference_limit,
-        settings.rotation,
+        settings.task.execute,
+        settings.with_every_call(settings.task.execute or policy.card.execute).capture.calls,
+        settings.capture.tokens == "all",
+        settings.task.edits,
+        settings.task.vectors,
+        settings.task.capture_only,
+        settings.machine.inference_limit,
+        settings.task.rotation,
     )
 
 
 def _check_scene_units(settings: ExtractSettings, asked: Sequence[PlannedEpisode], policy: "Policy") -> None:
     """Raise UnitsError for a scene whose first states lie outside the statistics of a policy that reads them."""
-    if settings.accept_units or policy.state_numbers is None or "state" in policy.zero_filled_inputs():
+    if settings.machine.accept_units or policy.state_numbers is None or "state" in policy.zero_filled_inputs():
         return
     states = policy.laid_out(first_states(settings.scene, asked[:FIRST_EPISODES]))
     names = [str(place) for place in range(states.shape[1])]
@@ -464,13 +483,13 @@ def load_acting_policy(settings: ExtractSettings) -> "Policy":
 
     chosen = settings.followed()
     return load_policy(
-        chosen.model,
-        chosen.checkpoint,
-        chosen.device,
-        chosen.dtype,
-        chosen.random_weights,
-        chosen.weights_seed,
-        **chosen.options,
+        chosen.model.family,
+        chosen.model.checkpoint,
+        chosen.machine.device,
+        chosen.model.dtype,
+        chosen.model.random_weights,
+        chosen.model.weights_seed,
+        **chosen.model.options,
     )
 
 
@@ -481,12 +500,12 @@ def _check_loaded(settings: ExtractSettings, policy: "Policy") -> None:
     card = policy.card
     said: dict[str, tuple[object, object]] = {}
     # A file may call its weights random; requested random weights have a seed.
-    if settings.random_weights or card.weights_seed is not None:
-        said["random_weights"] = settings.random_weights, card.random_weights
+    if settings.model.random_weights or card.weights_seed is not None:
+        said["random_weights"] = settings.model.random_weights, card.random_weights
     if card.weights_seed is not None:
-        said["weights_seed"] = settings.weights_seed, card.weights_seed
+        said["weights_seed"] = settings.model.weights_seed, card.weights_seed
     if card.family in family_names():
-        said["model"] = settings.model, card.family
+        said["model"] = settings.model.family, card.family
     wrong = [f"{name} {there!r} instead of {asked!r}" for name, (asked, there) in said.items() if asked != there]
     if wrong:
         raise UsageError(

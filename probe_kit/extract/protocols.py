@@ -3,14 +3,17 @@
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
+from probe_kit.extract.parts import ActTask, ModelSettings
+from probe_kit.extract.sources.scene import SceneSettings
+from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, PLAIN, ProtocolRow, as_text
 
 if TYPE_CHECKING:
+    from probe_kit.env import SceneSpec
     from probe_kit.hooks.family import Family
 
 SCENES: Mapping[str, str] = {ACT2ANSWER: "act2answer"}
@@ -18,63 +21,27 @@ SCENES: Mapping[str, str] = {ACT2ANSWER: "act2answer"}
 _OF_ACTING = ("execute", "rotation")
 
 
-class ProtocolSettings(Protocol):
-    """What is looked at of the settings of an extraction."""
-
-    @property
-    def model(self) -> str:
-        """A family, or a script."""
-
-    @property
-    def protocol(self) -> str | None:
-        """The protocol's name."""
-
-    @property
-    def checkpoint(self) -> str | None:
-        """Folder or hub id."""
-
-    @property
-    def options(self) -> Mapping[str, Any]:
-        """Of the family."""
-
-    @property
-    def execute(self) -> int | None:
-        """Actions per inference."""
-
-    @property
-    def rotation(self) -> str | None:
-        """What reaches the controller as the rotation of an action."""
-
-    @property
-    def dtype(self) -> str | None:
-        """Of the network."""
-
-    @property
-    def capture_only(self) -> bool:
-        """Whether no action is executed."""
-
-    @property
-    def scene(self) -> SceneSpec:
-        """What is played."""
-
-
-def protocol_scene(protocol: str | None, name: str | None = None, **changes: Any) -> SceneSpec:
+def protocol_scene(protocol: str | None, name: str | None = None, **changes: Any) -> "SceneSpec":
     """The preset `name`, else the protocol's, else the default one, with fields replaced.
 
     Raises UsageError for an unknown protocol, SceneError for an unknown preset or field.
     """
+    from probe_kit.env import SceneSpec
+
     if protocol is not None:
         check_protocol(protocol)
         name = name or SCENES[protocol]
     return SceneSpec.preset(name or "bridge", **changes)
 
 
-def scene_of(model: str, protocol: str | None = None, name: str | None = None, **changes: Any) -> SceneSpec:
+def scene_of(model: str, protocol: str | None = None, name: str | None = None, **changes: Any) -> "SceneSpec":
     """What `model` plays: the preset `name`, else the protocol's, else its family's home; with fields replaced.
 
     An unknown family and a scripted policy have the default scene. Errors are those of `protocol_scene`.
     """
     family = None if protocol or name else _family(model)
+    from probe_kit.env import SceneSpec
+
     if family is None:
         return protocol_scene(protocol, name, **changes)
     return SceneSpec.preset(family.home.preset, **{**family.home.changes, **changes})
@@ -93,25 +60,25 @@ def check_protocol(name: str) -> None:
         raise UsageError(f"unknown protocol {name!r}; available: {', '.join(SCENES)}.{hint}")
 
 
-def protocol_identity(settings: ProtocolSettings) -> dict[str, Any]:
+def protocol_identity(model: ModelSettings, task: ActTask, source: SourceSettings) -> dict[str, Any]:
     """What a run says of the protocol it follows, under `protocol`; empty without one.
 
     variant: which of several checkpoints of the protocol it is, where it has several for the model.
     differs_from_default: what the protocol has and what is the default here, by setting. deviations: what the
     protocol has and what the run has. unmatched: what cannot be done here.
     """
-    if settings.protocol is None:
+    if task.protocol is None or not isinstance(source, SceneSettings):
         return {}
-    row, used = protocol_row(settings.model, settings.protocol, settings.checkpoint), _used(settings)
-    protocol = {**({} if row is None else row.settings()), **_scene(protocol_scene(settings.protocol))}
-    default = {**({} if row is None else _defaults(settings, row)), **_scene(scene_of(settings.model))}
-    if settings.capture_only:
+    row, used = protocol_row(model, task.protocol), _used(model, task, source.scene)
+    protocol = {**({} if row is None else row.settings()), **_scene(protocol_scene(task.protocol))}
+    default = {**({} if row is None else _defaults(model.family, row)), **_scene(scene_of(model.family))}
+    if task.capture_only:
         for name in _OF_ACTING:
             protocol.pop(name, None)
             default.pop(name, None)
     return {
         "protocol": {
-            "name": settings.protocol,
+            "name": task.protocol,
             **({"variant": row.variant} if row is not None and row.variant else {}),
             "differs_from_default": _different(protocol, default, protocol),
             "deviations": _different(protocol, used, {**used, **protocol}),
@@ -120,19 +87,13 @@ def protocol_identity(settings: ProtocolSettings) -> dict[str, Any]:
     }
 
 
-def deviations(settings: ProtocolSettings) -> dict[str, list[str | None]]:
-    """By setting, what the protocol has and what was asked for instead."""
-    found: dict[str, list[str | None]] = protocol_identity(settings).get("protocol", {}).get("deviations", {})
-    return found
-
-
-def protocol_row(model: str, protocol: str | None, checkpoint: str | None = None) -> ProtocolRow | None:
+def protocol_row(model: ModelSettings, protocol: str | None) -> ProtocolRow | None:
     """The protocol's row of a model and checkpoint; None without a protocol, and for scripts.
 
     With another checkpoint than the protocol's, and with None, it is the row of the model's first.
     Raises UsageError for a model that the protocol does not use.
     """
-    family = _family(model)
+    family = _family(model.family)
     if protocol is None or family is None:
         return None
     if protocol not in family.protocols:
@@ -140,10 +101,10 @@ def protocol_row(model: str, protocol: str | None, checkpoint: str | None = None
 
         using = [name for name, one in known_families().items() if protocol in one.protocols]
         raise UsageError(
-            f"the protocol {protocol} does not use {model}; it uses {', '.join(using)}. Leave --protocol out, and "
-            f"take its scene with --scene {SCENES[protocol]}"
+            f"the protocol {protocol} does not use {model.family}; it uses {', '.join(using)}. Leave --protocol "
+            f"out, and take its scene with --scene {SCENES[protocol]}"
         )
-    return family.protocols[protocol].of(checkpoint)
+    return family.protocols[protocol].of(model.checkpoint)
 
 
 def _family(model: str) -> "Family | None":
@@ -152,12 +113,14 @@ def _family(model: str) -> "Family | None":
     return get_family(model)
 
 
-def _used(settings: ProtocolSettings) -> dict[str, str]:
+def _used(model: ModelSettings, task: ActTask, scene: "SceneSpec") -> dict[str, str]:
     """What the run is made with, under the names of `ProtocolRow.settings`."""
-    used = {f"-M {name}": _told(as_text(value)) for name, value in settings.options.items()}
-    plain = {name: getattr(settings, name) for name in ("checkpoint", "execute", "rotation", "dtype")}
+    used = {f"-M {name}": _told(as_text(value)) for name, value in model.options.items()}
+    plain = {
+        "checkpoint": model.checkpoint, "execute": task.execute, "rotation": task.rotation, "dtype": model.dtype,
+    }  # fmt: skip
     used |= {name: _told(str(value)) for name, value in plain.items() if value is not None}
-    return {**used, **({"acts": "capture only"} if settings.capture_only else {}), **_scene(settings.scene)}
+    return {**used, **({"acts": "capture only"} if task.capture_only else {}), **_scene(scene)}
 
 
 def _told(value: str) -> str:
@@ -165,11 +128,11 @@ def _told(value: str) -> str:
     return Path(value).name if Path(value).expanduser().exists() else value
 
 
-def _defaults(settings: ProtocolSettings, row: ProtocolRow) -> dict[str, str]:
+def _defaults(model: str, row: ProtocolRow) -> dict[str, str]:
     """What the same settings are without a protocol, in the words of `probe-kit models`."""
     from probe_kit.hooks.registry import find_family
 
-    family = find_family(settings.model)
+    family = find_family(model)
     known = {f"-M {option.name}": option.default for option in family.options}
     known |= {f"-M {name}": as_text(value) for name, value in family.of_default.items()}
     known |= {
@@ -181,7 +144,7 @@ def _defaults(settings: ProtocolSettings, row: ProtocolRow) -> dict[str, str]:
     return {name: known[name] for name in row.settings()}
 
 
-def _scene(scene: SceneSpec) -> dict[str, str]:
+def _scene(scene: "SceneSpec") -> dict[str, str]:
     derived = {"name"} | ({"epsilon"} if scene.epsilon is None else set())
     return {f"scene {name}": as_text(value) for name, value in _leaves(scene.to_json()) if name not in derived}
 

@@ -6,23 +6,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol, Self
 
-from probe_kit.env import SceneSpec
 from probe_kit.hooks.contract.card import EMBEDDED
 
 SOURCES = "sources"
 """Entry of a certificate."""
 
 
-class SettingsWithSources(Protocol):
-    """The settings of a run that name files and choices; see `RunSettings`."""
-
-    @property
-    def suite(self) -> Path | None:
-        """Suite folder."""
-
-    @property
-    def scene(self) -> SceneSpec:
-        """Scene, with its files."""
+class ModelWithSources(Protocol):
+    """The model of a run's settings; see `ModelSettings`."""
 
     @property
     def options(self) -> Mapping[str, Any]:
@@ -58,17 +49,21 @@ class RunSources:
 
     @classmethod
     def of(
-        cls, settings: SettingsWithSources, checkpoint: str, repositories: Mapping[str, str] = MappingProxyType({})
+        cls,
+        model: ModelWithSources,
+        suite: Path | None,
+        scene_files: Mapping[str, Path],
+        checkpoint: str,
+        repositories: Mapping[str, str] = MappingProxyType({}),
     ) -> Self:
-        """Sources of a process with these settings. checkpoint, repositories: of the loaded model's card."""
-        files = {name: getattr(settings.scene, name) for name in ("arm_urdf", "background")}
+        """Sources of a process with this model, suite and scene. checkpoint, repositories: of the model's card."""
         return cls(
-            suite=None if settings.suite is None else _absolute(settings.suite),
+            suite=None if suite is None else _absolute(suite),
             checkpoint=_absolute(checkpoint) if _is_here(checkpoint) else checkpoint,
-            scene_files={name: _absolute(path) for name, path in files.items() if path is not None},
-            options=dict(settings.options),
-            random_weights=settings.random_weights,
-            weights_seed=settings.weights_seed,
+            scene_files={name: _absolute(path) for name, path in scene_files.items()},
+            options=dict(model.options),
+            random_weights=model.random_weights,
+            weights_seed=model.weights_seed,
             repositories=dict(repositories),
         )
 

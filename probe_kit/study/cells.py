@@ -2,13 +2,13 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
 from pathlib import Path
 from typing import Any
 
-from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
+from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.study.planned_suite import PlannedSuite
 
@@ -46,7 +46,7 @@ class Cell:
     model: str
     way: str
     seed: int
-    settings: RunSettings
+    settings: Settings
     selections: Mapping[str, Selection]
     suite: PlannedSuite
     unavailable: str = ""
@@ -78,29 +78,28 @@ class Cell:
     @property
     def episodes(self) -> int:
         """Episodes: both layouts in every wording, of which some items may lack one."""
-        return 2 * self.n_items * len(self.settings.asked_wordings or (None,))
+        return 2 * self.n_items * len(self.settings.wordings or (None,))
 
     @property
     def inferences(self) -> int:
         """Inferences of a policy at most, where episodes may end early; a VLM has none."""
         if not isinstance(self.settings, ExtractSettings):
             return 0
-        if self.settings.capture_only:
+        if self.settings.task.capture_only:
             return self.episodes
-        return self.episodes * ceil(self.settings.scene.max_steps / (self.settings.execute or 1))
+        return self.episodes * ceil(self.settings.scene.max_steps / (self.settings.task.execute or 1))
 
     @cached_property
     def known(self) -> dict[str, Any]:
         """All that the settings decide but the selection, as plain values."""
         settings = self.settings
         known = {
-            **settings.choices(),
-            "checkpoint": checkpoint_stamp(settings.checkpoint),
-            "options": {name: str(value) for name, value in settings.options.items()},
-            "weights_seed": settings.weights_seed,
-            "protocol": getattr(settings, "protocol", None),
-            "capture_only": getattr(settings, "capture_only", False),
-            "wordings": settings.asked_wordings,
+            **settings.identity(),
+            "checkpoint": checkpoint_stamp(settings.model.checkpoint),
+            "options": {name: str(value) for name, value in settings.model.options.items()},
+            "weights_seed": settings.model.weights_seed,
+            "protocol": settings.task.protocol,
+            "wordings": settings.wordings,
             "scene": settings.scene.to_json(),
             "suite": self.suite.identity,
         }
@@ -122,11 +121,11 @@ class Cell:
         return f"{out.rstrip('/')}/{self.folder}"
 
     @property
-    def settings_to_play(self) -> RunSettings:
+    def settings_to_play(self) -> Settings:
         """The settings with suite and selection."""
         folder = self.suite.folder
-        return replace(
-            self.settings, suite=folder, categories=self.selection.categories, items=self.selection.items
+        return self.settings.changed(
+            suite=folder, categories=self.selection.categories, items=self.selection.items
         )
 
 

@@ -3,13 +3,10 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
-from probe_kit._terminal.options import read_size
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
-from probe_kit.extract.vqa.templates import find_template
+from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.hooks.registry import family_names, get_family
 from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.mistakes import Mistake, Place
@@ -138,13 +135,13 @@ def _blamed(study: Study, member: Member, said: str) -> Place:
     return (home, name, *named[:1])
 
 
-def _settings(study: Study, member: Member) -> RunSettings:
+def _settings(study: Study, member: Member) -> Settings:
     if member.block.asks:
         ask = study.asks[member.way]
         tokens = member.block.tokens or "none"
-        return replace(_asked(study, member.model, ask), tokens=tokens, seed=member.seed)
+        return _asked(study, member.model, ask).changed(tokens=tokens, seed=member.seed)
     found = _settings_of(study, member.model, study.conditions[member.way], member.block.tokens)
-    return replace(found, seed=member.seed)
+    return found.changed(seed=member.seed)
 
 
 def _common(study: Study, name: str) -> dict[str, Any]:
@@ -154,6 +151,7 @@ def _common(study: Study, name: str) -> dict[str, Any]:
         "checkpoint": model.checkpoint,
         "random_weights": model.random_weights,
         "weights_seed": model.weights_seed,
+        "options": model.options,
         "protocol": model.protocol,
         "scene": _scene(study, model),
         "dtype": model.dtype,
@@ -169,32 +167,18 @@ def _scene(study: Study, model: ModelTable) -> str | None:
 
 def _settings_of(study: Study, name: str, condition: ConditionTable, tokens: str | None) -> ExtractSettings:
     """Of a policy, with what its protocol decides."""
-    fields = condition.model_dump(exclude_none=True)
-    if condition.background is not None:
-        fields["background"] = Path(condition.background)
-    if condition.picture_size is not None:
-        fields["picture_size"] = read_size(condition.picture_size)
-    settings = ExtractSettings.from_options(
+    chosen = condition.model_dump(exclude={"no_act"})
+    return ExtractSettings(
         **_common(study, name),
-        **{part: value for part, value in fields.items() if part not in {"wordings", "no_act", "captured_calls"}},
+        **chosen,
         execute=study.models[name].execute,
-        captured_calls=condition.captured_calls,
         capture_only=condition.no_act,
-        wordings=None if condition.wordings is None else tuple(condition.wordings),
         tokens=tokens or "pooled",
-    )
-    return replace(settings, options=study.models[name].options).followed()
+    ).followed()
 
 
 def _asked(study: Study, name: str, ask: AskTable) -> AskSettings:
-    settings = AskSettings.from_options(
-        **_common(study, name),
-        prompt=find_template(ask.prompt),
-        picture_size=read_size(ask.picture_size),
-        picture=ask.picture,
-        query=ask.query,
-    )
-    return replace(settings, options=study.models[name].options)
+    return AskSettings(**_common(study, name), **ask.model_dump())
 
 
 def _same_settings(cells: list[Cell]) -> list[Mistake]:

@@ -9,8 +9,6 @@ from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import SettingsMismatchError
-from probe_kit.extract.protocols import protocol_identity
-from probe_kit.extract.settings import ExtractSettings
 from probe_kit.hashing import canonical_json
 from probe_kit.hooks.checkpoints.checkpoint import COMMIT_DIGITS, is_on_hub, without_revision
 from probe_kit.runs.growth import flat_settings
@@ -68,7 +66,7 @@ def differences(run: "Run", cell: Cell) -> Iterator[str]:
         is_open = name.partition(".")[0] in _OF_LOADED_MODEL
         if name in expected or not is_open:
             yield from _different(name, stored.get(name), expected.get(name))
-    yield from _different("wordings", list(run.wordings), list(cell.settings.asked_wordings or ()))
+    yield from _different("wordings", list(run.wordings), list(cell.settings.wordings or ()))
     yield from _other_weights(run, cell)
     yield from _other_items(run, cell.suite.contents)
 
@@ -81,7 +79,7 @@ def _expected(cell: Cell) -> dict[str, Any]:
     settings = cell.settings
     decided = {
         name: value
-        for name, value in settings.choices().items()
+        for name, value in settings.identity().items()
         if name != "dtype" and not (name in _OF_LOADED_MODEL and value in (None, "all"))
     }
     name, _, version = cell.suite.identity.rpartition("@")
@@ -89,7 +87,6 @@ def _expected(cell: Cell) -> dict[str, Any]:
         **decided,
         "scene": settings.scene.to_json(),
         "suite": {"name": name, "version": version},
-        **(protocol_identity(settings) if isinstance(settings, ExtractSettings) else {}),
     }
     plain: dict[str, Any] = json.loads(canonical_json(expected))
     return plain
@@ -113,9 +110,9 @@ def _other_weights(run: "Run", cell: Cell) -> Iterator[str]:
     if not run.commits():
         return
     card: Mapping[str, Any] = run.certificate.get("policy") or {}
-    if cell.settings.random_weights and "weights_seed" in card:
-        yield from _different("weights_seed", card["weights_seed"], cell.settings.weights_seed)
-    stored, expected = str(card.get("checkpoint")), str(cell.settings.checkpoint)
+    if cell.settings.model.random_weights and "weights_seed" in card:
+        yield from _different("weights_seed", card["weights_seed"], cell.settings.model.weights_seed)
+    stored, expected = str(card.get("checkpoint")), str(cell.settings.model.checkpoint)
     if is_on_hub(stored) and is_on_hub(expected):  # a folder may have been moved, and is bound by its hash
         has_commit = len(expected.partition("@")[2]) == COMMIT_DIGITS
         names = (name if has_commit else without_revision(name) for name in (stored, expected))

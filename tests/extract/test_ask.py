@@ -55,7 +55,7 @@ def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> As
 
 @pytest.fixture(scope="module")
 def asked(settings: AskSettings, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    return ask_run(replace(settings, tokens="pooled"), tmp_path_factory.mktemp("asked") / "run")
+    return ask_run(settings.changed(tokens="pooled"), tmp_path_factory.mktemp("asked") / "run")
 
 
 def files(run: Path) -> dict[str, str]:
@@ -124,7 +124,7 @@ def test_an_interrupted_run_continues_to_the_same_bytes(settings: AskSettings, a
     def crash(*_: object) -> None:
         raise CrashError
 
-    pooled = replace(settings, tokens="pooled")
+    pooled = settings.changed(tokens="pooled")
     with pytest.raises(CrashError):
         ask_run(pooled, tmp_path / "run", crash)
     assert 1 <= len(open_run(tmp_path / "run", allow_partial=True).episodes) < 4
@@ -134,12 +134,12 @@ def test_an_interrupted_run_continues_to_the_same_bytes(settings: AskSettings, a
 @pytest.mark.parametrize("change", [{"prompt": SEEN}, {"picture": "none"}, {"query": "distractor"}, {"seed": 1}])
 def test_other_questions_are_another_run(settings: AskSettings, asked: Run, change: dict) -> None:
     with pytest.raises(SettingsMismatchError):
-        prepare(replace(settings, tokens="pooled", **change), asked.path)
+        prepare(settings.changed(tokens="pooled", **change), asked.path)
 
 
 @pytest.mark.slow
 def test_a_batch_answers_alike(settings: AskSettings, asked: Run, tmp_path: Path) -> None:
-    run = ask_run(replace(settings, batch=3), tmp_path / "run")
+    run = ask_run(settings.changed(batch=3), tmp_path / "run")
     np.testing.assert_allclose(run.episodes["margin"], asked.episodes["margin"], atol=1e-4)
     assert run.episodes["answer"].tolist() == asked.episodes["answer"].tolist()
     assert run.streams == {}
@@ -147,7 +147,7 @@ def test_a_batch_answers_alike(settings: AskSettings, asked: Run, tmp_path: Path
 
 @pytest.mark.slow
 def test_worker_processes_give_the_same_commits(settings: AskSettings, asked: Run, tmp_path: Path) -> None:
-    run = ask_run(replace(settings, tokens="pooled", workers=2), tmp_path / "run")
+    run = ask_run(settings.changed(tokens="pooled", workers=2), tmp_path / "run")
     for path in sorted(asked.path.glob("commits/*.json")):
         assert (run.path / "commits" / path.name).read_bytes() == path.read_bytes()
 
@@ -214,7 +214,7 @@ def test_who_answers_by_side_has_no_letter_bias_and_is_right_as_often_as_wrong(s
 @pytest.mark.slow
 @pytest.mark.parametrize("prompt", [P1, P2, SEEN], ids=["p1", "p2", "seen"])
 def test_without_a_picture_exactly_as_many_are_right_as_wrong(settings: AskSettings, prompt: Template) -> None:
-    episodes = answers(replace(settings, picture="none", prompt=prompt, items=6))
+    episodes = answers(settings.changed(picture="none", prompt=prompt, items=6))
     for column in ("outcome_logits", "outcome_debiased", "outcome"):
         counts = episodes[column].value_counts()
         assert counts.get("correct", 0) == counts.get("wrong", 0), column
@@ -231,7 +231,7 @@ def test_side_by_side_shows_the_two_pictures_and_no_scene(settings: AskSettings)
             seen.extend(own.seen.image for own in questions)
             return super().read(questions)
 
-    answers(replace(settings, picture="side-by-side"), Watching(likes("A"), always("A")))
+    answers(settings.changed(picture="side-by-side"), Watching(likes("A"), always("A")))
     original, swapped = seen[1], seen[3]  # behind a blank one, each in two orders
     assert original.shape == (224, 224, 3)
     assert (original[0] == 128).all()
@@ -240,14 +240,14 @@ def test_side_by_side_shows_the_two_pictures_and_no_scene(settings: AskSettings)
 
 
 def test_the_distractor_lies_on_the_other_side(settings: AskSettings) -> None:
-    episodes = answers(replace(settings, query="distractor"), PositionModel(likes("A"), always("A")))
+    episodes = answers(settings.changed(query="distractor"), PositionModel(likes("A"), always("A")))
     assert episodes["question"][0].startswith("Do you see the red shape?")
     right = episodes["side_correct"] == "right"
     assert (episodes["outcome"] == np.where(right, "correct", "wrong")).all()
 
 
 def test_of_an_absent_object_right_is_no(settings: AskSettings) -> None:
-    absent = replace(settings, query="absent", prompt=SEEN, items=4)
+    absent = settings.changed(query="absent", prompt=SEEN, items=4)
     honest = answers(absent, PositionModel(likes("No"), always("No.")))
     assert (honest[["outcome", "outcome_logits", "outcome_debiased"]] == "correct").all().all()
     eager = answers(absent, PositionModel(likes("Yes"), always("Yes, left.")))
@@ -276,13 +276,13 @@ def test_what_cannot_be_asked_is_refused_before_a_model_is_loaded(
     settings: AskSettings, change: dict, match: str
 ) -> None:
     with pytest.raises(UsageError, match=match):
-        prepare(replace(settings, **change))
+        prepare(settings.changed(**change))
 
 
 def test_several_runs_of_one_model_are_checked_before_the_first_is_asked(
     settings: AskSettings, asked: Run, tmp_path: Path
 ) -> None:
-    wanted = [settings, replace(settings, prompt=P2)]
+    wanted = [settings, settings.changed(prompt=P2)]
     with pytest.raises(SettingsMismatchError):
         next(prepare_asks(wanted, [tmp_path / "p1", asked.path]))
     prepared = list(prepare_asks(wanted, [tmp_path / "p1", tmp_path / "p2"]))

@@ -1,6 +1,5 @@
 """`--batch auto`: what it chooses from what it measured, and that nothing stored depends on it."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -68,7 +67,7 @@ def test_a_policy_that_takes_one_observation_is_calibrated_to_the_same_bytes(
     monkeypatch.setattr(calibration, "cores_here", lambda: 1)  # no processes: their start takes longer than this
     settings = ExtractSettings("pi0-tiny", suite=small_suite.folder, scene=SHORT, items=2, env_workers=0)
     plain = extract_run(settings, tmp_path / "plain")
-    asked = replace(settings, env_workers=None, calibrate=True)
+    asked = settings.changed(env_workers=None, batch="auto")
     run_preflight, tried = PolicyController.run_preflight, set[int]()
 
     def counted(controller: PolicyController, observations: list, seeds: list) -> None:  # type: ignore[type-arg]
@@ -92,4 +91,4 @@ def test_what_it_chooses_is_refused_beside_it(small_suite: Suite) -> None:
     assert (result.exit_code, "leave out --env-workers" in " ".join(result.output.split())) == (2, True)
     assert CliRunner().invoke(app, [*asked[:-2], "many"]).exit_code == 2
     with pytest.raises(UsageError, match="scripted"):
-        prepare(ExtractSettings("expert", suite=small_suite.folder, calibrate=True))
+        prepare(ExtractSettings("expert", suite=small_suite.folder, batch="auto"))

@@ -1,6 +1,5 @@
 """Several captured inferences per episode: an axis of its own, also where episodes end early."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -146,10 +145,10 @@ def test_a_view_of_later_inferences_that_cannot_be_kept_is_refused(options: dict
 
 def test_all_inferences_are_as_many_as_an_episode_can_have() -> None:
     settings = ExtractSettings("pi0-tiny", scene=SceneSpec(max_steps=5), captured_calls="all")
-    assert [settings.with_every_call(execute).stored_calls for execute in (1, 2, 5, 8)] == [5, 3, 1, 1]
-    assert replace(settings, captured_calls=4).with_every_call(2).stored_calls == 4
+    assert [settings.with_every_call(execute).capture.calls for execute in (1, 2, 5, 8)] == [5, 3, 1, 1]
+    assert settings.changed(captured_calls=4).with_every_call(2).capture.calls == 4
     with pytest.raises(UsageError, match="before the model is loaded"):
-        _ = settings.stored_calls
+        _ = settings.capture.calls
 
 
 def test_bytes_of_a_run_count_what_later_inferences_keep() -> None:
@@ -249,10 +248,10 @@ def test_a_real_policy_is_captured_at_every_inference(small_suite: Suite, tmp_pa
     assert run.reached(1).all()
     assert np.isfinite(run.column(site, "mean", 1)).all()
     assert (run.column(site, "mean", 0) != run.column(site, "mean", 1)).any()
-    every = extract_run(replace(settings, captured_calls="all"), tmp_path / "every")
+    every = extract_run(settings.changed(captured_calls="all"), tmp_path / "every")
     assert every.settings_sha256 == run.settings_sha256
     np.testing.assert_array_equal(every.column(site, "mean", 1), run.column(site, "mean", 1))
-    fewer = extract_run(replace(settings, captured_calls="all", later_views="mean"), tmp_path / "fewer")
+    fewer = extract_run(settings.changed(captured_calls="all", later_views="mean"), tmp_path / "fewer")
     np.testing.assert_array_equal(fewer.column(site, "mean", 1), in_bfloat16(run.column(site, "mean", 1)))
 
 

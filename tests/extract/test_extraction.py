@@ -173,15 +173,15 @@ def test_runs_that_share_a_policy_hold_the_same_bytes_as_runs_that_load_their_ow
     settings = ExtractSettings("pi0-tiny", random_weights=True, suite=two_items.folder, scene=SHORT)
     policy = load_acting_policy(settings)
     shared = [
-        prepare(replace(settings, seed=seed), policy=policy).run(tmp_path / f"shared-{seed}") for seed in (1, 0)
+        prepare(settings.changed(seed=seed), policy=policy).run(tmp_path / f"shared-{seed}") for seed in (1, 0)
     ]
     alone = prepare(settings).run(tmp_path / "alone")
     assert (alone.stamp, alone.settings_sha256) == (shared[1].stamp, shared[1].settings_sha256)
     assert shared[0].stamp != alone.stamp
     with pytest.raises(UsageError, match="the loaded policy has random_weights True instead of False"):
-        prepare(replace(settings, random_weights=False), policy=policy)
+        prepare(settings.changed(random_weights=False), policy=policy)
     with pytest.raises(UsageError, match="model 'pi0-tiny' instead of 'pi0-tiny-state'"):
-        prepare(replace(settings, model="pi0-tiny-state"), policy=policy)
+        prepare(settings.changed(model="pi0-tiny-state"), policy=policy)
 
 
 def test_the_certificate_names_weights_fires_and_versions(recorded_run) -> None:
@@ -280,7 +280,7 @@ def test_a_device_changes_nothing_in_a_run_but_roundings(two_items: Suite, tmp_p
     """Through pooling on the device, page-locked buffers and the bits of tokens."""
     settings = ExtractSettings("pi0-tiny", suite=two_items.folder, scene=SHORT, tokens="all", env_workers=0)
     here = extract_run(settings, tmp_path / "here")
-    there = extract_run(replace(settings, device=device), tmp_path / "there")
+    there = extract_run(settings.changed(device=device), tmp_path / "there")
     for stream in here.streams:
         for site in here.sites(stream):
             expected = here.column(site)

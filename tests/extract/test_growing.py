@@ -65,7 +65,7 @@ def test_a_policy_gives_in_a_grown_run_what_it_gives_at_once(small_suite: Suite,
         scene=SceneSpec(max_steps=4), tokens="all",
     )  # fmt: skip
     extract_run(settings, tmp_path / "run")
-    before, more = bytes_of(tmp_path / "run"), replace(settings, categories=("color", "shape"))
+    before, more = bytes_of(tmp_path / "run"), settings.changed(categories=("color", "shape"))
     assert_grew(before, extract_run(more, tmp_path / "run"), extract_run(more, tmp_path / "at_once"))
     grown = open_run(tmp_path / "run")
     site = grown.sites("backbone")[-1]
@@ -142,4 +142,4 @@ def test_another_selection_is_refused_before_a_model_is_loaded(
 
     monkeypatch.setattr("probe_kit.hooks.load_policy", load_policy)
     with pytest.raises(SettingsMismatchError, match="never gets smaller"):
-        extract_run(replace(settings, categories=("shape",)), tmp_path / "run")
+        extract_run(settings.changed(categories=("shape",)), tmp_path / "run")

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -94,7 +93,7 @@ def test_a_run_is_not_continued_where_numbers_come_out_otherwise(
 def test_a_mixed_run_says_so(suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     begin(expert(suite), tmp_path / "run")
     elsewhere(monkeypatch, torch="1.0", device="cuda")
-    run = extract_run(replace(expert(suite), allow_mixed=True), tmp_path / "run")
+    run = extract_run(expert(suite).changed(allow_mixed=True), tmp_path / "run")
     assert run.mixed == ("device", "versions.torch")
     assert run.certificate["mixed"] == ["device", "versions.torch"]
     assert len(run.provenances) == 2
@@ -118,7 +117,7 @@ def test_other_writers_interpreters_and_processes_are_no_other_numbers(
     begin(expert(suite), tmp_path / "run")
     elsewhere(monkeypatch, python="3.13.0", machine="aarch64", zarr="9")
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    run = extract_run(replace(expert(suite), env_workers=1), tmp_path / "run")
+    run = extract_run(expert(suite).changed(env_workers=1), tmp_path / "run")
     assert run.mixed == ()
     assert len(run.provenances) == 2
 
@@ -167,5 +166,5 @@ def test_who_plans_for_gpus_elsewhere_needs_none(monkeypatch: pytest.MonkeyPatch
 
 
 def test_allowing_a_mix_is_no_part_of_the_identity(suite: Suite) -> None:
-    plain, allowed = prepare(expert(suite)), prepare(replace(expert(suite), allow_mixed=True))
+    plain, allowed = prepare(expert(suite)), prepare(expert(suite).changed(allow_mixed=True))
     assert plain.identity() == allowed.identity()

@@ -1,6 +1,5 @@
 """A policy without an action expert, through environment, store and columns."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +51,7 @@ def test_a_run_has_the_two_streams_and_every_token_has_its_role(settings: Extrac
 @pytest.mark.slow
 def test_other_units_are_another_run(settings: ExtractSettings, tmp_path: Path) -> None:
     extract_run(settings, tmp_path / "run")
-    other = replace(settings, options={"tokenizer": "bytes", "unnorm_key": "mine"})
+    other = settings.changed(options={"tokenizer": "bytes", "unnorm_key": "mine"})
     with pytest.raises(SettingsMismatchError, match=r"policy\.unnorm_key: stored 'bridge_orig', asked 'mine'"):
         extract_run(other, tmp_path / "run")
 
@@ -60,4 +59,4 @@ def test_other_units_are_another_run(settings: ExtractSettings, tmp_path: Path) 
 def test_a_vision_language_model_has_no_episodes(settings: ExtractSettings, tmp_path: Path) -> None:
     folder = write_checkpoint(tmp_path / "vlm", model_type="prismatic")
     with pytest.raises(UsageError, match="does not act"):
-        extract_run(replace(settings, model="prismatic", checkpoint=str(folder)), tmp_path / "run")
+        extract_run(settings.changed(model="prismatic", checkpoint=str(folder)), tmp_path / "run")

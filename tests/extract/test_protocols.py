@@ -1,7 +1,6 @@
 """`--protocol`: one row per family, what is given wins, and every difference is written down."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -96,7 +95,7 @@ def test_a_row_and_its_options_are_those_of_the_checkpoint_at_any_revision(name:
         at_commit = f"{row.checkpoint}@{'a' * 40}"
         settings = ExtractSettings(name, row.checkpoint, protocol="act2answer").followed()
         pinned = ExtractSettings(name, at_commit, protocol="act2answer").followed()
-        assert pinned == replace(settings, checkpoint=at_commit)
+        assert pinned == settings.changed(checkpoint=at_commit)
 
 
 @pytest.mark.parametrize("name", RELEASED)
@@ -141,11 +140,11 @@ def test_another_scene_that_is_asked_for_is_kept_and_reported() -> None:
 
 def test_a_vlm_is_asked_in_the_scene_of_the_protocol_or_the_one_that_is_named() -> None:
     size = {"picture_size": (224, 224)}
-    asked = AskSettings.from_options(model="vlm-tiny", protocol="act2answer", **size)
-    named = AskSettings.from_options(model="vlm-tiny", scene="act2answer", **size)
+    asked = AskSettings("vlm-tiny", protocol="act2answer", **size)
+    named = AskSettings("vlm-tiny", scene="act2answer", **size)
     assert asked.scene == named.scene == protocol_scene("act2answer", **size)
-    assert asked.choices() == named.choices()
-    both = AskSettings.from_options(model="vlm-tiny", protocol="act2answer", scene="frontal", **size)
+    assert asked.identity() == named.identity()
+    both = AskSettings("vlm-tiny", protocol="act2answer", scene="frontal", **size)
     assert both.scene == protocol_scene(None, "frontal", **size)
     assert AskSettings("vlm-tiny", protocol="act2answer").scene == protocol_scene("act2answer")
     with pytest.raises(UsageError, match="unknown protocol 'act3answer'"):
@@ -175,7 +174,7 @@ def test_the_conversion_of_rotations_is_the_protocols_unless_another_is_asked_fo
     assert ExtractSettings("magma", protocol="act2answer").followed().rotation == "roll-pitch-yaw"
     plain = ExtractSettings("pi0", protocol="act2answer", rotation="roll-pitch-yaw").followed()
     assert deviations(plain) == {"rotation": ["axis-angle", "roll-pitch-yaw"]}
-    assert "rotation" not in plain.choices()  # as of runs that were made before there was a choice
+    assert "rotation" not in plain.identity()  # as of runs that were made before there was a choice
     assert ExtractSettings("pi0", protocol="act2answer", capture_only=True).followed().rotation is None
     with pytest.raises(UsageError, match="expected one of roll-pitch-yaw, axis-angle"):
         ExtractSettings("pi0", rotation="quaternion")  # type: ignore[arg-type]
@@ -216,7 +215,7 @@ def test_a_run_names_its_protocol_and_the_report_lists_what_differs(small_suite:
     assert facts["protocol"] == "act2answer"
     assert "scene max_steps 2 instead of 80" in facts["deviates from it in"]
     assert "-M openness release instead of measured" in facts["it differs from the default in"]
-    again = prepare(replace(settings, workers=0), tmp_path / "run")
+    again = prepare(settings.changed(workers=0), tmp_path / "run")
     assert json.loads(json.dumps(again.identity())) == run.root.own_settings
 
 

@@ -84,13 +84,13 @@ def test_a_run_of_internvla_has_its_streams_and_roles(internvla: Run) -> None:
 
 def test_internvla_refuses_a_batch_before_it_begins(internvla_settings: ExtractSettings, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="at most 1"):
-        extract_run(replace(internvla_settings, batch=2), tmp_path / "run")
+        extract_run(internvla_settings.changed(batch=2), tmp_path / "run")
 
 
 def test_other_options_are_another_run(internvla_settings: ExtractSettings, internvla: Run) -> None:
     with pytest.raises(SettingsMismatchError, match="guidance"):
         extract_run(
-            replace(internvla_settings, options={**internvla_settings.options, "guidance": 2.0}),
+            internvla_settings.changed(options={**internvla_settings.options, "guidance": 2.0}),
             Path(str(internvla.location)),
         )
 

@@ -4,7 +4,6 @@ import re
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -47,7 +46,7 @@ def test_an_actor_killed_in_mid_run_changes_nothing_in_the_result(
         killer = threading.Thread(target=_kill_the_actor, args=(tmp_path / "run",))
         killer.start()
         with pytest.warns(WorkerLostWarning):
-            run = extract_run(replace(settings, ray="auto"), tmp_path / "run").path
+            run = extract_run(settings.changed(ray="auto"), tmp_path / "run").path
         killer.join()
     finally:
         ray.shutdown()
@@ -79,7 +78,7 @@ def test_a_node_lost_in_mid_run_changes_nothing_in_the_bucket(tmp_path: Path, bu
     with two_nodes() as nodes, ThreadPoolExecutor(1) as thread:
         kept = thread.submit(lose, nodes)
         with pytest.warns(WorkerLostWarning) as warned:
-            extract_run(replace(settings, ray=nodes.address, workers=2), url)
+            extract_run(settings.changed(ray=nodes.address, workers=2), url)
     assert 0 < kept.result() < len(plain.episodes)
     messages = [str(warning.message) for warning in warned]
     assert nodes.second_id in messages[0]

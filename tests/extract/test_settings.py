@@ -30,7 +30,7 @@ def test_what_sets_a_run_apart_is_in_its_label(settings: ExtractSettings, label:
 def test_an_edited_run_is_called_so_and_is_another_run() -> None:
     plain, edited = ExtractSettings("pi0"), ExtractSettings("pi0", edits=(ZERO,))
     assert run_label(edited).startswith("pi0 · edited ")
-    assert plain.choices() != edited.choices()
+    assert plain.identity() != edited.identity()
 
 
 @pytest.mark.slow
@@ -46,7 +46,7 @@ def test_only_what_is_asked_is_drawn_of_the_embedded_suite(
 
 def test_a_policy_on_a_gpu_chooses_its_batch_unless_one_is_given() -> None:
     def chosen(model: str, **given: object) -> tuple[int, bool]:
-        settings = ExtractSettings.from_options(model=model, **given)  # type: ignore[arg-type]
+        settings = ExtractSettings(model, **given)  # type: ignore[arg-type]
         return settings.batch, settings.calibrate
 
     assert chosen("pi0", device="cuda") == (1, True)

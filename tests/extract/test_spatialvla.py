@@ -40,7 +40,7 @@ def test_three_families_stand_in_one_table(settings: ExtractSettings, tmp_path: 
         checkpoint=str(write_openvla(tmp_path / "openvla")),
         options={"tokenizer": "bytes"},
     )
-    tiny = replace(settings, model="pi0-tiny", checkpoint=None)
+    tiny = settings.changed(model="pi0-tiny", checkpoint=None)
     runs = [extract_run(one, tmp_path / f"run-{one.model}") for one in (settings, openvla, tiny)]
     run = runs[0]
     assert list(run.streams) == ["backbone", "action"]
@@ -64,7 +64,7 @@ def test_three_families_stand_in_one_table(settings: ExtractSettings, tmp_path: 
 
 @pytest.mark.slow
 def test_another_camera_is_another_run(settings: ExtractSettings, tmp_path: Path) -> None:
-    small = replace(settings, items=2)
+    small = settings.changed(items=2)
     extract_run(small, tmp_path / "run")
     with pytest.raises(SettingsMismatchError, match=r"policy\.camera: stored 'scene', asked 'default'"):
         extract_run(replace(small, options={"camera": "default"}), tmp_path / "run")

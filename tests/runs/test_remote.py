@@ -3,7 +3,6 @@
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +97,7 @@ def test_three_writers_at_once_give_the_same_store_in_a_bucket(suite: Suite, who
 def test_worker_processes_share_a_bucket(suite: Suite, tmp_path: Path, bucket: str) -> None:
     settings = ExtractSettings("expert", suite=suite.folder, scene=SHORT, env_workers=0)
     alone = extract_run(settings, tmp_path / "run")
-    together = extract_run(replace(settings, workers=2), f"{bucket}/run")
+    together = extract_run(settings.changed(workers=2), f"{bucket}/run")
     assert together.stamp == alone.stamp
 
 
@@ -107,7 +106,7 @@ def test_other_settings_are_refused_in_a_bucket_too(suite: Suite, bucket: str) -
     settings = ExtractSettings("expert", suite=suite.folder, items=2, scene=SHORT)
     extract_run(settings, f"{bucket}/run")
     with pytest.raises(SettingsMismatchError, match=r"seed: stored 0, asked 1"):
-        extract_run(replace(settings, seed=1), f"{bucket}/run")
+        extract_run(settings.changed(seed=1), f"{bucket}/run")
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -1,7 +1,6 @@
 """Thumbnails illustrate: they are there by default, whole, and change no number of a run."""
 
 import json
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
@@ -55,10 +54,10 @@ def test_every_episode_keeps_its_first_and_last_frame(run: Run) -> None:
 def test_thumbnails_change_neither_numbers_nor_settings_and_can_be_left_out(
     settings: ExtractSettings, run: Run, tmp_path: Path
 ) -> None:
-    film = extract_run(replace(settings, frames="all"), tmp_path / "film")
+    film = extract_run(settings.changed(frames="all"), tmp_path / "film")
     assert film.settings_sha256 == run.settings_sha256
     assert without_seconds(film.episodes).equals(without_seconds(run.episodes))
-    bare = extract_run(replace(settings, frames="none"), tmp_path / "bare")
+    bare = extract_run(settings.changed(frames="none"), tmp_path / "bare")
     assert bare.settings_sha256 == run.settings_sha256
     assert without_seconds(bare.episodes).equals(without_seconds(run.episodes))
     assert bare.stamp != run.stamp, "commits name their pictures"
@@ -70,7 +69,7 @@ def test_thumbnails_change_neither_numbers_nor_settings_and_can_be_left_out(
 def test_environment_processes_give_the_same_thumbnails(
     settings: ExtractSettings, run: Run, tmp_path: Path
 ) -> None:
-    other = extract_run(replace(settings, env_workers=0), tmp_path / "run")
+    other = extract_run(settings.changed(env_workers=0), tmp_path / "run")
     for number in run.episodes["episode"]:
         assert read_thumbnail(other.path, number) == read_thumbnail(run.path, number)
 
@@ -100,7 +99,7 @@ def test_a_sheet_gives_back_every_frame_in_order(count: int) -> None:
 
 @pytest.fixture(scope="module")
 def film_settings(settings: ExtractSettings) -> ExtractSettings:
-    return replace(settings, scene=SceneSpec(max_steps=8), frames="all", env_workers=0)
+    return settings.changed(scene=SceneSpec(max_steps=8), frames="all", env_workers=0)
 
 
 @pytest.fixture(scope="module")
@@ -137,9 +136,9 @@ def test_all_frames_are_those_that_the_environment_draws_in_the_same_episode(
 def test_all_frames_of_a_policy_are_those_that_its_stored_actions_lead_to(
     film_settings: ExtractSettings, tmp_path: Path
 ) -> None:
-    settings = replace(film_settings, model="pi0-tiny", items=2, captured_calls="all", later_views="mean")
+    settings = film_settings.changed(model="pi0-tiny", items=2, captured_calls="all", later_views="mean")
     filmed = extract_run(settings, tmp_path / "film")
-    bare = extract_run(replace(settings, frames="none"), tmp_path / "bare")
+    bare = extract_run(settings.changed(frames="none"), tmp_path / "bare")
     assert filmed.captured_calls == 2
     assert filmed.reached(1).all()
     for site in filmed.sites("expert"):

@@ -15,7 +15,7 @@ import numpy as np
 from probe_kit._terminal.plain_text import UNSAFE
 from probe_kit.errors import ObservationError, OwnEnvironmentError, ProbeKitError, UsageError
 from probe_kit.extract.own_environments.contract import SUCCESS, EnvEpisode, OwnEnvironment, Step
-from probe_kit.extract.own_environments.env_source import LEROBOT, EnvSource
+from probe_kit.extract.sources.environment import LEROBOT, EnvSource
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 
 ENTRY_POINTS = "probe_kit.sources"

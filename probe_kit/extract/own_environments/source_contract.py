@@ -7,7 +7,6 @@ import numpy as np
 
 from probe_kit.errors import MissingExtraError, ProbeKitError, UsageError
 from probe_kit.extract.own_environments.contract import EnvEpisode, OwnEnvironment, Step
-from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.own_environments.opening import (
     checked_step,
     fact_values,
@@ -16,6 +15,7 @@ from probe_kit.extract.own_environments.opening import (
     open_environment,
     started,
 )
+from probe_kit.extract.sources.environment import EnvSource
 
 STEPS = 5
 """Actions per episode that the check executes."""

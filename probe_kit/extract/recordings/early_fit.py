@@ -6,8 +6,8 @@ from typing import Any
 from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import InstructionError, RecordingError
-from probe_kit.extract.recordings.lerobot_source import IMAGES, STATE
 from probe_kit.extract.recordings.recorded_plan import Recording
+from probe_kit.extract.sources.recording import IMAGES, STATE
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.family import Family
 

@@ -11,7 +11,7 @@ from probe_kit.extract.plan import RowPlan
 from probe_kit.extract.recordings.lerobot_folder import MOST_FRAMES, LeRobotFolder
 from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
 from probe_kit.extract.recordings.lerobot_meta import IMAGE
-from probe_kit.extract.recordings.lerobot_source import ACTION, IMAGES, STATE, LeRobotSource, Pairs
+from probe_kit.extract.sources.recording import ACTION, IMAGES, STATE, LeRobotSource, Pairs
 from probe_kit.hashing import derive_seed
 from probe_kit.runs.layout import OTHER_ACTIONS, RECORDED_EPISODES
 
@@ -179,7 +179,7 @@ class Recording:
             raise RecordingError(
                 f"--rotate {strange[0]}=…: that camera gets no picture; those with one are {', '.join(known)}"
             )
-        return replace(self, source=replace(self.source, cameras=pairs))
+        return replace(self, source=self.source.model_copy(update={"cameras": pairs}))
 
     def check(self) -> None:
         """Raise RecordingError for files, numbers or pictures of the chosen episodes that cannot be shown.

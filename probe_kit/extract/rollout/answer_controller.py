@@ -71,23 +71,23 @@ class AnswerController:
 
     def __init__(self, model: "AnswerModel", settings: AskSettings, suite: Suite, blank: Observation) -> None:
         """blank: an observation as the scene will show them."""
-        self.model, self._settings, self.template = model, settings, settings.prompt
+        self.model, self._settings, self.template = model, settings, settings.task.prompt
         self._choose_positions()
-        self._phrases = phrases(suite, settings.query, settings.seed)
+        self._phrases = phrases(suite, settings.task.query, settings.seed)
         self._item_has_side_word = {item.item_id: item.side_word for item in suite.items}
         self._instructions = sorted({item.instruction for item in suite.items})
         card = model.card
         self.script: str | None = None
-        self.limit = settings.inference_limit
+        self.limit = settings.machine.inference_limit
         self.threads = 1 if card.parameters < SMALL else None
         self.on_gpu = card.device.startswith("cuda")
         self.streams: list[StoredStream] = []
-        if settings.tokens != "none":
+        if settings.capture.tokens != "none":
             self.streams = self._streams(blank)
-        self._capturer = Capturer(model, self.streams, settings.tokens == "all", "answers")
+        self._capturer = Capturer(model, self.streams, settings.capture.tokens == "all", "answers")
         self._lens_stream = self._find_lens_stream() if self.template.lettered else None
         self.identity: dict[str, Any] = {
-            "model": settings.model,
+            "model": settings.model.family,
             "random_weights": card.random_weights,
             "weights_sha256": card.weights_sha256,
             "dtype": card.dtype,
@@ -140,7 +140,7 @@ class AnswerController:
     # -- what is asked -----------------------------------------------------------------------------------
 
     def _shown(self, turn: AskTurn) -> Observation:
-        if self._settings.picture != "side-by-side":
+        if self._settings.task.picture != "side-by-side":
             return turn.seen
         picture = side_by_side(turn.planned.episode, self._settings.scene.picture_shape)
         return replace(turn.seen, image=picture)
@@ -149,7 +149,7 @@ class AnswerController:
         """As the answer is spoken; the logits of its options are those of how it begins."""
         from probe_kit.hooks import Prompt
 
-        pictured = self._settings.picture != "none"
+        pictured = self._settings.task.picture != "none"
         options = tuple(self._spoken_options(order))
         return [
             Prompt(seen, self.template.render(phrase, order, seen.instruction), options, pictured=pictured)
@@ -221,7 +221,7 @@ class AnswerController:
         self, turn: AskTurn, question: str, spoken: Sequence[str], forced: Sequence[Forced]
     ) -> dict[str, Any]:
         episode = turn.planned.episode
-        expected = side_expected(self._settings.query, episode.side_correct)
+        expected = side_expected(self._settings.task.query, episode.side_correct)
         choice = Choice([own.logits for own in forced])
         columns: dict[str, Any] = {}
         for order, text in zip(self.template.orders, spoken, strict=True):
@@ -291,7 +291,7 @@ class AnswerController:
         """
         questions = self._blank_questions(blank)[:1]
         self.model.read(questions)
-        if self.template.lettered or self._settings.query == "absent":
+        if self.template.lettered or self._settings.task.query == "absent":
             return None
         lead = self.model.lead
         begun = f"{lead}Yes," if self.template.yes_or_no else ""

@@ -13,7 +13,6 @@ import numpy as np
 from PIL import Image
 
 from probe_kit.env import save_gif
-from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.plan import PlannedEpisode, PlannedRow, RowPlan
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import ActingController
@@ -25,7 +24,9 @@ from probe_kit.extract.rollout.question_loop import Asking
 from probe_kit.extract.rollout.recorded.recorded_stage import RecordedStage
 from probe_kit.extract.rollout.stage import AskableStage, LocalStage
 from probe_kit.extract.rollout.stage_process import ProcessStage
-from probe_kit.extract.settings import RunSettings
+from probe_kit.extract.settings import Settings
+from probe_kit.extract.sources.environment import EnvSource
+from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.runs.layout import VIDEOS, stored_inputs_of
 from probe_kit.runs.sources import SOURCES, RunSources
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
@@ -49,7 +50,7 @@ class Worker:
     def __init__(
         self,
         writer: RunWriter[RowPlan],
-        settings: RunSettings,
+        settings: Settings,
         controller: ActingController | AnswerController,
         episodes: int,
     ) -> None:
@@ -60,7 +61,7 @@ class Worker:
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             stack.enter_context(torch_threads(self._controller.threads))
-            count = 2 * self._settings.batch
+            count = 2 * self._settings.machine.observations
             self._stages = [self._open_stage(position, stack) for position in range(count)]
             self._ring = BufferPool([self._make_buffers() for _ in range(count + SPARE_BUFFERS)])
             self._thread = stack.enter_context(ThreadPoolExecutor(1, "probe-kit-writer"))
@@ -71,18 +72,18 @@ class Worker:
         self._opened.close()
 
     def _open_stage(self, position: int, stack: ExitStack) -> AskableStage:
-        wanted = self._settings.env_workers
+        wanted = self._settings.machine.env_workers
         if wanted is None:
-            wanted = 2 * self._settings.batch if self._episodes >= WORTH_PROCESSES else 0
+            wanted = 2 * self._settings.machine.observations if self._episodes >= WORTH_PROCESSES else 0
         kind = ProcessStage if position < wanted else LocalStage
-        settings, source = self._settings, getattr(self._settings, "source", None)
+        settings, source = self._settings, self._settings.source
         stage: AskableStage
-        if source is None:
-            stage = kind(settings.scene, self._controller.script, settings.frames)
+        if isinstance(source, SceneSettings):
+            stage = kind(settings.scene, self._controller.script, settings.machine.frames)
         elif isinstance(source, EnvSource):
             facts = tuple(stored_inputs_of(self._writer.settings)["columns"])
-            played = PlayedEnvironment(source, facts, settings.stored_calls)
-            stage = kind(played, None, settings.frames, kind=EnvironmentStage)
+            played = PlayedEnvironment(source, facts, settings.capture.calls)
+            stage = kind(played, None, settings.machine.frames, kind=EnvironmentStage)
         else:
             stage = kind(source, None, kind=RecordedStage)
         stack.callback(stage.close)
@@ -90,9 +91,13 @@ class Worker:
 
     def _make_buffers(self) -> EpisodeBuffers:
         settings, controller = self._settings, self._controller
-        with_tokens = settings.tokens == "all"
+        with_tokens = settings.capture.tokens == "all"
         return EpisodeBuffers(
-            self._writer.streams, settings.stored_calls, with_tokens, controller.on_gpu, settings.stored_later
+            self._writer.streams,
+            settings.capture.calls,
+            with_tokens,
+            controller.on_gpu,
+            settings.capture.later_views,
         )
 
     def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
@@ -138,19 +143,28 @@ class Worker:
         certificate = self._controller.certificate()
         card = certificate["policy"]
         checkpoint, repositories = str(card.get("checkpoint") or ""), card.get("repositories", {})
-        return {**certificate, SOURCES: RunSources.of(self._settings, checkpoint, repositories).to_json()}
+        source = self._settings.source
+        suite = source.suite if isinstance(source, SceneSettings) else None
+        sources = RunSources.of(self._settings.model, suite, source.files(), checkpoint, repositories)
+        return {**certificate, SOURCES: sources.to_json()}
 
     def _pictures(self, rollout: Rollout) -> dict[str, bytes]:
         """Content by key of what is kept for people."""
         small = rollout.small_frames
-        kept = {thumbnail_key(rollout.planned.index): as_thumbnail(small, self._settings.frames)} if small else {}
+        kept = (
+            {thumbnail_key(rollout.planned.index): as_thumbnail(small, self._settings.machine.frames)}
+            if small
+            else {}
+        )
         return kept | (dict([_film(rollout)]) if rollout.frames else {})
 
     def _frame_count(self, rollout: Rollout) -> int | None:
-        return len(rollout.small_frames) or None if self._settings.frames == "all" else None
+        return len(rollout.small_frames) or None if self._settings.machine.frames == "all" else None
 
     def _is_filmed(self, planned: PlannedRow) -> bool:
-        return self._settings.films(planned.index)
+        return self._settings.machine.video == "all" or (
+            self._settings.machine.video == "first" and planned.index == 0
+        )
 
 
 @contextmanager

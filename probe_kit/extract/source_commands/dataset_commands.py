@@ -1,32 +1,31 @@
 """`probe-kit dataset`: data sets of recordings."""
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import typer
 
-from probe_kit._terminal import options as common
 from probe_kit._terminal.console import err, marked, out
+from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.plain_text import terminal_safe
-from probe_kit.extract.command_options import AcceptUnits
-from probe_kit.extract.recordings import options as recorded
+from probe_kit.extract.parts import ActMachine, ModelSettings
+from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.sources.recording import LeRobotSource
 
+_OFFERED = {
+    "checkpoint", "model_option", "episodes", "select", "camera", "rotate", "instruction", "accept_units",
+}  # fmt: skip
 app = typer.Typer(help="Inspect data sets of recordings.", no_args_is_help=True)
 
 
 @app.command("show")
+@command_with(ModelSettings, ActMachine, LeRobotSource, offers=_OFFERED.__contains__)
 def show_dataset(
+    typed: Mapping[str, Any],
     folder: Annotated[
         str, typer.Argument(metavar="FOLDER", help="A LeRobotDataset, or USER/NAME@COMMIT of the hub.")
     ],
     model: Annotated[str | None, typer.Option("--model", help="Compare with the inputs of this model.")] = None,
-    checkpoint: common.Checkpoint = None,
-    options: common.ModelOptions = None,
-    episodes: recorded.Episodes = None,
-    select: recorded.Select = None,
-    cameras: recorded.Cameras = None,
-    rotations: recorded.Rotations = None,
-    instruction: recorded.Instruction = None,
-    accept_units: AcceptUnits = False,
 ) -> None:
     """Show what a data set holds and how a model would be shown it. Writes nothing.
 
@@ -40,16 +39,10 @@ def show_dataset(
     from rich.table import Table
 
     from probe_kit.extract.prepared import check_recording, load_acting_policy, open_recording
-    from probe_kit.extract.recordings.lerobot_source import LeRobotSource
     from probe_kit.extract.rollout.recorded.described import describe_fit, describe_recording
     from probe_kit.extract.rollout.recorded.recorded_controller import check_recorded_units, fit
-    from probe_kit.extract.settings import ExtractSettings
 
-    settings = ExtractSettings.from_options(
-        model=model or "pi0-tiny", checkpoint=checkpoint, options=options, dataset=folder, episodes=episodes,
-        select=select, cameras=cameras, rotations=rotations, instruction=instruction,
-        accept_units=accept_units,
-    )  # fmt: skip
+    settings = ExtractSettings.of_command({**typed, "model": model or "pi0-tiny", "dataset": folder})
     assert isinstance(settings.source, LeRobotSource)
     with err.status("reading the data set"):
         recording = open_recording(settings.source)
@@ -67,4 +60,4 @@ def show_dataset(
         table.add_row(name, marked("{}", terminal_safe(value)))
     out.print(table)
     if fitted is not None:
-        check_recorded_units(fitted, accept_units)
+        check_recorded_units(fitted, settings.machine.accept_units)

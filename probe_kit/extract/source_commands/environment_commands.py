@@ -8,7 +8,7 @@ import typer
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import marked, out, print_json, say
 from probe_kit._terminal.plain_text import terminal_safe
-from probe_kit.extract.own_environments.options import EnvOptions
+from probe_kit.extract.sources.environment import EnvOptions
 
 FAILED = 1
 
@@ -33,7 +33,7 @@ def check_environment(
     from probe_kit.extract import EnvSource
     from probe_kit.extract import check_environment as checks_of
 
-    source = EnvSource.from_options(environment, env_options, None, None, True)
+    source = EnvSource(environment, options=env_options or ())
     checks = []
     for check in checks_of(source):
         checks.append(check)

@@ -5,12 +5,12 @@ from contextlib import contextmanager
 
 from probe_kit.extract.prepared import load
 from probe_kit.extract.rollout.worker import Worker
-from probe_kit.extract.settings import RunSettings
+from probe_kit.extract.settings import Settings
 from probe_kit.runs.store import locate
 
 
 @contextmanager
-def load_worker(settings: RunSettings, run: str) -> Iterator[Worker]:
+def load_worker(settings: Settings, run: str) -> Iterator[Worker]:
     """A worker for a run that exists, with a model of its own; the run is held while the body runs.
 
     Raises SettingsMismatchError if they differ, or if this machine gives other numbers than those before it.
@@ -19,7 +19,7 @@ def load_worker(settings: RunSettings, run: str) -> Iterator[Worker]:
     assert prepared.controller is not None
     writer = prepared.writer(locate(run))
     with writer.joined():
-        writer.begin(settings.allow_mixed)
+        writer.begin(settings.machine.allow_mixed)
         episodes = len(writer.remaining())
         with Worker(writer, prepared.settings, prepared.controller, episodes) as worker:
             yield worker

@@ -8,7 +8,7 @@ from signal import SIGALRM
 from probe_kit._execution.process_pool import Ended, ProcessPool, share_of_machine
 from probe_kit.errors import ProbeKitError, WorkerDiedError
 from probe_kit.extract.rollout.events import Event
-from probe_kit.extract.settings import RunSettings
+from probe_kit.extract.settings import Settings
 from probe_kit.extract.workers.loading import load_worker
 from probe_kit.extract.workers.scheduler import Scheduler
 from probe_kit.extract.workers.worker_errors import tell_lost
@@ -18,16 +18,16 @@ _SERVICE = "probe_kit.extract.workers.processes:serve"
 
 
 def run_in_processes(
-    settings: RunSettings, run: str, scheduler: Scheduler, on_event: Callable[[Event], None]
+    settings: Settings, run: str, scheduler: Scheduler, on_event: Callable[[Event], None]
 ) -> None:
-    """Play the episodes in `settings.workers` processes; one that dies is replaced.
+    """Play the episodes in `settings.machine.workers` processes; one that dies is replaced.
 
     Raises what a worker raises, and WorkerDiedError if one dies before it could begin.
     """
     waiting: set[int] = set()
     began: set[int] = set()
-    share = partial(share_of_machine, size=settings.workers, device=settings.device)
-    with ProcessPool(_SERVICE, (settings, run), settings.workers, share) as pool:
+    share = partial(share_of_machine, size=settings.machine.workers, device=settings.machine.device)
+    with ProcessPool(_SERVICE, (settings, run), settings.machine.workers, share) as pool:
         while not scheduler.finished:
             for slot in sorted(waiting):
                 number = scheduler.take(slot)
@@ -48,15 +48,15 @@ def run_in_processes(
                     on_event(message)
 
 
-def _why(code: int, began: bool, slot: int, settings: RunSettings) -> str:
+def _why(code: int, began: bool, slot: int, settings: Settings) -> str:
     """How a worker ended. Raises WorkerDiedError for one that never began."""
     if not began:
         raise WorkerDiedError(
             f"worker {slot} ended with code {code} before its first episode; its last words are above. Try "
             "fewer --workers, or none to see the error in this process"
         )
-    if settings.inference_limit is not None and code == -SIGALRM:
-        limit = f"{settings.inference_limit:g}"
+    if settings.machine.inference_limit is not None and code == -SIGALRM:
+        limit = f"{settings.machine.inference_limit:g}"
         return f"was ended, because a call of its model took longer than --inference-limit {limit} s"
     return f"ended with code {code}"
 

@@ -9,7 +9,7 @@ from probe_kit._execution.ray_cluster import answer_of, ray_cluster
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import ProbeKitError, WorkerDiedError
 from probe_kit.extract.rollout.events import Done, Event
-from probe_kit.extract.settings import RunSettings
+from probe_kit.extract.settings import Settings
 from probe_kit.extract.workers.loading import load_worker
 from probe_kit.extract.workers.scheduler import Scheduler
 from probe_kit.extract.workers.worker_errors import tell_lost
@@ -29,7 +29,7 @@ class ClusterFullWarning(UserWarning):
     """No node of the cluster has room for a worker; the extraction waits for one."""
 
 
-def run_on_ray(settings: RunSettings, run: str, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
+def run_on_ray(settings: Settings, run: str, scheduler: Scheduler, on_event: Callable[[Event], None]) -> None:
     """Play the episodes in actors of a Ray cluster, one per GPU, all of which see the location `run`.
 
     An actor that dies is replaced; what it held is tried again by the scheduler, as in every transport.
@@ -45,7 +45,7 @@ def run_on_ray(settings: RunSettings, run: str, scheduler: Scheduler, on_event: 
 class RayActor:
     """What runs on a node: the same worker as everywhere."""
 
-    def __init__(self, settings: RunSettings, run: str) -> None:
+    def __init__(self, settings: Settings, run: str) -> None:
         self._settings, self._run = settings, run
         self._opened = ExitStack()
         self._worker: Any = None
@@ -73,14 +73,15 @@ class RayActor:
 
 
 class RayWorkers:
-    """Actors on a cluster, as many as GPUs, or as `settings.workers` says. A context manager.
+    """Actors on a cluster, as many as GPUs, or as `settings.machine.workers` says. A context manager.
 
     Each holds a GPU, if there are any, and a core, so that nodes share them; an actor gets episodes once it has
     loaded its model. One without room, because a node was lost, gets none and delays no other.
     """
 
-    def __init__(self, settings: RunSettings, run: str) -> None:
+    def __init__(self, settings: Settings, run: str) -> None:
         self._settings, self._run = settings, run
+        self._on_gpu = settings.machine.device.startswith("cuda")
         self._actors: dict[int, Any] = {}
         self._calls: dict[Any, int] = {}
         self._nodes: dict[int, str] = {}
@@ -91,8 +92,14 @@ class RayWorkers:
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            self._ray = ray = stack.enter_context(ray_cluster(self._settings.ray or "auto", log_to_driver=True))
-            gpus = int(ray.cluster_resources().get("GPU", 0)) if self._settings.device.startswith("cuda") else 0
+            self._ray = ray = stack.enter_context(
+                ray_cluster(self._settings.machine.ray or "auto", log_to_driver=True)
+            )
+            gpus = (
+                int(ray.cluster_resources().get("GPU", 0))
+                if self._settings.machine.device.startswith("cuda")
+                else 0
+            )
             # Ray could restart an actor itself, but fails every call meanwhile: episodes would seem to kill it
             # twice.
             options = {
@@ -100,7 +107,7 @@ class RayWorkers:
                 "scheduling_strategy": "SPREAD",
             }  # fmt: skip
             self._kind = ray.remote(**options)(RayActor)
-            for slot in range(self._settings.workers or max(1, gpus)):
+            for slot in range(self._settings.machine.workers or max(1, gpus)):
                 self._start(slot)
             self._opened = stack.pop_all()
         return self
@@ -155,7 +162,7 @@ class RayWorkers:
                 free = {name: self._ray.available_resources().get(name, 0) for name in ("CPU", "GPU")}
                 warnings.warn(
                     f"no worker on the Ray cluster has begun within {PATIENCE:.0f} s: each needs a core"
-                    f"{' and a GPU' if self._settings.device.startswith('cuda') else ''}, and the cluster has "
+                    f"{' and a GPU' if self._on_gpu else ''}, and the cluster has "
                     f"{free['CPU']:g} cores and {free['GPU']:g} GPUs free. It still loads the model, or waits for "
                     "a node: `ray status` shows which",
                     ClusterFullWarning,

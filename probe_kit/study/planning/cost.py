@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from probe_kit.extract.needs import PlannedSizes, planned_sizes, space_of
-from probe_kit.extract.settings import ExtractSettings, RunSettings
+from probe_kit.extract.settings import ExtractSettings, Settings
 from probe_kit.hooks.registry import family_names
 from probe_kit.runs.layout import StoredStream
 from probe_kit.study.cells import Cell
@@ -105,7 +105,7 @@ def _rates(works: Sequence[Work]) -> dict[str, float]:
 def _calibrated(cell: Cell, speeds: Mapping[str, Speed]) -> float | None:
     """Seconds per unit, unless they were measured with another batch or on another device."""
     found, settings = speeds.get(speed_name(cell)), cell.settings
-    if found is None or (found.batch, found.device) != (settings.batch, settings.device):
+    if found is None or (found.batch, found.device) != (settings.machine.observations, settings.machine.device):
         return None
     return found.seconds
 
@@ -114,21 +114,21 @@ def _bytes(one: Work, stored: Sequence[StoredStream] | None, speeds: Mapping[str
     """Of an episode: from stored streams, else as the family declares them, else from a calibration."""
     settings, streams = one.cell.settings, one.streams or stored
     if streams is None:  # a script has no network
-        sizes = planned_sizes(settings) if settings.model in family_names() else PlannedSizes((), "")
+        sizes = planned_sizes(settings) if settings.model.family in family_names() else PlannedSizes((), "")
         streams = None if sizes is None else sizes.streams
     if streams is not None:
         return bytes_per_episode(streams, settings)
     found = speeds.get(speed_name(one.cell))
-    return None if found is None or found.tokens != settings.tokens else found.bytes
+    return None if found is None or found.tokens != settings.capture.tokens else found.bytes
 
 
-def bytes_per_episode(streams: Sequence[StoredStream], settings: RunSettings) -> int:
+def bytes_per_episode(streams: Sequence[StoredStream], settings: Settings) -> int:
     """Uncompressed bytes of an episode with columns and probes, without a report.
 
     Those of an episode with the most inferences, where every one is captured.
     """
     if isinstance(settings, ExtractSettings):
-        settings = settings.with_every_call(settings.execute or 1)
+        settings = settings.with_every_call(settings.task.execute or 1)
     space = space_of(streams, 1, settings)
     return sum(space.values()) - space["report"]
 

@@ -8,7 +8,7 @@ from time import perf_counter
 from typing import Literal
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract.settings import ExtractSettings, RunSettings
+from probe_kit.extract.settings import ExtractSettings, Settings
 from probe_kit.runs import open_run
 from probe_kit.study.cells import Cell
 from probe_kit.study.ledger import Failure, Ledger, Speed, now
@@ -49,7 +49,7 @@ def calibrate_study(
 
 def _measured(one: PlannedCell, env_workers: int | None) -> Speed | Failure:
     cell, watch = one.cell, _Watch()
-    settings = replace(_shortened(cell), env_workers=env_workers)
+    settings = _shortened(cell).changed(env_workers=env_workers)
     with TemporaryDirectory(prefix="probe-kit-calibration-") as folder:
         place = Path(folder) / "run"
         try:
@@ -60,27 +60,27 @@ def _measured(one: PlannedCell, env_workers: int | None) -> Speed | Failure:
             return watch.failure
         streams = list(open_run(place).root.streams.values())
     return Speed(
-        seconds=round(watch.pace(settings.batch) / units(replace(cell, settings=settings)), 6),
+        seconds=round(watch.pace(settings.machine.observations) / units(replace(cell, settings=settings)), 6),
         bytes=bytes_per_episode(streams, cell.settings),
-        batch=settings.batch,
-        device=settings.device,
-        tokens=settings.tokens,
+        batch=settings.machine.observations,
+        device=settings.machine.device,
+        tokens=settings.capture.tokens,
         episodes=len(watch.times),
         when=now(),
     )
 
 
-def _shortened(cell: Cell) -> RunSettings:
+def _shortened(cell: Cell) -> Settings:
     """The settings of a cell with few episodes, each of few inferences, which are captured where several are."""
     settings = cell.settings_to_play
     name, count = max(cell.selection.counts(cell.suite).items(), key=lambda pair: pair[1])
-    items = min(count, max(EPISODES // 2, 2 * settings.batch))
-    settings = replace(settings, categories=(name,), items=items - items % 2)
+    items = min(count, max(EPISODES // 2, 2 * settings.machine.observations))
+    settings = settings.changed(categories=(name,), items=items - items % 2)
     if not isinstance(settings, ExtractSettings):
         return settings
-    steps = min(settings.scene.max_steps, INFERENCES * (settings.execute or 1))
-    calls: int | Literal["all"] = 1 if settings.captured_calls == 1 else "all"
-    return replace(settings, scene=replace(settings.scene, max_steps=steps), captured_calls=calls)
+    steps = min(settings.scene.max_steps, INFERENCES * (settings.task.execute or 1))
+    calls: int | Literal["all"] = 1 if settings.capture.captured_calls == 1 else "all"
+    return settings.changed(max_steps=steps, captured_calls=calls)
 
 
 class _Watch:

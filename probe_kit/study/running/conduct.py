@@ -1,7 +1,6 @@
 """Playing of all runs that a plan finds missing, in this process, in several, or on a Ray cluster."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from probe_kit._system.optional_dependencies import require
@@ -120,7 +119,7 @@ class _Course:
         try:
             if one.state == "damaged":
                 raise ProbeKitError(one.why.removeprefix("damaged: "))
-            settings = as_protocol(replace(one.cell.settings_to_play, ray=self._ray))  # its devices are elsewhere
+            settings = as_protocol(one.cell.settings_to_play.changed(ray=self._ray))  # its devices are elsewhere
             suite = check_run(settings, locate(one.location))
             if settings.scene not in rehearsed:
                 run_preflight(settings.scene, plan_episodes(suite, settings.seed))
@@ -133,6 +132,7 @@ class _Course:
 
     def _task(self, one: PlannedCell) -> RunTask:
         settings = one.cell.settings_to_play
-        suite = None if settings.suite is None else settings.suite.resolve()
-        settings = replace(settings, suite=suite, env_workers=self._env_workers)
+        folder = one.cell.suite.folder
+        suite = None if folder is None else folder.resolve()
+        settings = settings.changed(suite=suite, env_workers=self._env_workers)
         return RunTask(one.cell.name, settings, locate(one.location).address, one.done)

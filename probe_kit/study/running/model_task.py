@@ -10,7 +10,7 @@ from probe_kit.extract import prepare
 from probe_kit.extract.extraction import Extraction
 from probe_kit.extract.prepared import load_acting_policy, load_answer_model
 from probe_kit.extract.rollout.controllers import SCRIPTED
-from probe_kit.extract.settings import AskSettings, ExtractSettings, RunSettings
+from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.study.ledger import Failure, Played, machine_name, now
 from probe_kit.study.running.reuse import find_equal_run
 
@@ -30,7 +30,7 @@ class RunTask:
     """
 
     run: str
-    settings: RunSettings
+    settings: Settings
     location: str
     done: int
 
@@ -107,13 +107,13 @@ class _Loaded:
     policy: "Policy | None" = None
     answer_model: "AnswerModel | None" = None
 
-    def prepare(self, settings: RunSettings, location: str) -> Extraction:
+    def prepare(self, settings: Settings, location: str) -> Extraction:
         """An extraction with the model that is loaded."""
         if isinstance(settings, AskSettings):
             self.answer_model = self.answer_model or load_answer_model(settings)
             return prepare(settings, location, answer_model=self.answer_model)
         assert isinstance(settings, ExtractSettings)
-        if settings.model not in SCRIPTED and self.policy is None:
+        if settings.model.family not in SCRIPTED and self.policy is None:
             self.policy = load_acting_policy(settings)
         return prepare(settings, location, policy=self.policy)
 

@@ -1,6 +1,5 @@
 """A Gymnasium environment from `extract --env` to a decoded label, with the embedded policy."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +108,7 @@ def test_what_does_not_fit_the_model_is_refused_before_anything_is_written(pi0_t
     with pytest.raises(UsageError, match="--no-act does not apply with --env"):
         prepare(settings(capture_only=True), policy=pi0_tiny)
     with pytest.raises(UsageError, match="expert is scripted"):
-        prepare(replace(settings(), model="expert"))
+        prepare(settings().changed(model="expert"))
 
 
 def test_an_environment_that_fails_costs_its_episode_and_says_where(pi0_tiny: Pi0, tmp_path: Path) -> None:
@@ -129,7 +128,7 @@ def test_options_of_scenes_and_recordings_are_refused_with_an_environment() -> N
     with pytest.raises(UsageError, match="two sources"):
         ExtractSettings.from_options(**given, dataset="kitchen")
     with pytest.raises(UsageError, match="--env-option is for environments; give --env"):
-        ExtractSettings.from_options(model="pi0-tiny", env_options=["a=1"])
+        ExtractSettings("pi0-tiny", env_options=["a=1"])
     typed = ExtractSettings.from_options(
         **given, episodes="0:2", max_steps=9, no_pixels=True, captured_calls="all"
     )

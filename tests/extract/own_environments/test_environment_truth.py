@@ -128,7 +128,7 @@ def test_states_in_other_units_are_refused_of_an_environment_unless_accepted(
         prepare(settings(name, accept_units=name == "Degrees"), policy=pi0_tiny)
         for name in ("Degrees", "ReachEnv")
     )
-    assert one.settings.choices() == two.settings.choices(), "accepting units changes no number"
+    assert one.settings.identity() == two.settings.identity(), "accepting units changes no number"
 
 
 def test_a_scene_whose_states_lie_outside_the_statistics_is_refused_unless_accepted(

@@ -206,7 +206,7 @@ def test_which_frames_and_episodes_are_chosen_changes_no_number_of_a_frame(
 def test_frames_are_decoded_in_child_processes_with_the_same_numbers(
     run: Run, recording: Path, pi0_tiny: Pi0, tmp_path: Path
 ) -> None:
-    own = replace(settings(recording, episodes=(0, 1)), env_workers=2)
+    own = settings(recording, episodes=(0, 1)).changed(env_workers=2)
     found = prepare(own, policy=pi0_tiny).run(tmp_path / "run")
     for name, every in rows(run).items():
         np.testing.assert_array_equal(rows(found)[name][:, :5], every[:2, :5])

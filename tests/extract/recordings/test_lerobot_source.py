@@ -9,9 +9,9 @@ import pytest
 from probe_kit.errors import MissingExtraError, RecordingError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, prepare
 from probe_kit.extract.recordings.lerobot_folder import open_lerobot, resolved_commit
-from probe_kit.extract.recordings.lerobot_source import read_episodes, read_every
 from probe_kit.extract.recordings.recorded_plan import PlannedStretch, mapped_cameras
 from probe_kit.extract.rollout.settings_checks import check_meaningless
+from probe_kit.extract.sources.recording import read_episodes, read_every
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
@@ -167,9 +167,9 @@ def test_options_of_scenes_are_refused_with_recordings(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="expert is scripted and looks at nothing"):
         prepare(ExtractSettings("expert", source=source))
     with pytest.raises(UsageError, match="--max-steps, --captured-calls does not apply with --dataset"):
-        ExtractSettings.from_options(model="pi0-tiny", dataset="x", max_steps=3, captured_calls=2)
+        ExtractSettings("pi0-tiny", dataset="x", max_steps=3, captured_calls=2)
 
 
 def test_options_of_recordings_are_refused_without_them() -> None:
     with pytest.raises(UsageError, match="--episodes, --no-pixels is for recordings; give --dataset"):
-        ExtractSettings.from_options(model="pi0-tiny", episodes="0:5", no_pixels=True)
+        ExtractSettings("pi0-tiny", episodes="0:5", no_pixels=True)

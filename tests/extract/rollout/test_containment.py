@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -326,7 +325,7 @@ def test_a_model_that_hangs_in_a_worker_is_ended_and_its_episodes_are_played_aga
     installed: str, settings: ExtractSettings, tmp_path: Path
 ) -> None:
     """The third call of every worker hangs: the first episode of each is kept, and the last ones are named."""
-    hurried = replace(settings, model=installed, workers=1, inference_limit=15.0)
+    hurried = settings.changed(model=installed, workers=1, inference_limit=15.0)
     said = r"worker 0 was ended, because a call of its model took longer than --inference-limit 15 s"
     with pytest.warns(WorkerLostWarning, match=said), suppress(EpisodesFailedError):
         extract_run(hurried, tmp_path / "run")
@@ -335,14 +334,14 @@ def test_a_model_that_hangs_in_a_worker_is_ended_and_its_episodes_are_played_aga
 
 def test_a_limit_without_a_process_that_can_be_ended_is_wrong_usage(settings: ExtractSettings) -> None:
     with pytest.raises(UsageError, match="add --workers 1"):
-        replace(settings, inference_limit=5.0)
+        settings.changed(inference_limit=5.0)
     for limit in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(UsageError, match="inference_limit is"):
-            replace(settings, workers=1, inference_limit=limit)
+            settings.changed(workers=1, inference_limit=limit)
 
 
 def test_a_limit_changes_no_name_of_a_run(settings: ExtractSettings) -> None:
-    assert replace(settings, workers=1, inference_limit=5.0).choices() == settings.choices()
+    assert settings.changed(workers=1, inference_limit=5.0).identity() == settings.identity()
 
 
 @pytest.mark.slow

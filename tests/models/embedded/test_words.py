@@ -1,7 +1,6 @@
 """The words of the embedded models: listed, and checked before a model is loaded."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -72,4 +71,4 @@ def test_a_suite_with_an_unknown_word_is_refused_before_the_model_is_loaded(
     table.write_text("instruction,correct,wrong\nPut it on the xylophone,red.png,blue.png\n", encoding="utf-8")
     suite = suite_from_csv(table, tmp_path / "suite", terms=Terms("CC0-1.0", "the test"))
     with pytest.raises(InstructionError, match=r"does not know .*'xylophone'"):
-        check_run(replace(settings, suite=suite.folder))
+        check_run(settings.changed(suite=suite.folder))

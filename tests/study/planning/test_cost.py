@@ -33,7 +33,7 @@ def test_hours_come_from_stored_episodes_of_the_model_by_inferences(
     cells: dict[str, Cell], ledger: Ledger
 ) -> None:
     plain, dark = cells["base/plain"], cells["base/dark"]
-    short = replace(plain, settings=replace(plain.settings, scene=replace(plain.settings.scene, max_steps=20)))
+    short = replace(plain, settings=plain.settings.changed(scene=replace(plain.settings.scene, max_steps=20)))
     assert (plain.inferences / plain.episodes, short.inferences / short.episodes) == (40, 20)
     works = [Work(plain, 10, 90, 8.0, STREAMS), Work(replace(short, way="short"), 0, 36), Work(dark, 0, 0)]
     cost = cost_of(works, ledger)
@@ -50,7 +50,7 @@ def test_a_calibrated_rate_holds_for_its_batch_and_device(cells: dict[str, Cell]
     cost = cost_of([Work(plain, 0, 10), Work(reader, 0, 40)], ledger)
     assert cost.seconds == {"base/plain": 10 * 40 * 0.25, "reader/p1": 40 * 0.25}
     assert set(cost.sources.values()) == {"calibrated"}
-    other = replace(plain, settings=replace(plain.settings, batch=8))
+    other = replace(plain, settings=plain.settings.changed(batch=8))
     assert cost_of([Work(other, 0, 10)], ledger).unmeasured == ("base",)
     assert cost_of([Work(plain, 5, 10, 2.0)], ledger).sources == {"base": "stored episodes"}
 
@@ -66,7 +66,7 @@ def test_bytes_come_from_stored_streams_of_the_model_or_from_a_calibration(
     assert cost_of([new], ledger).unsized == ("base",)
     ledger.note_speed("base, acting", SPEED)
     assert cost_of([new], ledger).bytes == {"base": 2000}
-    every = replace(dark, settings=replace(dark.settings, tokens="all"))
+    every = replace(dark, settings=dark.settings.changed(tokens="all"))
     assert cost_of([Work(every, 0, 2)], ledger).unsized == ("base",)
 
 
@@ -74,7 +74,7 @@ def test_every_inference_takes_bytes_at_most(cells: dict[str, Cell], ledger: Led
     plain = cells["base/plain"]
     most, rest = plain.settings.scene.max_steps, 4 * 16 + EPISODE + THUMBNAILS
     for later, bytes_of_later in (("all", 2 * 4 * 64 * 2 * 4), ("mean", 2 * 4 * 64 * 2)):
-        every = replace(plain, settings=replace(plain.settings, captured_calls="all", later_views=later))
+        every = replace(plain, settings=plain.settings.changed(captured_calls="all", later_views=later))
         expected = 2 * 4 * 64 * 2 * 4 + (most - 1) * bytes_of_later + rest
         assert cost_of([Work(every, 10, 1, 1.0, STREAMS)], ledger).bytes == {"base": expected}
 

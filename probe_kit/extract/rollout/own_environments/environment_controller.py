@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError, ObservationError, OwnEnvironmentError, UsageError
 from probe_kit.extract.own_environments.contract import EnvEpisode
-from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.own_environments.environment_plan import EnvironmentPlan, plan_env_episodes
 from probe_kit.extract.own_environments.opening import (
     checked_step,
@@ -24,6 +23,7 @@ from probe_kit.extract.rollout.own_environments.environment_stage import cameras
 from probe_kit.extract.rollout.preflight import FIRST_EPISODES, exchanged_names, unusual_shares
 from probe_kit.extract.rollout.recorded.recorded_controller import RecordedController, check_predictions
 from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.sources.environment import EnvSource
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
@@ -153,15 +153,16 @@ def environment_controller(fitted: FittedEnvironment, settings: ExtractSettings)
     """The controller of a run in an environment."""
     blank = replace(fitted.example, image=np.zeros_like(fitted.example.image))
     examples = [replace(blank, instruction=text) for text in fitted.opened.instructions]
-    execute = settings.execute or fitted.policy.card.execute
+    execute = settings.task.execute or fitted.policy.card.execute
     if execute > fitted.chunk:
         raise UsageError(
-            f"--execute {execute}: {settings.model} gives {fitted.chunk} actions per inference; execute 1 to "
-            f"{fitted.chunk} of them"
+            f"--execute {execute}: {settings.model.family} gives {fitted.chunk} actions per inference; execute 1 "
+            f"to {fitted.chunk} of them"
         )
     return EnvironmentController(
-        fitted.policy, settings.model, examples, execute, settings.with_every_call(execute).stored_calls,
-        settings.tokens == "all", settings.edits, settings.vectors, limit=settings.inference_limit,
+        fitted.policy, settings.model.family, examples, execute, settings.with_every_call(execute).capture.calls,
+        settings.capture.tokens == "all", settings.task.edits, settings.task.vectors,
+        limit=settings.machine.inference_limit,
     )  # fmt: skip
 
 
@@ -175,7 +176,7 @@ def environment_plan(
     """The episodes of an environment. fitted: None where no model is loaded. execute: actions per inference."""
     rows = tuple(plan_env_episodes(opened.episodes, settings.seed))
     per_row = sum(
-        stream.raw_bytes(settings.tokens == "all", settings.stored_calls, settings.later_views)
+        stream.raw_bytes(settings.capture.tokens == "all", settings.capture.calls, settings.capture.later_views)
         for stream in streams
     )
     identity = {} if fitted is None else _identity(fitted, execute)

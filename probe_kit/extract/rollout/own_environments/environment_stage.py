@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.own_environments.contract import SUCCESS, Step
-from probe_kit.extract.own_environments.env_source import EnvSource
 from probe_kit.extract.own_environments.environment_plan import PlannedEnvEpisode
 from probe_kit.extract.own_environments.opening import (
     checked_step,
@@ -21,6 +20,7 @@ from probe_kit.extract.own_environments.opening import (
 )
 from probe_kit.extract.rollout.recorded.recorded_stage import small_picture
 from probe_kit.extract.rollout.stage import Answer, Ending, TimedStage
+from probe_kit.extract.sources.environment import EnvSource
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import AT_END, ONCE, FrameChoice
 from probe_kit.runs.small_frames import SmallFrames, shrink

@@ -1,8 +1,8 @@
 """What `probe-kit dataset show` says of a data set, and of a model that is to be shown it."""
 
-from probe_kit.extract.recordings.lerobot_source import ACTION, STATE
 from probe_kit.extract.recordings.recorded_plan import Recording
 from probe_kit.extract.rollout.recorded.recorded_controller import Fitted
+from probe_kit.extract.sources.recording import ACTION, STATE
 
 _LONGEST = 12
 """Tasks and numbers that are listed."""

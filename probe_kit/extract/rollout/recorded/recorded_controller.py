@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from probe_kit.errors import ObservationError, PolicyFailedError, RecordingError
 from probe_kit.extract.recordings.early_fit import check_state_width, raise_together
 from probe_kit.extract.recordings.lerobot_folder import fetched
-from probe_kit.extract.recordings.lerobot_source import ACTION, STATE
 from probe_kit.extract.recordings.recorded_plan import Recording
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
 from probe_kit.extract.rollout.preflight import MOST_UNUSUAL, check_units, other_order, unusual_shares
 from probe_kit.extract.rollout.recorded.recorded_stage import example_of
 from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.sources.recording import ACTION, STATE
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 
@@ -97,8 +97,8 @@ def recorded_controller(fitted: Fitted, settings: ExtractSettings) -> RecordedCo
     recording = fitted.recording
     examples = [example_of(recording, text) for text in recording.instructions]
     controller = RecordedController(
-        fitted.policy, settings.model, examples, None, settings.stored_calls, settings.tokens == "all",
-        limit=settings.inference_limit,
+        fitted.policy, settings.model.family, examples, None, settings.capture.calls,
+        settings.capture.tokens == "all",        limit=settings.machine.inference_limit,
     )  # fmt: skip
     del controller.identity["execute"]
     return controller

@@ -10,9 +10,9 @@ from PIL import Image
 
 from probe_kit.errors import ProbeKitError, RecordingError
 from probe_kit.extract.recordings.lerobot_folder import open_lerobot
-from probe_kit.extract.recordings.lerobot_source import ACTION, STATE, LeRobotSource
 from probe_kit.extract.recordings.recorded_plan import SIDE, PlannedStretch, Recording
 from probe_kit.extract.rollout.stage import Answer, Ending, TimedStage
+from probe_kit.extract.sources.recording import ACTION, STATE, LeRobotSource
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
 from probe_kit.runs.layout import CAPTURE_ONLY, FrameChoice

@@ -1,0 +1,152 @@
+"""Commands whose options are fields of models: a field is declared once, as setting, option and key of a file.
+
+A field that a command offers has a `typer.Option` in its annotation. The type, the choices, the default and the
+bounds are the field's own; pydantic ignores the option, and typer sees nothing of the model.
+"""
+
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import chain
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
+
+import typer
+from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic.fields import FieldInfo
+from typer.models import OptionInfo
+
+from probe_kit.errors import UsageError
+
+
+class Part(BaseModel):
+    """A frozen group of settings. Values without a name are those of the first fields.
+
+    Raises UsageError naming the field, the value and what is expected in its place.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    def __init__(self, *first: Any, **values: Any) -> None:
+        try:
+            names = (name for name in type(self).model_fields if name != "kind")
+            super().__init__(**dict(zip(names, first, strict=False)), **values)
+        except ValidationError as error:
+            raise UsageError(in_words(type(self).__name__, error)) from None
+
+
+def in_words(subject: str, error: ValidationError) -> str:
+    """The first mistake of a model's values as a sentence. subject: the name of the model."""
+    first = error.errors(include_url=False)[0]
+    name = ".".join(str(part) for part in first["loc"] if not str(part).startswith("function-"))
+    if first["type"] == "extra_forbidden":
+        return f"{subject} has no setting {name}; leave it out"
+    expected = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return f"{name} is {first['input']!r}; expected {expected}"
+
+
+@dataclass(frozen=True)
+class FieldOption:
+    """A field that a command offers as an option. parameter: its name in Python, from the option's long form."""
+
+    field: str
+    parameter: str
+    flag: str
+    info: FieldInfo
+    option: OptionInfo
+
+    @property
+    def typed(self) -> Any:
+        """The type that typer reads: texts where the field reads several of them, and anything behind a parser."""
+        bare = _bare(self.info.annotation)
+        if self.option.parser is not None:
+            return object
+        return list[str] | None if get_origin(bare) in (dict, tuple) else bare
+
+
+def options_of(model: type[BaseModel]) -> Iterator[FieldOption]:
+    """The options among the fields of a model, in their order."""
+    for name, info in model.model_fields.items():
+        for option in (one for one in info.metadata if isinstance(one, OptionInfo)):
+            texts = (option.default, *(option.param_decls or ()))
+            declared = (str(text).rpartition("/")[2].strip() for text in texts)
+            flag = next(text for text in declared if text.startswith("--"))
+            yield FieldOption(name, flag.removeprefix("--").replace("-", "_"), flag, info, option)
+
+
+def command_with(
+    *models: type[BaseModel], offers: Callable[[str], bool] = bool
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Decorate a command with the options of models, in front of its own.
+
+    The command gets the values that were typed by the name of their parameter, as its first argument. A parameter
+    that two models share is one option; one that the command has itself, or does not offer, is not added.
+    """
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        first, *own = inspect.signature(command, eval_str=True).parameters.values()
+        names = {one.name for one in own}
+        added: dict[str, inspect.Parameter] = {}
+        for one in chain.from_iterable(map(options_of, models)):
+            if one.parameter not in names and offers(one.parameter):
+                added.setdefault(one.parameter, _parameter(one))
+
+        def run(context: typer.Context, **values: Any) -> None:
+            typed = {
+                name: value for name in added if _was_typed(context, name) and (value := values[name]) is not None
+            }
+            command(typed, **{one.name: values[one.name] for one in own})
+
+        required = [one for one in added.values() if one.name in _required(models)]
+        others = [one for one in (*own, *added.values()) if one not in required]
+        ordered = [*required, *sorted(others, key=lambda one: _panel(one) is not None)]
+        context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+        keyword = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in ordered]
+        run.__signature__ = inspect.Signature([context, *keyword])  # type: ignore[attr-defined]
+        run.__annotations__ = {one.name: one.annotation for one in (context, *keyword)}
+        run.__name__, run.__doc__, run.__module__ = command.__name__, command.__doc__, command.__module__
+        del first
+        return run
+
+    return decorate
+
+
+def _required(models: Iterable[type[BaseModel]]) -> set[str]:
+    """The parameters that every command line has: those of required fields, but for fields that choose a model."""
+    first = next(iter(models), None)
+    return set() if first is None else {one.parameter for one in options_of(first) if one.info.is_required()}
+
+
+def _parameter(one: FieldOption) -> inspect.Parameter:
+    required = one.info.is_required()
+    default = None if required or one.typed == list[str] | None else one.info.default
+    typed = one.typed | None if default is None and one.typed is not object else one.typed
+    return inspect.Parameter(
+        one.parameter, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[typed, one.option]
+    )
+
+
+def _was_typed(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name != "DEFAULT"
+
+
+def _panel(parameter: inspect.Parameter) -> str | None:
+    for one in get_args(parameter.annotation)[1:]:
+        if isinstance(one, OptionInfo):
+            return one.rich_help_panel
+    return None
+
+
+def _bare(annotation: Any) -> Any:
+    """A type without the metadata of its parts, such as `int | None` of a bounded number that may be missing."""
+    if get_origin(annotation) is Annotated:
+        return _bare(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, UnionType):
+        return Union[tuple(_bare(one) for one in get_args(annotation))]  # noqa: UP007 - made of a tuple
+    return annotation
+
+
+def plain(value: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries that are neither None nor False: those that were chosen."""
+    return {name: one for name, one in value.items() if one is not None and one is not False}

@@ -1,0 +1,380 @@
+"""Parts of the settings of a run: model, capture, task, machine. A field says by its part whether it is identity.
+
+`capture` and `task` are identity as they are; `model` and the source (in `sources/`) are by what they lead to, a
+hash of weights and a list of rows; `machine` never is. A field is declared here once: its annotation holds the
+option of the command line, and study files have the same fields.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import typer
+from pydantic import BeforeValidator, Field, PlainSerializer
+
+from probe_kit._terminal import options as common
+from probe_kit._terminal.console import whole_number
+from probe_kit._terminal.field_options import Part
+from probe_kit._terminal.options import further_option, speed_option
+from probe_kit.errors import UsageError
+from probe_kit.extract.vqa.phrases import Picture, Query
+from probe_kit.extract.vqa.templates import P1, Template, find_template
+from probe_kit.hooks import family as hook_family
+from probe_kit.hooks.capturing.edits import Edit, Vectors
+from probe_kit.hooks.contract.options import read_pairs
+from probe_kit.hooks.contract.protocol import ProtocolName, Rotation
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.layout import AskTokens, Codec, FrameChoice, LaterViews, Tokens, VideoChoice
+
+LARGEST = 1_000_000
+MOST_CALLS = 10_000
+stored_option = partial(typer.Option, rich_help_panel="Stored data")
+control_option = partial(typer.Option, rich_help_panel="Controls")
+
+
+def option_of(annotated: Any) -> Any:
+    """The option of an alias in `_terminal.options`, for a field of another type than its texts."""
+    return annotated.__metadata__[0]
+
+
+def count_or(word: str, option: str) -> Callable[[Any], Any]:
+    """A parser of a whole number or `word`. Raises UsageError for anything else."""
+
+    def parse(text: Any) -> Any:
+        number = whole_number(str(text))
+        if number is None and text != word:
+            raise UsageError(f"{option} {text!r} is neither a whole number nor {word}")
+        return word if number is None else number
+
+    return parse
+
+
+def read_options(value: Any) -> Any:
+    """KEY=VALUE texts as a dictionary, and a dictionary as it is."""
+    return read_pairs(value) if isinstance(value, Sequence) and not isinstance(value, str) else dict(value or {})
+
+
+OptionsByName = Annotated[dict[str, Any], BeforeValidator(read_options)]
+
+
+WeightsDtype = Annotated[
+    hook_family.Dtype | None,
+    further_option("--dtype", help="Data type of the weights. Default: the data type of the checkpoint."),
+]
+
+
+class ModelSettings(Part):
+    """The model that acts or answers, and its weights.
+
+    family: a name of `probe-kit models`, or a script. checkpoint: folder or hub id; None for the family's default.
+    options: what only some families have, such as `unnorm_key`. weights_seed: of an untrained network's weights.
+    dtype: of the weights; None for the checkpoint's.
+    """
+
+    family: Annotated[str, option_of(common.ModelName)]
+    checkpoint: common.Checkpoint = None
+    options: Annotated[OptionsByName, option_of(common.ModelOptions)] = Field(default={})
+    random_weights: common.RandomWeights = False
+    weights_seed: Annotated[common.WeightsSeed, Field(ge=0)] = 0
+    dtype: WeightsDtype = None
+
+
+# -- capture ------------------------------------------------------------------------------------------------
+
+
+class Capture(Part):
+    """What is stored of the activations of a model that acts.
+
+    tokens: `pooled` stores pooled views only, `all` also every token. captured_calls: inferences captured per
+    episode, from the first on; `all` is as many as an episode can have, once the model is loaded. later_views:
+    `mean` stores of the inferences after the first the view `mean` alone, in bfloat16.
+    """
+
+    tokens: Annotated[
+        Tokens, stored_option("--tokens", help="pooled: store pooled views. all: also store every token (large).")
+    ] = "pooled"
+    captured_calls: Annotated[
+        Annotated[int, Field(ge=1, le=MOST_CALLS)] | Literal["all"],
+        stored_option(
+            "--captured-calls",
+            parser=count_or("all", "--captured-calls"),
+            metavar="N|all",
+            help="Number of inferences captured per episode. all: as many as an episode can have.",
+        ),
+    ] = 1
+    later_views: Annotated[
+        LaterViews,
+        stored_option(
+            "--later-views",
+            help="mean: of the inferences after the first, store the view mean alone, in bfloat16 (small).",
+        ),
+    ] = "all"
+    codec: Annotated[Codec, stored_option("--codec", help="Compression of stored activations.")] = "zstd"
+
+    def model_post_init(self, _: Any) -> None:
+        """Raise UsageError for later inferences that are not captured, and for tokens of means."""
+        if self.later_views == "all":
+            return
+        if self.captured_calls == 1:
+            raise UsageError(
+                "--later-views mean is about inferences after the first, and the first alone is captured; add "
+                "--captured-calls all, or a number"
+            )
+        if self.tokens == "all":
+            raise UsageError("--later-views mean and --tokens all contradict each other; leave one out")
+
+    @property
+    def calls(self) -> int:
+        """Inferences captured per episode. Raises UsageError for `all`, which has no number yet."""
+        if self.captured_calls == "all":
+            raise UsageError("captured_calls is 'all', which has no number before the model is loaded")
+        return self.captured_calls
+
+
+class AskCapture(Part):
+    """What is stored of the activations of a model that answers: of its only inference, or nothing."""
+
+    tokens: Annotated[
+        AskTokens,
+        stored_option(
+            "--tokens",
+            help="none: store answers only. pooled: also store pooled views, for probes. all: also store every "
+            "token.",
+        ),
+    ] = "none"
+    codec: Codec = "zstd"
+    captured_calls: ClassVar[int] = 1
+    later_views: ClassVar[LaterViews] = "all"
+    calls: ClassVar[int] = 1
+
+
+# -- tasks --------------------------------------------------------------------------------------------------
+
+
+def _edit(value: Any) -> Any:
+    """An edit from what a file has of it."""
+    if not isinstance(value, Mapping):
+        return value
+    sites = tuple(Site.parse(site) for site in value.get("sites", ()))
+    return Edit(**{**value, "sites": sites, "roles": tuple(value.get("roles") or ()) or None})
+
+
+if TYPE_CHECKING:
+    PlainEdit = Edit
+else:
+    PlainEdit = Annotated[Edit, BeforeValidator(_edit), PlainSerializer(Edit.to_json)]
+
+
+class ActTask(Part):
+    """How a policy acts, or that it is only captured.
+
+    protocol: a published one, such as `act2answer`: what is not chosen is as it has it, see `protocols`. execute:
+    actions per inference; None for the policy's own. rotation: what reaches the controller as the rotation of an
+    action, see `ProtocolRow`; None for the protocol's, or its angles as they are. capture_only: capture the first
+    inference of every episode and do not act. edits: what is changed in the streams at every inference; vectors:
+    their directions and sources, by hash.
+    """
+
+    protocol: Annotated[
+        ProtocolName | None,
+        further_option(
+            "--protocol",
+            help="Use scene, checkpoint and options of a published protocol. Your options take precedence.",
+        ),
+    ] = None
+    execute: Annotated[
+        Annotated[int, Field(ge=1, le=MOST_CALLS)] | None,
+        further_option(
+            "--execute", help="Number of actions executed per inference. Default: set by protocol or model."
+        ),
+    ] = None
+    rotation: Annotated[
+        Rotation | None,
+        further_option(
+            "--rotation",
+            help="roll-pitch-yaw: pass the angles of an action on. axis-angle: convert them, as the release does "
+            "for some models. Default: set by protocol, else roll-pitch-yaw.",
+        ),
+    ] = None
+    capture_only: Annotated[
+        bool,
+        further_option(
+            "--no-act",
+            help="Capture the first inference of each episode without acting. There is no success rate.",
+        ),
+    ] = False
+    edits: tuple[PlainEdit, ...] = ()
+    if TYPE_CHECKING:
+        vectors: Vectors = {}
+    else:
+        vectors: Annotated[Any, Field(exclude=True)] = {}
+
+
+def _template(value: Any) -> Any:
+    return find_template(value) if isinstance(value, str) else value
+
+
+PromptTemplate = Annotated[Template, BeforeValidator(_template)]
+
+
+class AskTask(Part):
+    """How a model is asked.
+
+    protocol: a published one, whose scene takes the place of the default one; it decides nothing else of a
+    question. prompt: a template, or its name or file. picture: `frame` shows the first frame of the episode,
+    `side-by-side` its two pictures on grey, `none` nothing. query: the object that is asked for, see `QUERIES`.
+    Raises UsageError for an absent object with a prompt that takes no no.
+    """
+
+    protocol: Annotated[
+        ProtocolName | None,
+        typer.Option("--protocol", help="Use the scene of a published protocol. --scene takes precedence."),
+    ] = None
+    prompt: PromptTemplate = P1
+    picture: Annotated[
+        Picture,
+        control_option(
+            "--picture",
+            help="frame: show the first frame. side-by-side: show both pictures on grey. none: show no picture; "
+            "accuracy above 50 % then indicates a leak in the suite.",
+        ),
+    ] = "frame"
+    query: Annotated[
+        Query,
+        control_option(
+            "--query",
+            help="target: ask for the object of the instruction. distractor: ask for the object of the other "
+            "picture. absent: ask for an object in neither picture (requires --prompt seen; no is correct).",
+        ),
+    ] = "target"
+
+    def model_post_init(self, _: Any) -> None:
+        """Raise UsageError for an absent object that the prompt gives no answer for."""
+        if self.query == "absent" and not self.prompt.yes_or_no:
+            raise UsageError(
+                f"--query absent needs a prompt that can be answered no; {self.prompt.name} does not ask "
+                "for yes or no. Use --prompt seen"
+            )
+
+
+# -- machine ------------------------------------------------------------------------------------------------
+
+
+class Machine(Part):
+    """What changes no stored number: how fast a run comes, and the pictures that are stored for people.
+
+    frames: `ends` stores small copies of the first and last frame of every episode, `all` of every frame, `none`
+    none. env_workers: processes that simulate and draw; None for two per observation of a batch, 0 for this
+    process. workers: processes with a model each, one per GPU where there are several; 0 for this process. ray:
+    address of a Ray cluster, or `auto`; the workers then run there. inference_limit: seconds that one call of the
+    model may take in a worker, which is ended then; its episodes are tried once more and given up by name. None
+    for no limit. allow_mixed: continue a run whose episodes were made on another kind of device or with other
+    versions; the run is then marked as mixed wherever tables name it.
+    """
+
+    device: common.Device = "cpu"
+    frames: Annotated[
+        FrameChoice,
+        stored_option(
+            "--frames",
+            help="ends: store the first and last frame of every episode in small. all: store every frame, for the "
+            "viewer and for data sets.",
+        ),
+    ] = "ends"
+    env_workers: Annotated[Annotated[int, Field(ge=0, le=1024)] | None, option_of(common.EnvWorkers)] = None
+    workers: Annotated[common.Workers, Field(ge=0, le=1024)] = 0
+    ray: common.RayAddress = None
+    inference_limit: Annotated[
+        Annotated[float, Field(gt=0, le=LARGEST)] | None, option_of(common.InferenceLimit)
+    ] = None
+    allow_mixed: common.AllowMixed = False
+
+    def model_post_init(self, _: Any) -> None:
+        """Raise UsageError for a limit in a process that nothing can end."""
+        if self.inference_limit is not None and not self.elsewhere:
+            raise UsageError(
+                f"--inference-limit {self.inference_limit:g} needs a process that can be ended: add --workers 1, "
+                "or leave it out and end a model that hangs with Ctrl-C"
+            )
+
+    @property
+    def observations(self) -> int:
+        """Observations per call of the model. Raises UsageError for `auto`, which has no number yet."""
+        batch = getattr(self, "batch", 1)
+        if not isinstance(batch, int):
+            raise UsageError(f"batch is {batch!r}, which has no number before it is measured")
+        return batch
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether other processes than this one hold the model."""
+        return bool(self.workers or self.ray)
+
+
+class ActMachine(Machine):
+    """The same of a model that acts.
+
+    batch: observations per call of the model. With 1, bytes repeat exactly; with more, up to float rounding.
+    `auto` chooses batch and env_workers by a measurement of some seconds, see `calibration`; None is `auto` for a
+    policy on a GPU without a number of env_workers, and else 1. video: GIF of the first episode, of all, or none.
+    accept_units: play or show states that lie far outside the checkpoint's statistics.
+    """
+
+    batch: Annotated[
+        Annotated[int, Field(ge=1, le=4096)] | Literal["auto"] | None,
+        speed_option(
+            "--batch",
+            parser=count_or("auto", "--batch"),
+            metavar="N|auto",
+            help="Number of observations per model call. Above 1, results repeat up to rounding. auto: measure "
+            "for some seconds and choose --batch and --env-workers. Default: auto on a GPU, else 1.",
+        ),
+    ] = None
+    video: Annotated[VideoChoice, stored_option("--video", help="Store a GIF of the first episode or of all.")] = (
+        "none"
+    )
+    accept_units: Annotated[
+        bool,
+        further_option(
+            "--accept-units",
+            help="Accept states that lie far outside the statistics of the checkpoint, on any source.",
+        ),
+    ] = False
+
+
+class AskMachine(Machine):
+    """The same of a model that answers. batch: questions per call of the model."""
+
+    batch: Annotated[
+        int,
+        Field(ge=1, le=4096),
+        speed_option(
+            "--batch", help="Number of questions per model call. Above 1, results repeat up to rounding."
+        ),
+    ] = 1
+    video: ClassVar[VideoChoice] = "none"
+    accept_units: ClassVar[bool] = False
+
+
+def _plain_scene(scene: Any) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    return asdict(scene)
+
+
+def _scene(value: Any) -> Any:
+    """A scene from what a file has of it; one that is a scene is returned as it is."""
+    from pydantic import TypeAdapter
+
+    from probe_kit.env import SceneSpec
+
+    return value if isinstance(value, SceneSpec) else TypeAdapter(SceneSpec).validate_python(value)
+
+
+if TYPE_CHECKING:
+    from probe_kit.env import SceneSpec
+
+    Scene = SceneSpec
+else:
+    Scene = Annotated[Any, BeforeValidator(_scene), PlainSerializer(_plain_scene)]
+    """A `SceneSpec`, whose package is loaded with the first scene, so that help comes without a simulator."""

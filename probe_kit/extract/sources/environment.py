@@ -1,0 +1,72 @@
+"""Environments of the user's own as a source: settings of what is played."""
+
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import typer
+from pydantic import BeforeValidator, Field
+
+from probe_kit.extract.parts import read_options
+from probe_kit.extract.sources.recording import Episodes, Pixels
+from probe_kit.extract.sources.source import SourceSettings
+
+LEROBOT = "lerobot"
+MAX_STEPS = 200
+MOST_STEPS = 10_000
+_option = partial(typer.Option, rich_help_panel="Own environments")
+
+EnvOptions = Annotated[
+    list[str] | None,
+    _option("--env-option", metavar="KEY=VALUE", help="Argument of the environment; repeatable."),
+]
+
+
+class EnvSource(SourceSettings):
+    """An environment of the user's own in place of a scene.
+
+    environment: MODULE:CLASS of the contract `OwnEnvironment`, `lerobot:TYPE` for a configuration of lerobot, or
+    the name of an entry point of the group `probe_kit.sources`. options: keyword arguments of the class.
+    episodes: indices among its episodes; None for all. max_steps: actions after which an episode ends. pixels:
+    whether pictures at 32 × 32 are stored for controls.
+    Raises UsageError for what no environment can have.
+    """
+
+    kind: Literal["env"] = "env"
+    environment: Annotated[
+        str,
+        _option(
+            "--env",
+            metavar="MODULE:CLASS",
+            help="Play an environment of your own in place of a suite, or lerobot:TYPE such as lerobot:libero. "
+            "`probe-kit check-environment` checks one.",
+        ),
+    ]
+    options: Annotated[dict[str, Any], BeforeValidator(read_options), EnvOptions.__metadata__[0]] = Field(
+        default={}
+    )
+    episodes: Episodes = None
+    max_steps: Annotated[
+        int, Field(ge=1, le=MOST_STEPS), typer.Option("--max-steps", help="Number of actions per episode.")
+    ] = MAX_STEPS
+    pixels: Pixels = True
+
+    command: ClassVar[str] = "--env MODULE:CLASS"
+    subject: ClassVar[str] = "environments"
+    loads: ClassVar[str] = "environment"
+    shows: ClassVar[str] = "--env, in which the model acts in its own units"
+
+    def __init__(self, environment: str, **choices: Any) -> None:
+        super().__init__(**{"environment": environment, **choices})
+
+    @property
+    def name(self) -> str:
+        """The name in tables."""
+        return self.environment
+
+    def marks(self) -> list[str]:
+        """The part of a run's label that names the source."""
+        return [f"in {self.name}"]
+
+    def steps(self) -> int:
+        """Count the actions that an episode can have."""
+        return self.max_steps

@@ -1,0 +1,199 @@
+"""Frames of a LeRobotDataset as a source: settings of what is shown."""
+
+import re
+from collections.abc import Iterable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import typer
+from pydantic import BeforeValidator, Field
+
+from probe_kit.errors import UsageError
+from probe_kit.extract.sources.source import SourceSettings
+
+IMAGES = "observation.images."
+STATE, ACTION = "observation.state", "action"
+TURNS = (90, 180, 270)
+"""Degrees that pictures can be rotated by, counterclockwise."""
+MOST_EPISODES = 1_000_000
+_RANGE = re.compile(r"(\d+)(?::(\d+))?")
+_EVERY = re.compile(r"every:([1-9]\d*)")
+_HUB = re.compile(r"[\w.-]+/[\w.-]+(@[\w./-]+)?")
+_option = partial(typer.Option, rich_help_panel="Recordings")
+
+Pairs = tuple[tuple[str, str], ...]
+
+
+def read_episodes(value: Any) -> Any:
+    """Indices, each once and in order: of `0:5` (0 to 4), `7`, several such with commas, or numbers.
+
+    Raises UsageError.
+    """
+    if value is None:
+        return None
+    if not isinstance(value, str):
+        numbers = tuple(sorted({int(number) for number in value}))
+        if not numbers or numbers[0] < 0:
+            raise UsageError(f"episodes are {list(numbers)[:5]}; expected indices from 0 on, at least one")
+        return numbers
+    several: list[int] = []
+    for part in filter(None, (text.strip() for text in value.split(","))):
+        matched = _RANGE.fullmatch(part)
+        start, stop = (int(matched[1]), int(matched[2] or int(matched[1]) + 1)) if matched else (0, 0)
+        if not start < stop <= MOST_EPISODES:
+            raise UsageError(
+                f"--episodes {value!r}: {part!r} is no range of episodes; expected START:STOP, such as 0:5 for "
+                "the first five, or single indices"
+            )
+        several += range(start, stop)
+    if not several:
+        raise UsageError(f"--episodes {value!r} names none; expected START:STOP, such as 0:5")
+    return tuple(sorted(set(several)))
+
+
+Episodes = Annotated[
+    tuple[int, ...] | None,
+    BeforeValidator(read_episodes),
+    _option(
+        "--episodes",
+        parser=str,
+        metavar="START:STOP",
+        help="Episodes of the data set or environment, such as 0:5. Default: all.",
+    ),
+]
+Pixels = Annotated[
+    bool,
+    _option(
+        " /--no-pixels",
+        show_default=False,
+        help="Store no pictures at 32 × 32; two controls of labels are then not possible.",
+    ),
+]
+
+
+def _every(value: Any) -> Any:
+    """N of `every:N`, or a number as it is. Raises UsageError."""
+    if not isinstance(value, str):
+        return value
+    matched = _EVERY.fullmatch(value)
+    if matched is None:
+        raise UsageError(f"--select {value!r}; expected every:N, such as every:5")
+    return int(matched[1])
+
+
+def _pairs(option: str, example: str, value: Any) -> Any:
+    """CAMERA=VALUE texts, a dictionary, or pairs, as pairs. Raises UsageError."""
+    if isinstance(value, Mapping):
+        return tuple(value.items())
+    pairs = []
+    for text in value or ():
+        name, equals, chosen = text.partition("=") if isinstance(text, str) else (text[0], "=", text[1])
+        if not (name and equals and chosen):
+            raise UsageError(f"{option} {text!r}; expected CAMERA=VALUE, such as {option} {example}")
+        pairs.append((name, chosen))
+    return tuple(pairs)
+
+
+def _turns(value: Any) -> Any:
+    turns = []
+    for camera, degrees in _pairs("--rotate", "base=180", value):
+        if not str(degrees).isdecimal():
+            raise UsageError(f"--rotate {camera}={degrees}; expected degrees, such as {camera}=180")
+        turns.append((camera, int(degrees)))
+    if wrong := [turn for _, turn in turns if turn not in TURNS]:
+        raise UsageError(
+            f"pictures are rotated by {wrong[0]} degrees; expected one of {', '.join(map(str, TURNS))}"
+        )
+    return tuple(turns)
+
+
+class LeRobotSource(SourceSettings):
+    """Frames of a LeRobotDataset in place of a scene.
+
+    folder: the data set's folder, or USER/NAME@COMMIT of the hub. episodes: indices; None for all. every: of each
+    episode, frame 0 and each so many frames on. cameras: feature of the data set by camera of the model; empty
+    where both have one, or the names are equal. rotations: degrees by camera of the model, counterclockwise.
+    instruction: what the model reads in place of the task of a frame. pixels: whether pictures at 32 × 32 are
+    stored for controls.
+    Raises UsageError for what no data set can have.
+    """
+
+    kind: Literal["lerobot"] = "lerobot"
+    folder: Annotated[
+        str,
+        BeforeValidator(str),
+        _option(
+            "--dataset",
+            metavar="FOLDER",
+            help="Show frames of a LeRobotDataset (3.0) in place of a suite: a folder, or USER/NAME@COMMIT of the "
+            "hub. The model does not act.",
+        ),
+    ]
+    episodes: Episodes = None
+    every: Annotated[
+        int,
+        Field(ge=1),
+        BeforeValidator(_every),
+        _option(
+            "--select",
+            parser=str,
+            metavar="every:N",
+            show_default=False,
+            help="Frames of an episode, such as every:5. Default: every:1.",
+        ),
+    ] = 1
+    cameras: Annotated[
+        Pairs,
+        BeforeValidator(partial(_pairs, "--camera", f"base={IMAGES}top")),
+        _option(
+            "--camera",
+            metavar="CAMERA=FEATURE",
+            help="Which picture of the data set a camera of the model gets; repeatable. Default: equal names.",
+        ),
+    ] = ()
+    rotations: Annotated[
+        tuple[tuple[str, int], ...],
+        BeforeValidator(_turns),
+        _option(
+            "--rotate",
+            metavar="CAMERA=DEGREES",
+            help="Rotate the pictures of a camera by 90, 180 or 270 degrees.",
+        ),
+    ] = ()
+    instruction: Annotated[
+        str | None, _option("--instruction", help="What the model reads. Default: the task of each frame.")
+    ] = None
+    pixels: Pixels = True
+
+    command: ClassVar[str] = "--dataset FOLDER"
+    subject: ClassVar[str] = "recordings"
+    loads: ClassVar[str] = "recordings"
+    shows: ClassVar[str] = "--dataset, which shows recorded frames and executes no action"
+
+    def __init__(self, folder: str | Path, **choices: Any) -> None:
+        super().__init__(**{"folder": folder, **choices})
+
+    def model_post_init(self, _: Any) -> None:
+        """Raise UsageError for a camera or feature that is mapped twice."""
+        features: Iterable[tuple[str, list[str]]] = (
+            ("camera", [name for name, _ in self.cameras]),
+            ("feature", list(dict(self.cameras).values())),
+        )
+        for part, names in features:
+            if twice := [name for name in names if names.count(name) > 1]:
+                raise UsageError(f"the {part} {twice[0]!r} is mapped twice; give each once")
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it names a folder, not a data set of the hub."""
+        return Path(self.folder).expanduser().exists() or not _HUB.fullmatch(self.folder)
+
+    @property
+    def name(self) -> str:
+        """The name in tables; where the folder lies is no part of a run."""
+        return Path(self.folder).expanduser().resolve().name if self.is_local else self.folder.partition("@")[0]
+
+    def marks(self) -> list[str]:
+        """The part of a run's label that names the source."""
+        return [f"on {self.name}"]

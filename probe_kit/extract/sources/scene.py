@@ -1,0 +1,122 @@
+"""The scene as a source: settings of what is played there."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import typer
+from pydantic import BeforeValidator, Field
+
+from probe_kit._terminal import options as common
+from probe_kit._terminal.field_options import Part, plain
+from probe_kit._terminal.options import choices as listed_choices
+from probe_kit._terminal.options import further_option, read_size, some_of
+from probe_kit.extract.parts import LARGEST, Scene, option_of
+from probe_kit.extract.sources.source import SourceSettings
+from probe_kit.scene_names import ArmName, Rendering
+from probe_kit.suite.ladder import WORDINGS, Wording, check_wordings
+
+_option = partial(typer.Option, rich_help_panel="Scene")
+
+
+def _size(value: Any) -> Any:
+    return read_size(value) if isinstance(value, str) else value
+
+
+class SceneOptions(Part):
+    """What a command or a study changes in a scene: a preset, and fields of `SceneSpec`.
+
+    scene: the preset; None for the protocol's or the model's own. None and False leave the preset's value.
+    """
+
+    scene: common.Scene = None
+    max_steps: Annotated[
+        int | None, _option("--max-steps", help="Number of actions per episode; in the scene at 5 Hz.")
+    ] = None
+    tile_side: Annotated[
+        float | None,
+        _option("--tile-side", help="Side of a tile in metres. The paper uses 0.1452, 0.2033 and 0.1162."),
+    ] = None
+    light_level: Annotated[
+        float | None,
+        _option("--light-level", help="Brightness of the light; 1 is the default. The paper uses 0.7 and 1.3."),
+    ] = None
+    rendering: Annotated[
+        Rendering | None,
+        _option("--rendering", help="visual-matching: draw robot, cube and tiles over a photo."),
+    ] = None
+    background: Annotated[
+        Path | None, _option("--background", help="Photo for visual-matching. Default: the embedded photo.")
+    ] = None
+    picture_size: Annotated[
+        tuple[int, int] | None,
+        BeforeValidator(_size),
+        _option(
+            "--picture-size",
+            parser=read_size,
+            metavar="WxH",
+            help="Size of the camera image for the policy in pixels, such as 224x224.",
+        ),
+    ] = None
+    epsilon: Annotated[
+        float | None,
+        _option("--epsilon", help="Radius of the target zone in metres. Default: half a tile + 0.01."),
+    ] = None
+    arm: Annotated[ArmName | None, _option("--arm", help="Robot arm.")] = None
+    arm_urdf: Annotated[Path | None, _option("--arm-urdf", help="Your own URDF file of this arm.")] = None
+    start_grasped: Annotated[bool, _option("--start-grasped", help="Start with the cube in the gripper.")] = False
+    early_stop: Annotated[
+        bool, _option("--early-stop", help="End an episode when the released cube is at rest.")
+    ] = False
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """The fields of the scene that are changed."""
+        return plain(
+            {name: value for name, value in self if name in SceneOptions.model_fields and name != "scene"}
+        )
+
+
+class SceneSettings(SourceSettings):
+    """Questions of a suite in the built-in scene.
+
+    suite: suite folder; None for the embedded suite. categories: slugs; None for all of the suite. items: items
+    per category; None for all. wordings: names of `suite.ladder`, each a condition of the run; None for the items'
+    own words alone. scene: by default the model's own, see `Family.home`.
+    """
+
+    kind: Literal["scene"] = "scene"
+    suite: common.SuiteFolder = None
+    categories: Annotated[tuple[str, ...] | None, option_of(common.Categories)] = None
+    items: Annotated[
+        Annotated[int, Field(ge=1, le=LARGEST)] | None,
+        typer.Option("--items", help="Number of items per category, an even number. Default: all."),
+    ] = None
+    wordings: Annotated[
+        tuple[Wording, ...] | None,
+        further_option(
+            "--wordings",
+            parser=some_of(WORDINGS),
+            metavar=f"{listed_choices(WORDINGS)},…",
+            help="Wordings of the instruction, comma-separated. Every item is played in each of them with the "
+            "same seeds. Default: knowledge, the wording of the item.",
+        ),
+    ] = None
+    scene: Scene
+
+    subject: ClassVar[str] = "scenes"
+    loads: ClassVar[str] = "suite"
+
+    def model_post_init(self, _: Any) -> None:
+        """Raise UsageError for wordings that come twice, or none."""
+        if self.wordings is not None:
+            check_wordings(self.wordings)
+
+    def steps(self) -> int:
+        """Count the actions that an episode can have."""
+        return self.scene.max_steps
+
+    def files(self) -> dict[str, Path]:
+        """Return the files of the scene, by its field."""
+        named = {"arm_urdf": self.scene.arm_urdf, "background": self.scene.background}
+        return {name: path for name, path in named.items() if path is not None}
