@@ -18,9 +18,8 @@ from probe_kit.cli import app, commands_of
 from probe_kit.env.robot.arm_models import ARMS
 from probe_kit.env.scoring.rules import RULES
 from probe_kit.env.spec import PRESETS
-from probe_kit.extract.command_options import Size, Sizes
+from probe_kit.extract.command_options import Sizes
 from probe_kit.extract.protocols import SCENES
-from probe_kit.extract.settings import SCENE_OPTIONS, AskSettings, ExtractSettings
 from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
 from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.hooks.contract.protocol import ROTATIONS, ProtocolName
@@ -158,47 +157,6 @@ def test_no_command_function_is_longer_than_100_lines(command: str) -> None:
     assert len(inspect.getsource(LEAVES[command].callback).splitlines()) <= MOST_LINES
 
 
-def test_every_option_of_extract_and_ask_is_a_setting_or_says_how_the_run_starts() -> None:
-    for command, settings in (("extract", ExtractSettings), ("ask", AskSettings)):
-        names = {parameter.name for parameter in LEAVES[command].params} - {"help"}
-        parsed = inspect.signature(settings.from_options).parameters  # of recordings, such as --episodes
-        known = {
-            *settings.__dataclass_fields__,
-            *parsed,
-            *SCENE_OPTIONS,
-            "out_folder",
-            "dry_run",
-            "force",
-            "large",
-        }
-        assert names <= known
-
-
-def test_options_that_are_not_given_have_the_default_of_the_protocol_the_model_or_the_class() -> None:
-    assert ExtractSettings("expert") == ExtractSettings("expert")
-    assert ExtractSettings("expert", scene=None, arm=None, early_stop=False, items=None) == (
-        ExtractSettings("expert")
-    )
-    assert ExtractSettings("expert", protocol="act2answer").scene.name == "act2answer"
-    assert (
-        ExtractSettings("expert", protocol="act2answer", scene="vl-think").scene.home
-        == (PRESETS["vl-think"]["home"])
-    )
-    chosen = ExtractSettings.from_options(
-        model="pi0", options=["unnorm-key=bridge"], batch="auto", max_steps=7, early_stop=True, picture_size=(8, 6)
-    )
-    assert (chosen.options, chosen.batch, chosen.calibrate) == ({"unnorm_key": "bridge"}, 1, True)
-    assert (chosen.scene.max_steps, chosen.scene.early_stop) == (7, True)
-    assert chosen.scene.picture_shape == (6, 8)
-    with pytest.raises(TypeError, match="no_such_option"):
-        ExtractSettings("pi0", no_such_option=1)
-
-
-def test_a_scene_value_of_zero_is_given_and_therefore_checked() -> None:
-    with pytest.raises(Exception, match="max_steps"):
-        ExtractSettings("expert", max_steps=0)
-
-
 def test_categories_are_read_by_title_in_any_case() -> None:
     assert read_categories("Color, Living World,public-info") == ("color", "living-world", "public-info")
 
@@ -206,7 +164,6 @@ def test_categories_are_read_by_title_in_any_case() -> None:
 def test_sizes_are_read_as_width_by_height_and_shown_as_typed() -> None:
     assert Sizes.parse("224x224,560x480") == ((224, 224), (560, 480))
     assert str(Sizes.parse("560x480")) == "560x480"
-    assert Size.parse("560x480") == (560, 480)
 
 
 @pytest.mark.parametrize("command", sorted(LEAVES))

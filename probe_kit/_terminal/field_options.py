@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain
 from types import UnionType
-from typing import Annotated, Any, Union, get_args, get_origin
+from typing import Annotated, Any, Self, Union, get_args, get_origin
 
 import typer
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -34,6 +34,10 @@ class Part(BaseModel):
         except ValidationError as error:
             raise UsageError(in_words(type(self).__name__, error)) from None
 
+    def changed(self, **values: Any) -> Self:
+        """The group with other values, which are checked."""
+        return type(self)(**(dict(self) | values))
+
 
 def in_words(subject: str, error: ValidationError) -> str:
     """The first mistake of a model's values as a sentence. subject: the name of the model."""
@@ -41,7 +45,13 @@ def in_words(subject: str, error: ValidationError) -> str:
     name = ".".join(str(part) for part in first["loc"] if not str(part).startswith("function-"))
     if first["type"] == "extra_forbidden":
         return f"{subject} has no setting {name}; leave it out"
-    expected = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    bounds = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
+    bounded = [
+        f"{words} {first['ctx'][bound]}" for bound, words in bounds.items() if bound in first.get("ctx", {})
+    ]
+    choices = str(first.get("ctx", {}).get("expected", "")).replace("'", "").replace(" or ", ", ")
+    other = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    expected = " and ".join(bounded) or (f"one of {choices}" if choices else other)
     return f"{name} is {first['input']!r}; expected {expected}"
 
 

@@ -196,7 +196,7 @@ def _with_recording(settings: ExtractSettings, source: LeRobotSource) -> Extract
     check_meaningless(settings)
     folder = open_lerobot(source)
     if folder.repo is not None:
-        source = source.model_copy(update={"folder": f"{folder.repo}@{folder.revision}"})
+        source = source.changed(folder=f"{folder.repo}@{folder.revision}")
     calls = Recording.of(folder, source).most_frames
     return settings.changed(source=source, captured_calls=calls, capture_only=True, frames="none")
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, Self
 
 import typer
 from pydantic import AfterValidator, BeforeValidator, SerializeAsAny
@@ -27,7 +27,6 @@ from probe_kit.extract.vqa.templates import find_template
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.checkpoints.checkpoint import is_on_hub
 from probe_kit.hooks.contract.protocol import PLAIN
-from probe_kit.runs.label import check_label
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
@@ -51,6 +50,8 @@ def _read_source(value: Any) -> Any:
 def _checked_label(label: str | None) -> str | None:
     """The label. Raises UsageError for one that tables cannot show."""
     if label is not None:
+        from probe_kit.runs.label import check_label
+
         check_label(label)
     return label
 
@@ -118,20 +119,23 @@ class Settings(Part):
         yield from (cls, SceneOptions, *cls.sources)
 
     @classmethod
-    def of_command(cls, typed: Mapping[str, Any], file: Mapping[str, Any] | None = None) -> Self:
+    def of_command(cls, typed: Mapping[str, Any], file: Mapping[str, Any] | None = None, **chosen: Any) -> Self:
         """The settings of a command.
 
         typed: the values that were typed, by parameter. file: settings by part, which typed ones replace.
+        chosen: further fields by name.
         Raises UsageError for two sources, for options of another source, and what `__init__` raises.
         """
         parts = [one for part in (*(_model_of(cls, part) for part in _PARTS), cls) for one in options_of(part)]
-        values = {one.field: typed[one.parameter] for one in parts if one.parameter in typed}
+        values = chosen | {one.field: typed[one.parameter] for one in parts if one.parameter in typed}
         rest = {name: value for name, value in typed.items() if name not in {one.parameter for one in parts}}
         before = None if file is None else cls(**{"model": values.pop("family", None), **file})
         kind, fields = cls._typed_source(rest, None if before is None else before.source)
         if kind is SceneSettings:
             values |= fields
         else:
+            if refused := [name for name in values if name in kind.decides]:
+                _refuse(refused, kind)
             known = dict(before.source) if before is not None and isinstance(before.source, kind) else {}
             values["source"] = kind(**{**known, **fields})
         return cls(values.pop("family", None), **values) if before is None else before.changed(**values)
@@ -150,9 +154,9 @@ class Settings(Part):
             raise UsageError(f"{flags} are {len(chosen)} sources; give one")
         kind = chosen[0] if chosen else SceneSettings if before is None else type(before)
         if strange := [name for name in typed if name not in options[kind]]:
-            flags = ", ".join(f"--{name.replace('_', '-')}" for name in strange)
             if kind is not SceneSettings:
-                raise UsageError(f"{flags} does not apply with {kind.shows}; remove it")
+                _refuse(strange, kind)
+            flags = ", ".join(f"--{name.replace('_', '-')}" for name in strange)
             other = next(kind for kind in cls.sources if strange[0] in options[kind])
             raise UsageError(f"{flags} is for {other.subject}; give {other.command} too, or leave it out")
         return kind, {options[kind][name].field: value for name, value in typed.items()}
@@ -205,8 +209,8 @@ class ExtractSettings(Settings):
 
     sources: ClassVar[tuple[type[SourceSettings], ...]] = SOURCES
 
-    def __init__(self, model: Any = None, **values: Any) -> None:
-        super().__init__(model, **values)
+    def __init__(self, model: Any = None, *checkpoint: str | None, **values: Any) -> None:
+        super().__init__(model, **values, **dict(zip(("checkpoint",), checkpoint, strict=False)))
 
     @classmethod
     def _by_part(cls, model: Any, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -268,8 +272,8 @@ class AskSettings(Settings):
     task: AskTask
     machine: AskMachine
 
-    def __init__(self, model: Any = None, **values: Any) -> None:
-        super().__init__(model, **values)
+    def __init__(self, model: Any = None, *checkpoint: str | None, **values: Any) -> None:
+        super().__init__(model, **values, **dict(zip(("checkpoint",), checkpoint, strict=False)))
 
     @classmethod
     def per_prompt_and_size(
@@ -282,7 +286,7 @@ class AskSettings(Settings):
         """
         templates = [find_template(prompt) for prompt in prompts]
         every = [
-            cls.of_command(typed).changed(prompt=template, picture_size=size)
+            cls.of_command(typed, prompt=template, picture_size=size)
             for template in templates
             for size in picture_sizes
         ]
@@ -335,6 +339,12 @@ def _model_of(settings: type[Settings], part: str) -> Any:
     return settings.model_fields[part].annotation
 
 
+def _refuse(names: Iterable[str], source: type[SourceSettings]) -> NoReturn:
+    """Raise UsageError for options that a source does not have."""
+    flags = ", ".join(f"--{name.replace('_', '-')}" for name in names)
+    raise UsageError(f"{flags} does not apply with {source.shows}; remove it")
+
+
 def _with_scene(parts: Mapping[str, Any], fields: dict[str, Any]) -> Any:
     """The source of settings by part. fields: of a scene and its questions, by name.
 
@@ -345,8 +355,7 @@ def _with_scene(parts: Mapping[str, Any], fields: dict[str, Any]) -> Any:
     if (isinstance(source, SourceSettings) and not known) or known.get("kind", "scene") != "scene":
         settings = _read_source(source)
         if chosen := [name for name, value in fields.items() if value not in (None, False)]:
-            flags = ", ".join(f"--{name.replace('_', '-')}" for name in chosen)
-            raise UsageError(f"{flags} does not apply with {settings.shows}; remove it")
+            _refuse(chosen, type(settings))
         return settings
     changes = {name: fields.pop(name) for name in SceneOptions.model_fields if name in fields and name != "scene"}
     changes = SceneOptions(**changes).changes

@@ -109,7 +109,7 @@ def test_who_acts_in_the_same_scene_begins_with_the_same_frame(
     settings: AskSettings, asked: Run, tmp_path: Path
 ) -> None:
     short = SceneSpec(max_steps=1)  # at full size: pictures are made smaller behind the frame that is hashed
-    acting = ExtractSettings("expert", suite=settings.suite, categories=("color",), items=2, scene=short)
+    acting = ExtractSettings("expert", suite=settings.source.suite, categories=("color",), items=2, scene=short)
     acted = extract_run(acting, tmp_path / "run").episodes
     for column in ("episode_id", "scene_seed", "first_frame_sha256", "visible_left"):
         assert acted[column].tolist() == asked.episodes[column].tolist(), column
@@ -172,8 +172,8 @@ def test_an_episode_that_cannot_be_asked_is_given_up_and_the_others_stay(
 
 def answers(settings: AskSettings, answer_model: AnswerModel | None = None) -> pd.DataFrame:
     """What the run's episodes would hold. Their frames are noise: which model answers needs no scene."""
-    assert settings.suite is not None
-    suite = load_suite(settings.suite).select(settings.categories, settings.items)
+    assert settings.source.suite is not None
+    suite = load_suite(settings.source.suite).select(settings.source.categories, settings.source.items)
     blank = example_observations(settings.scene, [suite.items[0].instruction])[0]
     model = load_answer_model(settings) if answer_model is None else answer_model
     controller = AnswerController(model, settings, suite, blank)

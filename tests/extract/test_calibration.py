@@ -79,7 +79,7 @@ def test_a_policy_that_takes_one_observation_is_calibrated_to_the_same_bytes(
     extraction = prepare(asked, tmp_path / "run")
     assert tried == {1}
     assert extraction.calibration is not None
-    assert (extraction.settings.batch, extraction.settings.env_workers) == (1, 0)
+    assert (extraction.settings.machine.batch, extraction.settings.machine.env_workers) == (1, 0)
     extraction.run(tmp_path / "run")
     for key in plain.location.keys("commits"):
         assert open_run(tmp_path / "run").location.read(key) == plain.location.read(key)

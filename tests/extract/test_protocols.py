@@ -73,11 +73,11 @@ def test_openvla_has_a_row_per_checkpoint_and_labels_say_which_it_is(
 ) -> None:
     settings = ExtractSettings("openvla", checkpoint, protocol="act2answer").followed()
     shared = {"temperature": 0.6, "top_k": "checkpoint", "resize": "tensor", "centre_crop": False}
-    assert dict(settings.options) == {"unnorm_key": unnorm_key, **shared}
+    assert dict(settings.model.options) == {"unnorm_key": unnorm_key, **shared}
     assert deviations(settings) == {}
     assert protocol_identity(settings)["protocol"]["variant"] == variant
     assert run_label(settings) == f"openvla · act2answer · {variant}"
-    assert ExtractSettings("openvla", settings.checkpoint, protocol="act2answer").followed() == settings
+    assert ExtractSettings("openvla", settings.model.checkpoint, protocol="act2answer").followed() == settings
 
 
 @pytest.mark.parametrize("name", RELEASED)
@@ -113,8 +113,8 @@ def test_what_is_given_wins_and_is_recorded_as_a_deviation() -> None:
         protocol="act2answer", scene=protocol_scene("act2answer", tile_side=0.2033),
     )  # fmt: skip
     settings = given.followed()
-    assert settings.options["temperature"] == "0"
-    assert settings.options["prompt"] == "act2answer"
+    assert settings.model.options["temperature"] == "0"
+    assert settings.model.options["prompt"] == "act2answer"
     assert deviations(settings) == {
         "dtype": ["bfloat16", "float32"],
         "-M temperature": ["0.7", "0"],
@@ -183,7 +183,7 @@ def test_the_conversion_of_rotations_is_the_protocols_unless_another_is_asked_fo
 def test_a_script_follows_the_scene_alone() -> None:
     settings = ExtractSettings("idle", protocol="act2answer").followed()
     assert settings.scene == SceneSpec.preset("act2answer")
-    assert (settings.checkpoint, dict(settings.options), deviations(settings)) == (None, {}, {})
+    assert (settings.model.checkpoint, dict(settings.model.options), deviations(settings)) == (None, {}, {})
 
 
 def test_protocols_that_are_not_there_are_refused() -> None:

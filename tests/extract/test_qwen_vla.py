@@ -90,7 +90,7 @@ def test_internvla_refuses_a_batch_before_it_begins(internvla_settings: ExtractS
 def test_other_options_are_another_run(internvla_settings: ExtractSettings, internvla: Run) -> None:
     with pytest.raises(SettingsMismatchError, match="guidance"):
         extract_run(
-            internvla_settings.changed(options={**internvla_settings.options, "guidance": 2.0}),
+            internvla_settings.changed(options={**internvla_settings.model.options, "guidance": 2.0}),
             Path(str(internvla.location)),
         )
 

@@ -1,16 +1,196 @@
-"""What a run is called, and which questions its settings ask for."""
+"""Settings: one declaration of a field makes keyword, option, file and identity."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
+from typer.testing import CliRunner
 
-from probe_kit.extract import ExtractSettings
+from probe_kit._terminal.field_options import command_with, options_of
+from probe_kit.cli import app
+from probe_kit.env import SceneSpec
+from probe_kit.env.spec import PRESETS
+from probe_kit.errors import UsageError
+from probe_kit.extract import AskSettings, EnvSource, ExtractSettings, LeRobotSource
+from probe_kit.extract.config_files import read_config
 from probe_kit.extract.prepared import check_run
-from probe_kit.extract.settings import run_label
+from probe_kit.extract.settings import SOURCES, run_label
 from probe_kit.hooks import Edit, Site
 from probe_kit.suite import load_suite
 
 ZERO = Edit("zero", (Site("backbone", 1),))
+EVERY = {
+    "checkpoint": "DIR", "options": {"unnorm_key": "bridge"}, "random_weights": True, "weights_seed": 3,
+    "dtype": "bfloat16", "tokens": "all", "captured_calls": 4, "codec": "none", "protocol": "act2answer",
+    "execute": 2, "rotation": "axis-angle", "capture_only": True, "edits": (ZERO,), "device": "cuda:1",
+    "frames": "none", "env_workers": 1, "workers": 2, "ray": "auto", "inference_limit": 9.5, "allow_mixed": True,
+    "batch": 8, "video": "all", "accept_units": True, "seed": 5, "label": "after", "suite": Path("mine"),
+    "categories": ("color",), "items": 6, "wordings": ("named",), "max_steps": 7, "arm": "panda",
+}  # fmt: skip
+"""Another value than the default for every field of settings that play a scene."""
+CAPTURE_TASK_SEED = {
+    "tokens", "captured_calls", "codec", "later_views", "protocol", "execute", "rotation", "capture_only", "edits",
+    "seed",
+}  # fmt: skip
+
+
+def value_of(name: str) -> Any:
+    return {"later_views": "mean"}.get(name, EVERY.get(name))
+
+
+def with_one(name: str) -> ExtractSettings:
+    """Settings of which one field differs; what it needs beside itself has its other value too."""
+    beside = {"inference_limit": {"workers": 1}, "later_views": {"captured_calls": 2}}.get(name, {})
+    return ExtractSettings("pi0", **{name: value_of(name)} | beside)
+
+
+def typed(*words: str) -> ExtractSettings:
+    """Settings that a command line makes."""
+    made: list[ExtractSettings] = []
+
+    @command_with(*ExtractSettings.options())
+    def command(values: Any) -> None:
+        made.append(ExtractSettings.of_command(values))
+
+    program = typer.Typer()
+    program.command()(command)
+    ended = CliRunner().invoke(program, words, catch_exceptions=False)
+    assert ended.exit_code == 0, ended.output
+    return made[0]
+
+
+@pytest.mark.parametrize("name", sorted({*EVERY, "later_views"}))
+def test_a_file_makes_the_settings_again_that_it_was_written_of(name: str) -> None:
+    settings = with_one(name)
+    assert settings != ExtractSettings("pi0")
+    assert ExtractSettings(**json.loads(json.dumps(settings.config()))) == settings
+
+
+@pytest.mark.parametrize("name", sorted({*EVERY, "later_views"} - {"max_steps", "arm"}))
+def test_the_part_of_a_field_says_whether_it_is_identity(name: str) -> None:
+    base = ExtractSettings("pi0", captured_calls=2 if name == "later_views" else 1)
+    changed = with_one(name).identity() != base.identity()
+    assert changed == (name in CAPTURE_TASK_SEED | {"random_weights", "dtype"})
+
+
+def test_every_field_of_a_run_is_tried_above() -> None:
+    parts = ("model", "capture", "task", "machine")
+    fields = {name for part in parts for name in getattr(ExtractSettings("pi0"), part).__class__.model_fields}
+    fields |= {*SOURCES[0].model_fields, "seed", "label"} - {"kind", "scene"}
+    assert fields - {"family", "vectors", "later_views"} <= set(EVERY)
+
+
+def test_a_command_line_and_keywords_make_the_same_settings() -> None:
+    assert typed("--model", "expert") == ExtractSettings("expert")
+    line = (
+        "--model pi0 -M unnorm-key=bridge --categories Color,shape --items 4 --wordings named --batch auto "
+        "--max-steps 7 --early-stop --picture-size 8x6 --captured-calls all --no-act --weights-seed 2 --seed 0"
+    )
+    keywords = ExtractSettings(
+        "pi0", options={"unnorm_key": "bridge"}, categories=("color", "shape"), items=4, wordings=("named",),
+        batch="auto", max_steps=7, early_stop=True, picture_size=(8, 6), captured_calls="all", capture_only=True,
+        weights_seed=2,
+    )  # fmt: skip
+    assert typed(*line.split()) == keywords
+    assert (keywords.scene.max_steps, keywords.scene.picture_shape) == (7, (6, 8))
+    recorded = "--model pi0 --dataset kitchen --episodes 0:2,4 --select every:3 --camera base=top --rotate base=90"
+    assert typed(*recorded.split(), "--no-pixels").source == LeRobotSource(
+        "kitchen", episodes=(0, 1, 4), every=3, cameras={"base": "top"}, rotations={"base": 90}, pixels=False
+    )
+    played = "--model pi0 --env kitchen:Kitchen --env-option count=3 --max-steps 9 --episodes 1"
+    expected = EnvSource("kitchen:Kitchen", options={"count": "3"}, max_steps=9, episodes=[1])
+    assert typed(*played.split()).source == expected
+
+
+def test_typed_options_replace_those_of_a_file(tmp_path: Path) -> None:
+    source = LeRobotSource("kitchen", every=3)
+    for settings, words in (
+        (ExtractSettings("pi0", items=4, max_steps=7), {"items": 6, "seed": 2}),
+        (ExtractSettings("pi0", source=source), {"episodes": "0:2"}),
+    ):
+        (tmp_path / "settings.json").write_text(json.dumps(settings.config()), encoding="utf-8")
+        file = read_config(tmp_path / "settings.json")
+        again = ExtractSettings.of_command(words, file)
+        assert ExtractSettings.of_command({}, file) == settings
+        assert again.scene.max_steps == 7 if "items" in words else again.source == source.changed(episodes=(0, 1))
+
+
+def test_printed_settings_are_those_that_a_command_reads(tmp_path: Path) -> None:
+    line = ["extract", "--model", "pi0-tiny", "--items", "2", "--print-config"]
+    printed = CliRunner().invoke(app, line)
+    assert printed.exit_code == 0, printed.output
+    (tmp_path / "settings.json").write_text(printed.stdout, encoding="utf-8")
+    again = CliRunner().invoke(app, ["extract", "--config", str(tmp_path / "settings.json"), "--print-config"])
+    assert json.loads(again.stdout) == json.loads(printed.stdout)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"tokens": "some"}, "tokens is 'some'; expected one of pooled, all"),
+        ({"items": 0}, "items is 0; expected at least 1"),
+        ({"batch": 0}, "batch"),
+        ({"workers": 2000}, "workers is 2000"),
+        ({"wordings": ("sung",)}, "sung"),
+        ({"inference_limit": 3.0}, "--workers 1"),
+        ({"later_views": "mean"}, "--captured-calls"),
+        ({"label": ""}, "label"),
+        ({"suite": Path("x"), "source": LeRobotSource("kitchen")}, "--suite does not apply with --dataset"),
+    ],
+    ids=str,
+)
+def test_a_value_that_cannot_be_used_is_refused_by_its_name(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        ExtractSettings("pi0", **values)
+    assert message in str(refused.value)
+
+
+def test_an_unknown_name_is_refused_with_the_nearest_known_one() -> None:
+    with pytest.raises(TypeError, match=r"'tokns'; is it tokens\?"):
+        ExtractSettings("pi0", tokns="all")
+    with pytest.raises(TypeError, match="execute"):
+        AskSettings("vlm-tiny", execute=2)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"model": "pi0", "dataset": "a", "env": "b:C"}, "are 2 sources"),
+        ({"model": "pi0", "select": "every:2"}, "is for recordings; give --dataset FOLDER too"),
+        ({"model": "pi0", "env_option": ["a=1"]}, "is for environments"),
+        ({"model": "pi0", "dataset": "a", "items": 2}, "--items does not apply with --dataset"),
+        ({"items": 2}, "--model NAME"),
+    ],
+    ids=str,
+)
+def test_options_of_another_source_are_refused(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        ExtractSettings.of_command(values)
+    assert message in str(refused.value)
+
+
+def test_a_scene_value_of_zero_is_chosen_and_therefore_checked() -> None:
+    with pytest.raises(Exception, match="max_steps"):
+        ExtractSettings("expert", max_steps=0)
+
+
+def test_what_is_not_chosen_is_that_of_the_protocol_the_model_or_the_class() -> None:
+    assert ExtractSettings("expert", scene=None, arm=None, early_stop=False, items=None) == ExtractSettings(
+        "expert"
+    )
+    assert ExtractSettings("expert", protocol="act2answer").scene.name == "act2answer"
+    home = ExtractSettings("expert", protocol="act2answer", scene="vl-think").scene.home
+    assert home == PRESETS["vl-think"]["home"]
+    assert ExtractSettings("expert", scene=SceneSpec(max_steps=2)).changed(seed=1).scene == SceneSpec(max_steps=2)
+
+
+def test_sources_share_the_options_that_mean_the_same() -> None:
+    declared = [(one.parameter, one.option.metavar) for kind in SOURCES for one in options_of(kind)]
+    shared = {name for name, _ in declared if [name for name, _ in declared].count(name) > 1}
+    assert shared == {"episodes", "no_pixels"}
+    assert len(set(declared)) == len(declared) - len(shared)
 
 
 @pytest.mark.parametrize(
@@ -21,16 +201,15 @@ ZERO = Edit("zero", (Site("backbone", 1),))
         (ExtractSettings("openvla", options={"centre_crop": True}), "openvla · centre_crop=True"),
         (ExtractSettings("pi0", random_weights=True, weights_seed=2), "pi0 · twin 2"),
         (ExtractSettings("pi0", label="after fine-tuning"), "after fine-tuning"),
+        (ExtractSettings("pi0", source=EnvSource("kitchen:Kitchen")), "pi0 · in kitchen:Kitchen"),
     ],
 )
 def test_what_sets_a_run_apart_is_in_its_label(settings: ExtractSettings, label: str) -> None:
     assert run_label(settings) == label
 
 
-def test_an_edited_run_is_called_so_and_is_another_run() -> None:
-    plain, edited = ExtractSettings("pi0"), ExtractSettings("pi0", edits=(ZERO,))
-    assert run_label(edited).startswith("pi0 · edited ")
-    assert plain.identity() != edited.identity()
+def test_an_edited_run_is_called_so() -> None:
+    assert run_label(ExtractSettings("pi0", edits=(ZERO,))).startswith("pi0 · edited ")
 
 
 @pytest.mark.slow
@@ -44,14 +223,8 @@ def test_only_what_is_asked_is_drawn_of_the_embedded_suite(
     assert {item.category for item in load_suite(drawn).items} == {"color"}
 
 
-def test_a_policy_on_a_gpu_chooses_its_batch_unless_one_is_given() -> None:
-    def chosen(model: str, **given: object) -> tuple[int, bool]:
-        settings = ExtractSettings(model, **given)  # type: ignore[arg-type]
-        return settings.batch, settings.calibrate
-
-    assert chosen("pi0", device="cuda") == (1, True)
-    assert chosen("pi0", device="cuda:1", batch=1) == (1, False)
-    assert chosen("pi0", device="cuda", batch=8) == (8, False)
-    assert chosen("pi0", device="cuda", env_workers=4) == (1, False)
-    assert chosen("pi0") == chosen("expert", device="cuda") == (1, False)
-    assert chosen("pi0", batch="auto") == (1, True)
+def test_a_policy_on_a_gpu_chooses_its_batch_unless_one_is_chosen() -> None:
+    assert ExtractSettings("pi0", device="cuda").machine.batch == "auto"
+    assert ExtractSettings("pi0", device="cuda:1", batch=1).machine.batch == 1
+    assert ExtractSettings("pi0", device="cuda", env_workers=4).machine.batch == 1
+    assert ExtractSettings("pi0").machine.batch == ExtractSettings("expert", device="cuda").machine.batch == 1

@@ -115,8 +115,8 @@ def test_all_frames_are_those_that_the_environment_draws_in_the_same_episode(
     assert sheet is not None
     assert sheet.count == row["steps"] + 1 == 9
     frames = decode_frames(sheet.content, sheet.count)
-    assert film_settings.suite is not None
-    item = next(one for one in load_suite(film_settings.suite).items if one.item_id == row["item_id"])
+    assert film_settings.source.suite is not None
+    item = next(one for one in load_suite(film_settings.source.suite).items if one.item_id == row["item_id"])
     env = Act2AnswerEnv(film_settings.scene)
     env.reset(seed=int(row["scene_seed"]), options={"item": item, "layout": row["layout"]})
     expert = ScriptedExpert(env)
@@ -144,8 +144,8 @@ def test_all_frames_of_a_policy_are_those_that_its_stored_actions_lead_to(
     for site in filmed.sites("expert"):
         for call in range(2):
             assert np.array_equal(filmed.column(site, "mean", call), bare.column(site, "mean", call))
-    assert film_settings.suite is not None
-    items = {item.item_id: item for item in load_suite(film_settings.suite).items}
+    assert film_settings.source.suite is not None
+    items = {item.item_id: item for item in load_suite(film_settings.source.suite).items}
     env = Act2AnswerEnv(settings.scene)
     for position, row in enumerate(filmed.episodes.to_dict("records")):
         sheet = read_sheet(filmed.location, int(row["episode"]))

@@ -179,7 +179,7 @@ def test_a_condition_captures_a_number_of_inferences_or_all(tmp_path: Path) -> N
         text = changed((dark, f'{dark}\ncaptured_calls = {said}\nlater_views = "mean"'))
         (cell,) = (one for one in load_study(written(tmp_path, text)).cells if one.name == "base/dark")
         assert isinstance(cell.settings, ExtractSettings)
-        assert (cell.settings.captured_calls, cell.settings.later_views) == (kept, "mean")
+        assert (cell.settings.capture.captured_calls, cell.settings.capture.later_views) == (kept, "mean")
 
 
 CAPTURED = """
@@ -243,7 +243,9 @@ def test_the_papers_study_is_41_runs_of_107_440_episodes(monkeypatch: pytest.Mon
     assert len(plan.study.study.models) == 20
     scenes = {one.cell.settings.scene.name for one in plan.cells}
     assert scenes == {"act2answer"}  # policies and VLMs: else they would see other frames
-    checkpoints = {one.cell.model: one.cell.settings.checkpoint for one in plan.cells if one.cell.way == "plain"}
+    checkpoints = {
+        one.cell.model: one.cell.settings.model.checkpoint for one in plan.cells if one.cell.way == "plain"
+    }
     assert checkpoints["openvla"] == "openvla/openvla-7b"
     assert checkpoints["openvla-sft"] == "gen-robot/openvla-7b-rlvla-sft_16k"
 
@@ -251,7 +253,7 @@ def test_the_papers_study_is_41_runs_of_107_440_episodes(monkeypatch: pytest.Mon
 def test_the_embedded_study_needs_no_download(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     study = load_study("embedded")
-    assert all(cell.settings.checkpoint is None for cell in study.cells)
+    assert all(cell.settings.model.checkpoint is None for cell in study.cells)
     assert {cell.model for cell in study.cells} == set(study.study.models)
     assert plan_study(study).totals()["episodes"] == 1728
 

@@ -282,4 +282,4 @@ def test_the_viewer_opens_every_stored_run_of_a_study(played: LoadedStudy, tmp_p
     assert [one["key"] for one in index["runs"]] == cells
     assert [one["episodes"] for one in index["runs"]] == [cell.episodes for cell in played.cells]
     for cell, key in zip(played.cells, cells, strict=True):
-        assert read_payload((data / key / "run.js").read_bytes())[1]["model"] == cell.settings.model
+        assert read_payload((data / key / "run.js").read_bytes())[1]["model"] == cell.settings.model.family

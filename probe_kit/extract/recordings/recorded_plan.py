@@ -179,7 +179,7 @@ class Recording:
             raise RecordingError(
                 f"--rotate {strange[0]}=…: that camera gets no picture; those with one are {', '.join(known)}"
             )
-        return replace(self, source=self.source.model_copy(update={"cameras": pairs}))
+        return replace(self, source=self.source.changed(cameras=pairs))
 
     def check(self) -> None:
         """Raise RecordingError for files, numbers or pictures of the chosen episodes that cannot be shown.

@@ -59,7 +59,6 @@ def _check_source(settings: ExtractSettings) -> None:
     }
     if isinstance(settings.source, LeRobotSource):
         given |= {
-            "--captured-calls": settings.capture.captured_calls != 1,
             "--execute": settings.task.execute is not None,
             "--later-views": settings.capture.later_views != "all",
             "edits": bool(settings.task.edits),

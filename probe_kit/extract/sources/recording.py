@@ -169,6 +169,7 @@ class LeRobotSource(SourceSettings):
     command: ClassVar[str] = "--dataset FOLDER"
     subject: ClassVar[str] = "recordings"
     loads: ClassVar[str] = "recordings"
+    decides: ClassVar[tuple[str, ...]] = ("captured_calls",)
     shows: ClassVar[str] = "--dataset, which shows recorded frames and executes no action"
 
     def __init__(self, folder: str | Path, **choices: Any) -> None:

@@ -11,7 +11,8 @@ class SourceSettings(Part):
 
     kind: the name of the source in files. command: the option that a command names it with; empty for the scene.
     shows: the reason why options of other sources do not apply. subject, loads: what its options are about, and
-    what is loaded of it, in words.
+    what is loaded of it, in words. decides:
+    fields of other parts that the source itself decides.
     """
 
     kind: str
@@ -20,6 +21,7 @@ class SourceSettings(Part):
     shows: ClassVar[str] = ""
     subject: ClassVar[str] = ""
     loads: ClassVar[str] = ""
+    decides: ClassVar[tuple[str, ...]] = ()
 
     @property
     def name(self) -> str:

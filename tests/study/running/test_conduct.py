@@ -246,7 +246,7 @@ def test_what_fails_while_it_plays_is_kept_with_its_traceback_and_tried_again_on
     tries: list[str] = []
 
     def load(settings: ExtractSettings) -> None:
-        tries.append(settings.model)
+        tries.append(settings.model.family)
         raise RuntimeError("the loader of a family is wrong")
 
     monkeypatch.setattr(model_task, "load_acting_policy", load)
@@ -271,7 +271,7 @@ def test_a_policy_is_loaded_once_for_all_of_its_runs(
     load = model_task.load_acting_policy
 
     def count(settings):  # type: ignore[no-untyped-def]
-        loaded.append(settings.model)
+        loaded.append(settings.model.family)
         return load(settings)
 
     monkeypatch.setattr(model_task, "load_acting_policy", count)
