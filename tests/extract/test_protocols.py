@@ -2,13 +2,15 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, extract_run, prepare
-from probe_kit.extract.protocols import check_protocol, deviations, protocol_identity, protocol_scene
+from probe_kit.extract import protocols
+from probe_kit.extract.protocols import check_protocol, protocol_scene
 from probe_kit.extract.settings import run_label
 from probe_kit.hooks.contract.options import check_options
 from probe_kit.hooks.registry import own_families
@@ -51,6 +53,15 @@ RELEASED = {
         "-M steps": "10", "-M guidance": "1.5",
     },
 }  # fmt: skip
+
+
+def protocol_identity(settings: ExtractSettings) -> dict[str, Any]:
+    return protocols.protocol_identity(settings.model, settings.task, settings.source)
+
+
+def deviations(settings: ExtractSettings) -> dict[str, Any]:
+    """By setting, what the protocol has and what the run has."""
+    return dict(protocol_identity(settings).get("protocol", {}).get("deviations", {}))
 
 
 def test_every_model_of_the_release_that_is_here_has_its_row() -> None:
