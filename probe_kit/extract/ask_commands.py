@@ -19,7 +19,7 @@ OWN_SCENE = frozenset(SceneOptions.model_fields) - {"scene"} | {"wordings"}
 """Fields of a scene that questions leave as they are."""
 
 
-@command_with(*AskSettings.options(), offers=lambda name: name not in OWN_SCENE)
+@command_with(*AskSettings.option_models(), offers=lambda name: name not in OWN_SCENE)
 def ask(
     typed: Mapping[str, Any],
     prompt: start.Prompts = start.P1_P2_SEEN,

@@ -27,7 +27,7 @@ LARGE = 64 * 10**9
 """Bytes above which a run is begun with --yes only."""
 
 
-@command_with(*ExtractSettings.options())
+@command_with(*ExtractSettings.option_models())
 def extract(
     typed: Mapping[str, Any],
     out_folder: start.OutFolder = None,

@@ -113,7 +113,7 @@ class Settings(Part):
         return type(self)(**(dict(self) | values))
 
     @classmethod
-    def options(cls) -> Iterator[Any]:
+    def option_models(cls) -> Iterator[Any]:
         """The models whose fields are the options of a command that makes these settings."""
         yield from (_model_of(cls, part) for part in _PARTS)
         yield from (cls, SceneOptions, *cls.sources)

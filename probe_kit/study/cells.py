@@ -62,6 +62,11 @@ class Cell:
         """Whether a VLM is asked."""
         return isinstance(self.settings, AskSettings)
 
+    @property
+    def captured(self) -> bool:
+        """Whether a policy is only captured."""
+        return isinstance(self.settings, ExtractSettings) and self.settings.task.capture_only
+
     @cached_property
     def selection(self) -> Selection:
         """What all blocks together need."""
@@ -85,7 +90,7 @@ class Cell:
         """Inferences of a policy at most, where episodes may end early; a VLM has none."""
         if not isinstance(self.settings, ExtractSettings):
             return 0
-        if self.settings.task.capture_only:
+        if self.captured:
             return self.episodes
         return self.episodes * ceil(self.settings.scene.max_steps / (self.settings.task.execute or 1))
 

@@ -8,8 +8,7 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
-from probe_kit.extract import AskSettings, ExtractSettings, extract_run, prepare
-from probe_kit.extract import protocols
+from probe_kit.extract import AskSettings, ExtractSettings, extract_run, prepare, protocols
 from probe_kit.extract.protocols import check_protocol, protocol_scene
 from probe_kit.extract.settings import run_label
 from probe_kit.hooks.contract.options import check_options
@@ -174,19 +173,19 @@ def test_how_a_protocol_differs_from_the_default_is_in_the_run() -> None:
 
 def test_options_of_the_protocols_checkpoint_do_not_follow_another_one() -> None:
     own = ExtractSettings("openvla", "my/fine-tune", protocol="act2answer").followed()
-    assert "unnorm_key" not in own.options
-    assert own.options["temperature"] == 0.6
+    assert "unnorm_key" not in own.model.options
+    assert own.model.options["temperature"] == 0.6
     assert set(deviations(own)) == {"checkpoint", "-M unnorm_key"}
     assert "SFT" not in run_label(own)
 
 
 def test_the_conversion_of_rotations_is_the_protocols_unless_another_is_asked_for() -> None:
-    assert ExtractSettings("pi0", protocol="act2answer").followed().rotation == "axis-angle"
-    assert ExtractSettings("magma", protocol="act2answer").followed().rotation == "roll-pitch-yaw"
+    assert ExtractSettings("pi0", protocol="act2answer").followed().task.rotation == "axis-angle"
+    assert ExtractSettings("magma", protocol="act2answer").followed().task.rotation == "roll-pitch-yaw"
     plain = ExtractSettings("pi0", protocol="act2answer", rotation="roll-pitch-yaw").followed()
     assert deviations(plain) == {"rotation": ["axis-angle", "roll-pitch-yaw"]}
-    assert "rotation" not in plain.identity()  # as of runs that were made before there was a choice
-    assert ExtractSettings("pi0", protocol="act2answer", capture_only=True).followed().rotation is None
+    assert plain.identity()["rotation"] == "roll-pitch-yaw"
+    assert ExtractSettings("pi0", protocol="act2answer", capture_only=True).followed().task.rotation is None
     with pytest.raises(UsageError, match="expected one of roll-pitch-yaw, axis-angle"):
         ExtractSettings("pi0", rotation="quaternion")  # type: ignore[arg-type]
 

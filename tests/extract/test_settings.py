@@ -50,7 +50,7 @@ def typed(*words: str) -> ExtractSettings:
     """Settings that a command line makes."""
     made: list[ExtractSettings] = []
 
-    @command_with(*ExtractSettings.options())
+    @command_with(*ExtractSettings.option_models())
     def command(values: Any) -> None:
         made.append(ExtractSettings.of_command(values))
 

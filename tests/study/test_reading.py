@@ -272,4 +272,4 @@ def test_paths_are_relative_to_the_working_directory_also_in_studies_of_the_pack
     text = changed(("[suite]", '[suite]\npath = "suites/paper"'), ("items = 24", "items = 12"))
     study = load_study(written(tmp_path / "files", text))
     assert study.suite.identity == f"{small_suite.name}@{small_suite.version}"  # a suite that grows keeps its runs
-    assert study.cells[0].settings_to_play.suite == Path("suites/paper")
+    assert study.cells[0].settings_to_play.source.suite == Path("suites/paper")

@@ -81,7 +81,7 @@ def cost_of(works: Iterable[Work], ledger: Ledger) -> Cost:
 
 def speed_name(cell: Cell) -> str:
     """What shares one rate: a model that acts, is captured without acting, or is asked."""
-    captured = getattr(cell.settings, "capture_only", False)
+    captured = cell.captured
     return f"{cell.model}, {'asked' if cell.asks else 'captured' if captured else 'acting'}"
 
 

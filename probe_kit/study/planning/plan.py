@@ -92,7 +92,7 @@ class StudyPlan:
         """Runs, episodes by what is done in them, inferences of policies, and what is missing."""
         cells = [one.cell for one in self.played]
         asked = sum(cell.episodes for cell in cells if cell.asks)
-        captured = sum(cell.episodes for cell in cells if getattr(cell.settings, "capture_only", False))
+        captured = sum(cell.episodes for cell in cells if cell.captured)
         return {
             "runs": len(cells),
             "episodes": sum(cell.episodes for cell in cells),
