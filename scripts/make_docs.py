@@ -54,7 +54,8 @@ def main() -> None:
 def _of_trained(made: Demo) -> list[Finding]:
     return [
         Finding(TRAINED.name, row.category, TRAINED.expected(row.category), verdict(row), row)
-        for row in made.acted
+        for row in made.table.rows
+        if row.run.mode == "acts"
     ]
 
 

@@ -49,10 +49,8 @@ def demo(
 
 
 def print_demo(made: "Demo") -> None:
-    """Where to look, then the finding, which stays in view, and last the command that opens the viewer."""
+    """Where to look, then the table and a sentence per category, and last the command that opens the viewer."""
     out.print(made.next_steps(), soft_wrap=True)
     out.print()
-    out.print(made.table.to_rich())
-    out.print()
-    out.print(made.finding())
+    out.print(made.table.to_rich(with_next_step=False))
     out.print(made.viewer(), soft_wrap=True)

@@ -12,14 +12,11 @@ from probe_kit._system.drafts import write_whole
 from probe_kit._terminal.console import marked
 from probe_kit.demo.organisms import TRAINED, VLM, Finding, NamedProgress, answered, compare, probed
 from probe_kit.retention import RetentionTable, retention_table
-from probe_kit.retention.columns.sentences import verdict
 from probe_kit.retention.displays import layer_curve
 from probe_kit.retention.report import write_report
-from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.runs import Run
 from probe_kit.runs.layout import VIDEOS
 from probe_kit.suite import Suite, build_suite
-from probe_kit.suite.categories import category_of
 
 
 @dataclass(frozen=True)
@@ -65,26 +62,10 @@ class Demo:
             lines.insert(0, marked(warning))
         return Text("\n").join(line if isinstance(line, Text) else Text(line) for line in lines)
 
-    @property
-    def acted(self) -> list[RetentionRow]:
-        """The rows of the policy, one per category."""
-        return [row for row in self.table.rows if row.category != MEAN and row.run.mode == "acts"]
-
-    def finding(self) -> Text:
-        """Return one line: per category whether the policy knows the answer, and whether it uses it."""
-        each = (f"{category_of(row.category).title}: {_known_and_used(row)}" for row in self.acted)
-        return marked("[bold]Found[/]   {}.", " · ".join(each))
-
     def viewer(self) -> Text:
-        """The command that shows both runs episode by episode."""
+        """Return one line: the command that shows both runs episode by episode."""
         runs = (shlex.quote(str(run.path)) for run in (self.run, self.asked))
         return marked("[bold]Open[/]    probe-kit view {} {}", *runs)
-
-
-def _known_and_used(row: RetentionRow) -> str:
-    if row.backbone.has_signal:
-        return f"known, {verdict(row)}"
-    return str(row.backbone.verdict or verdict(row))
 
 
 def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:

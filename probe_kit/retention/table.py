@@ -19,6 +19,7 @@ from probe_kit.retention.behaviour.wordings import WordingPair, correct_wordings
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import averaged_fields
 from probe_kit.retention.columns.comparisons import size_table, vlm_vla_tables, wording_tables
+from probe_kit.retention.columns.findings import next_step
 from probe_kit.retention.columns.summary import RunSummary, summarise_runs, summary_table
 from probe_kit.retention.columns.tables import retention_tables
 from probe_kit.retention.columns.text import model_name
@@ -75,7 +76,9 @@ class RetentionTable:
         """The summary with its sentences, and folded below it the tables; pointing at a heading explains it."""
         from markupsafe import Markup
 
-        sentences = Markup("").join(Markup("<li>{}</li>").format(without_places(one)) for one in self._sentences())
+        rows = [one for run in self.summary for one in run.categories]
+        item = Markup("<li><b>{}</b> {}</li>")
+        sentences = Markup("").join(item.format(one.name, without_places(one.finding)) for one in rows)
         tables = [table for title, table in self._tables().items() if title != "Controls"]
         shown = "".join(own._repr_html_() for table in tables if (own := table.details(False)) is not None)
         details = f"<details><summary>All tables</summary>{shown}</details>"
@@ -172,8 +175,17 @@ class RetentionTable:
     def to_markdown(self) -> str:
         """Success rates, retention, controls and differences as Markdown tables."""
         tables = [*self._tables().values(), *wording_tables(self.wordings), *self.further_tables]
-        sentences = [f"* {markdown_safe(sentence)}" for sentence in self._sentences()]
-        parts = [self._summary_table().to_markdown(), *sentences, "", *(table.to_markdown() for table in tables)]
+        rows = [one for run in self.summary for one in run.categories]
+        sentences = [f"* **{markdown_safe(one.name)}** {markdown_safe(one.finding)}" for one in rows]
+        long = [f"* {markdown_safe(one.details)}" for one in rows]
+        parts = [
+            self._summary_table().to_markdown(),
+            *sentences,
+            "",
+            *long,
+            "",
+            *(table.to_markdown() for table in tables),
+        ]
         return "\n".join([*parts, *(f"> {markdown_safe(note)}\n" for note in self.notes)])
 
     def to_latex(self, details: Collection[Section] | Literal["all"] = ()) -> str:
@@ -191,9 +203,6 @@ class RetentionTable:
 
     def _summary_table(self) -> Table:
         return summary_table(self.summary, self.differences)
-
-    def _sentences(self) -> list[str]:
-        return [sentence for run in self.summary for sentence in run.sentences]
 
     def _details(self, details: Collection[Section] | Literal["all"]) -> list[Table]:
         """The tables of some sections, without columns that need room."""
@@ -219,20 +228,25 @@ class RetentionTable:
     def __rich__(self) -> "Group":
         return self.to_rich()
 
-    def to_rich(self, details: Collection[Section] | Literal["all"] = ()) -> "Group":
-        """The summary for a rich console: one table, and a sentence per category as the last lines.
+    def to_rich(self, details: Collection[Section] | Literal["all"] = (), with_next_step: bool = True) -> "Group":
+        """The summary for a rich console: one table, a sentence per category, and one line what to do next.
 
         details: sections that are shown above it, see `probe_kit.retention.choices.Section`; all of them by "all".
         """
         from rich.console import Group
         from rich.text import Text
 
-        why = self.unpaired if details or len(self.summary) > 1 else ()
+        summary = self.summary
+        why = self.unpaired if details or len(summary) > 1 else ()
         notes = [Text(sentence, style="yellow") for sentence in (*why, *self.notes)]
-        sentences: list[Text] = []
-        for run in self.summary:
-            sentences += [Text(run.title, style="bold")] * (len(self.summary) > 1) + [*map(Text, run.sentences)]
-        return Group(*self._details(details), self._summary_table(), *notes, *sentences)
+        long = [Text(one.details) for run in summary for one in run.categories] if details else []
+        short: list[Text] = []
+        for run in summary:
+            short += [Text(run.title, style="bold")] * (len(summary) > 1) + [*map(Text, run.sentences)]
+        last = Text(next_step(self.rows), style="bold") if with_next_step else Text("")
+        return Group(
+            *self._details(details), *long, self._summary_table(), *notes, *short, *[last] * bool(last.plain)
+        )
 
     @property
     def further_tables(self) -> list[Table]:

@@ -80,7 +80,7 @@ def verdict(row: RetentionRow) -> str:
 
 def _is_nowhere(row: RetentionRow, use: UseVerdict) -> bool:
     """Whether the image swap bounds the use, and probes did not find the answer."""
-    return use.is_bounded and _is_probed(row) and not row.backbone.has_signal
+    return use.is_bounded and is_probed(row) and not row.backbone.has_signal
 
 
 def readable(row: RetentionRow) -> Readable:
@@ -100,7 +100,7 @@ def readable(row: RetentionRow) -> Readable:
     if row.success.sr is None:
         return evidence
     success = _success(row)
-    if not _is_probed(row):
+    if not is_probed(row):
         return success
     if success == "success not shown" and evidence != "shown":
         return evidence
@@ -148,7 +148,7 @@ def conclusion(row: RetentionRow) -> str:
     use = row.image_swap.use
     is_later = use is not None and use.is_bounded and use.is_of_first_chunk and knows(row)
     parts = [_finding(row) if use is None else _used(row, use), _LATER * is_later]
-    if not _is_probed(row):
+    if not is_probed(row):
         parts.append("The backbone was not probed.")
     return " ".join(filter(None, parts))
 
@@ -163,7 +163,7 @@ def _used(row: RetentionRow, use: UseVerdict) -> str:
 def _finding(row: RetentionRow) -> str:
     """Of a row without one."""
     found = readable(row)
-    if not _is_probed(row):
+    if not is_probed(row):
         return _unprobed(row)
     if found == "shown":
         return "Shown in the backbone."
@@ -218,7 +218,8 @@ def _behaviour(row: RetentionRow) -> str:
     return words[_success(row)]
 
 
-def _is_probed(row: RetentionRow) -> bool:
+def is_probed(row: RetentionRow) -> bool:
+    """Whether probes of the backbone are stored."""
     return bool(row.backbone.exceeds)
 
 
@@ -267,7 +268,7 @@ _CONTROLS = {RANDOM_FEATURES: "random features", UNTRAINED: "the untrained netwo
 def _streams(row: RetentionRow) -> list[str]:
     """What can be read in the backbone, and where the action is made. The first clause names the answer."""
     action = f"the {row.run.action_name}"
-    if _is_probed(row) and row.backbone.score is None:
+    if is_probed(row) and row.backbone.score is None:
         return ["the probes have no score: too few groups of items, or a fold with one side only"]
     parts = [] if row.backbone.score is None else [_in_stream("the backbone", row.backbone, "the answer")]
     if row.action.score is not None:
@@ -302,7 +303,7 @@ def _accuracy(part: StreamPart) -> str:
 
 def chance_only(rows: Sequence[RetentionRow]) -> str:
     """A warning that names the runs whose probes were compared with no control; empty where all were."""
-    probed = [row for row in rows if _is_probed(row)]
+    probed = [row for row in rows if is_probed(row)]
     names = list(dict.fromkeys(model_name(row) for row in probed if not row.backbone.is_controlled))
     if not names:
         return ""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from probe_kit._tables.numbers import Limits, number, points, signed, whole, with_limits
 from probe_kit._tables.table import Cell, Heading, Row, Table
 from probe_kit.intervene.kinds.image_swap.verdict import describe_readouts
+from probe_kit.retention.columns.findings import finding
 from probe_kit.retention.columns.sentences import chance_only, describe_category, knows, verdict
 from probe_kit.retention.columns.text import (
     P_DECIDES,
@@ -70,8 +71,13 @@ class CategorySummary:
         )
 
     @property
-    def sentence(self) -> str:
-        """The finding in plain words, with its numbers, their uncertainty and the number of items."""
+    def finding(self) -> str:
+        """The finding in one short sentence, to be set behind the category's name."""
+        return finding(self.row, self.asked)
+
+    @property
+    def details(self) -> str:
+        """The finding with all its numbers, their uncertainty and the number of items."""
         return f"{self.name} {describe_category(self.row, self.asked)}"
 
 
@@ -114,8 +120,9 @@ class RunSummary:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """One per category."""
-        return tuple(one.sentence for one in self.categories)
+        """One per category, all beginning at one column."""
+        width = max(len(one.name) for one in self.categories)
+        return tuple(f"{one.name.ljust(width)}  {one.finding}" for one in self.categories)
 
 
 def summary_table(found: Sequence[RunSummary], differences: Sequence[Difference] = ()) -> Table:

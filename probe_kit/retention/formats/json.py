@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from probe_kit.retention.columns.findings import finding
 from probe_kit.retention.columns.sentences import conclusion, verdict
 from probe_kit.retention.compare.differences import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
@@ -27,8 +28,8 @@ def table_json(
 def _in_words(row: RetentionRow) -> dict[str, Any]:
     """The verdict and what follows from it, as tables and sentences have them; None of a mean."""
     if row.category == MEAN:
-        return {"verdict": None, "conclusion": None}
-    return {"verdict": verdict(row), "conclusion": conclusion(row)}
+        return {"verdict": None, "finding": None, "conclusion": None}
+    return {"verdict": verdict(row), "finding": finding(row), "conclusion": conclusion(row)}
 
 
 def _own(row: RetentionRow, differences: Sequence[Difference]) -> dict[str, Any]:

@@ -88,7 +88,8 @@ def test_a_policy_stands_alone_where_no_vlm_was_asked_the_same(rows: list[Retent
 
 def test_a_vlm_without_a_policy_is_described_as_answering() -> None:
     (found,) = summarise_runs(ASKED)
-    assert found.sentences[0] == (
+    assert found.sentences[0] == "Color     known: the VLM answers right in 100 %."
+    assert found.categories[0].details == (
         "Color (24 items): the VLM answers right in 100 %, 90 to 100. The VLM knows the answer."
     )
     assert summary_table([found]).columns == ("category", "VLM %", "verdict")
@@ -124,7 +125,7 @@ def test_nothing_is_marked_where_no_control_was_run_and_a_warning_names_the_run(
     assert MARK not in table.texts[0][backbone] + table.texts[0][action]
     assert MARK in table.texts[0][success]
     assert "No control was run: a signal is judged against chance only" in " ".join(table.notes)
-    assert "against chance only" in found.sentences[0]
+    assert "against chance only" in found.categories[0].details
     both = summary_table(summarise_runs([*ACTED, *bare]))
     assert "No control was run for bare:" in " ".join(both.notes)
     assert "No control" not in " ".join(summary_table(summarise_runs(ACTED)).notes)
@@ -152,8 +153,9 @@ def test_the_terminal_shows_one_table_at_any_width_and_ends_on_the_sentences(wid
         console.print(RetentionTable(rows, means).to_rich())
     text = printed.get()
     assert text.count("category") == 1, "one header: one table, and it is not split"
-    assert "[40, 100]" in text.split("Color (24")[0], "a narrow table has intervals below their values"
-    assert " ".join(text.split()).endswith("The answer is not used in the first chunk: by the swap.")
+    assert "[40, 100]" in text.split("Counting  ")[0], "a narrow table has intervals below their values"
+    assert " ".join(text.split()).endswith("next: probe-kit power how many items would show what is open")
+    assert "State     known and encoded, not used: " in text
 
 
 @pytest.mark.parametrize(
@@ -185,7 +187,7 @@ def test_terminal_markdown_and_json_say_the_same_of_first_chunk_and_whole_episod
     differ = second not in (None, first)
     verdict = "first chunk not used; episode used" if differ else "used"
     with (console := Console(width=200)).capture() as printed:
-        console.print(table.to_rich())
+        console.print(table.to_rich("all"))
     text, (stored, _) = " ".join(printed.get().split()), json.loads(table.to_json())
     assert stored["verdict"] == verdict
     assert said in stored["conclusion"]
@@ -199,7 +201,7 @@ def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:
     found = (acts(name, score, None, None, capture_only=True) for name, score in (("color", 1.0), ("shape", 0.5)))
     rows = [*found, acts(MEAN, 0.75, None, None, capture_only=True)]
     (found,) = summarise_runs(rows)
-    color, shape = found.sentences
+    color, shape = (one.details for one in found.categories)
     assert color.endswith("the model did not act. Shown in the backbone.")
     assert shape.endswith("the model did not act. Not shown in the backbone: more items would tell.")
     assert "success" not in " ".join(cell for line in summary_table([found]).texts for cell in line)
@@ -207,4 +209,4 @@ def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:
 
 def test_a_category_goes_by_its_title() -> None:
     (found,) = summarise_runs([answers("public-info"), answers("ripe-fruit"), answers(MEAN)])
-    assert [sentence.partition(" (")[0] for sentence in found.sentences] == ["Public Info", "Ripe fruit"]
+    assert [one.name for one in found.categories] == ["Public Info", "Ripe fruit"]

@@ -1,0 +1,217 @@
+"""What a command ends on: one short sentence per category that says where the answer is lost, and the next step.
+
+A sentence has at most 25 words, two numbers and no brackets. Intervals, reasons and controls stand in the table,
+in `--details`, in reports and in JSON; `probe_kit.retention.columns.sentences` has the long form.
+"""
+
+import re
+import shlex
+from collections.abc import Sequence
+
+from probe_kit._tables.numbers import whole
+from probe_kit.intervene.kinds.image_swap.verdict import USES, UseVerdict
+from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.columns.sentences import is_probed, knows
+from probe_kit.retention.columns.text import is_vlm
+from probe_kit.retention.rows.parts import StreamPart
+from probe_kit.retention.rows.row import MEAN, RetentionRow
+from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
+
+MOST_WORDS = 25
+"""Of a sentence with the name of its category; a number is a word."""
+MOST_NUMBERS = 2
+_CONTROLS = {RANDOM_FEATURES: "random features", UNTRAINED: "an untrained network"}
+
+
+def finding(row: RetentionRow, asked: RetentionRow | None = None) -> str:
+    """Return what is found in a category: a verdict, a colon, and where on the way to the action it is lost.
+
+    asked: the row of a VLM that answered the same questions.
+    """
+    if is_vlm(row):
+        return _of_vlm(row)
+    use = row.image_swap.use
+    if use is None:
+        return _without_swap(row, asked)
+    if use.is_bounded and is_probed(row) and not _is_encoded(row):
+        return f"{_without_signal(row, asked)}: {_unread(row)}; the action does not follow it."
+    return _of_use(row, asked, use)
+
+
+def count_words(sentence: str) -> int:
+    """Return the number of words and numbers."""
+    return len(re.findall(r"[\w’'-]+", sentence))
+
+
+# -- VLMs ----------------------------------------------------------------------------------------------------
+
+
+def _of_vlm(row: RetentionRow) -> str:
+    rate = f"{whole(row.success.sr)} %"
+    if knows(row):
+        inside = ", and probes read it in the backbone" if _is_encoded(row) else ""
+        return f"known: the VLM answers right in {rate}{inside}."
+    if (row.success.share_outside or 0) > 0.5:
+        return f"not shown: no answer could be read in {whole(row.success.share_outside)} % of the episodes."
+    inside = ", yet probes read the answer in the backbone" if _is_encoded(row) else ""
+    return f"not shown: the VLM answers right in {rate}, {_against_guessing(row)}{inside}."
+
+
+def _against_guessing(row: RetentionRow) -> str:
+    return "less often than guessing" if row.success.regime == Regime.FAILURE else "which guessing can reach"
+
+
+# -- policies ----------------------------------------------------------------------------------------------------
+
+
+def _sentence(head: str, *clauses: str, row: RetentionRow) -> str:
+    """Return head and clauses, with the action stream and the rate of guessing where there is room for them."""
+    *before, success = [*clauses, _success(row)]
+    guessing = "" if row.success.sr is None else _beside_guessing(row)
+    stream = _in_action(row)
+    for in_action, guess in ((stream, guessing), (stream, ""), ("", guessing), ("", "")):
+        said = [clause.replace(_READ, f"{_READ}{in_action}") for clause in before]
+        sentence = f"{head}: {'; '.join([*said, success])}{guess}."
+        if count_words(sentence) < MOST_WORDS and len(re.findall(r"\d+", sentence)) <= MOST_NUMBERS:
+            break
+    return sentence
+
+
+_READ = "probes read the answer in the backbone"
+
+
+def _in_action(row: RetentionRow) -> str:
+    if row.action.verdict is None:
+        return ""
+    return f" and the {row.run.action_name}" if _holds(row.action) else f", not in the {row.run.action_name}"
+
+
+def _head(row: RetentionRow, asked: RetentionRow | None, used: str) -> str:
+    """Return the verdict: whether the VLM knows the answer, the policy encodes it, and the action uses it."""
+    stages = ["known"] * (asked is not None and knows(asked)) + ["encoded"] * _is_encoded(row)
+    return ", ".join(filter(None, (" and ".join(stages), used)))
+
+
+def _of_use(row: RetentionRow, asked: RetentionRow | None, use: UseVerdict) -> str:
+    """Return the sentence of a row whose pictures were swapped."""
+    first, *later = use.by_readout
+    if later and (first.behaviour in USES) != (later[0].behaviour in USES):
+        if first.behaviour in USES:
+            head, what = "used at first", "the first actions follow the answer, the whole episode does not"
+        else:
+            head, what = "used later", "the first actions do not follow the answer, the whole episode does"
+        return _sentence(head, what, row=row)
+    if use.behaviour == "used" and use.reversed:
+        return _sentence("used in reverse", "the action goes to the other picture", row=row)
+    if use.behaviour == "used":
+        return _sentence("used", *_read_and(row, "the action follows"), row=row)
+    if use.behaviour in USES:
+        direction = "goes against" if use.reversed else "follows"
+        how = f"only where it lies on the {use.side}" if use.side else "in some episodes or part of the way"
+        return _sentence("partly used", f"the action {direction} the answer {how}", row=row)
+    if use.behaviour == "moves with it, does not decide":
+        what = "the answer shifts the action without turning it"
+        return _sentence(_head(row, asked, "not decisive"), what, *_missing(row), row=row)
+    if use.behaviour == "not used" and use.is_of_first_chunk and knows(row):
+        what = "the first actions do not follow the answer, later ones may"
+        return _sentence(_head(row, asked, "not used at first"), what, *_missing(row), row=row)
+    if use.behaviour == "not used":
+        return _sentence(_head(row, asked, "not used"), *_read_and(row, "the action does not follow"), row=row)
+    if use.lacks_control:
+        what = "the action follows neither this answer nor that of another category"
+        return _sentence(_head(row, asked, "use undecided"), what, *_missing(row), row=row)
+    read = [_READ] if _is_encoded(row) else _missing(row, "the answer")
+    return _sentence(_head(row, asked, "use undecided"), *read, "more items would tell", row=row)
+
+
+def _holds(part: StreamPart) -> bool:
+    """Return whether the answer is shown in a stream; one without a score shows nothing."""
+    return part.has_signal and part.score is not None
+
+
+def _is_encoded(row: RetentionRow) -> bool:
+    return _holds(row.backbone)
+
+
+def _read_and(row: RetentionRow, action: str) -> list[str]:
+    """Return that probes read the answer and what the action does with it; else what is missing."""
+    if _is_encoded(row):
+        return [f"{_READ}, {action} it"]
+    return [f"{action} the answer", *_missing(row)]
+
+
+def _missing(row: RetentionRow, answer: str = "it") -> list[str]:
+    """Return why the answer is not known to be in the backbone; nothing where it is."""
+    if not is_probed(row):
+        return ["the backbone was not probed"]
+    if _is_encoded(row):
+        return []
+    return [f"probes do not show {answer} in the backbone"]
+
+
+def _unread(row: RetentionRow) -> str:
+    """Return what is known of a backbone without signal."""
+    part, items = row.backbone, row.success.n_items
+    if part.score is None:
+        return "too few groups of items to measure the answer in the backbone"
+    if part.verdict == "absent":
+        return f"probes of {items} items do not find the answer in the backbone"
+    if part.exceeds.get("chance") is None:
+        return "probes of the backbone were fitted without label permutations"
+    missed = [_CONTROLS.get(name, name) for name, better in part.exceeds.items() if better is False]
+    if part.exceeds["chance"]:
+        return f"probes of the backbone do no better than {' and '.join(missed)}"
+    return f"{items} items are too few to tell what the backbone holds"
+
+
+def _beside_guessing(row: RetentionRow) -> str:
+    if knows(row):
+        return ", guessing 50 %"
+    return ", less than guessing" if row.success.regime == Regime.FAILURE else ", like guessing"
+
+
+def _success(row: RetentionRow) -> str:
+    """Return how a policy does."""
+    if row.success.sr is None:
+        return "the model did not act" if row.run.capture_only else "success is not known"
+    return f"success {whole(row.success.sr)} %"
+
+
+def _without_signal(row: RetentionRow, asked: RetentionRow | None) -> str:
+    missing = "absent" if row.backbone.verdict == "absent" else "not shown"
+    return f"known, {missing} in the backbone" if asked is not None and knows(asked) else missing
+
+
+def _without_swap(row: RetentionRow, asked: RetentionRow | None) -> str:
+    """Return the sentence of a row whose pictures were not swapped."""
+    if is_probed(row) and _is_encoded(row):
+        tested = "use not tested" if row.success.sr is not None else ""
+        return _sentence(_head(row, asked, tested), _READ, row=row)
+    if is_probed(row):
+        return _sentence(_without_signal(row, asked), _unread(row), row=row)
+    if row.success.sr is None:
+        return f"not measured: {_success(row)}, and the backbone was not probed."
+    words = {Regime.KNOWLEDGE: "success", Regime.FAILURE: "failure"}
+    head = words.get(row.success.regime or Regime.NO_RELIABLE_KNOWLEDGE, "success not shown")
+    beside = "" if head == "success" else f", {_against_guessing(row)}"
+    return f"{head}: the cube ends right in {whole(row.success.sr)} %{beside}; the backbone was not probed."
+
+
+# -- what to do next ----------------------------------------------------------------------------------------------
+
+
+def next_step(rows: Sequence[RetentionRow]) -> str:
+    """Return the command for what is open in the first run, and what it answers; empty without a policy."""
+    acts = [row for row in rows if row.category != MEAN and not is_vlm(row)]
+    if not acts:
+        return ""
+    own = [row for row in acts if row.key == acts[0].key]
+    run = shlex.quote(own[0].run.location)
+    has_activations = own[0].run.action_stream is not None
+    if has_activations and not any(map(is_probed, own)):
+        return f"next: probe-kit train {run}  where inside the answer can be read"
+    if has_activations and any(row.image_swap.use is None for row in own) and not own[0].run.capture_only:
+        return f"next: probe-kit intervene {run}  whether the action follows the answer"
+    if any(is_probed(row) and not _is_encoded(row) and row.backbone.verdict != "absent" for row in own):
+        return "next: probe-kit power  how many items would show what is open"
+    return f"next: probe-kit view {run}  episode by episode, in a browser"
