@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 from probe_kit.study import load_study, plan_study
 from probe_kit.study.planning.plan import StudyPlan
 from probe_kit.study.running.model_task import Failure, Made, ModelTask, RunTask
-from probe_kit.study.running.ray import play_on_ray
+from probe_kit.study.running.playing import play_models
 
 STUDY = """
 schema = 1
@@ -117,7 +117,7 @@ def main() -> None:
                 waiting.ended += isinstance(event, Made | Failure)
                 failures.extend([event] if isinstance(event, Failure) else [])
 
-            play_on_ray(tasks, "auto", note)
+            play_models(tasks, note, ray="auto")
         seconds = time.monotonic() - began
         ray.shutdown()
     assert not failures, failures

@@ -1,1 +1,1 @@
-"""Work in other processes: a child, a pool of children, a Ray cluster. Used by playing and by fitting."""
+"""Work in other processes: a child, pools of workers here and on a Ray cluster, and their executor."""

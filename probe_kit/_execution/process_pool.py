@@ -1,37 +1,30 @@
-"""A pool of child processes that run one service."""
+"""A pool of workers in child processes."""
 
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing.connection import wait
 from typing import Any, Self
 
 from probe_kit._execution.child_process import Child
-from probe_kit.errors import ProbeKitError
+from probe_kit._execution.worker import Lost, Work
 
 LONGEST_WAIT_S = 1.0
 """A signal that arrives just before the system call does not end it: an endless wait would miss Ctrl-C."""
 
 
-@dataclass(frozen=True)
-class Ended:
-    """What a pool receives from a process that died. code: its exit code."""
-
-    code: int
-
-
 class ProcessPool:
-    """Processes of one service, numbered from 0. A context manager.
+    """Workers in processes, numbered from 0. A context manager.
 
-    service: `module:name`, see `Child`. setup: the first message to each. environment: by number, variables of the
-    process beyond those of this one.
+    environment: by number, variables of the process beyond those of this one. exits: by exit code, the predicate
+    of a sentence that says why a process ended.
     """
 
     def __init__(
-        self, service: str, setup: object, size: int, environment: Callable[[int], Mapping[str, str]] | None = None
-    ) -> None:
-        self._service, self._setup, self._size, self._environment = service, setup, size, environment
+        self, work: Work, setup: object, size: int,
+        environment: Callable[[int], Mapping[str, str]] | None = None, exits: Mapping[int, str] | None = None,
+    ) -> None:  # fmt: skip
+        self._setup, self._size, self._environment, self._exits = (work, setup), size, environment, exits or {}
         self._children: dict[int, Child] = {}
 
     def __enter__(self) -> Self:
@@ -47,13 +40,23 @@ class ProcessPool:
         for child in self._children.values():
             child.close()
 
-    def restart(self, slot: int) -> None:
-        """Start process number `slot` again, which ended."""
+    @property
+    def slots(self) -> set[int]:
+        """The numbers of the workers."""
+        return set(self._children)
+
+    def start(self, slot: int) -> None:
+        """Start worker number `slot` again, which ended."""
         self._spawn(slot)
         self.send(slot, self._setup)
 
+    def stop(self, slot: int) -> None:
+        """End an idle worker."""
+        self._children.pop(slot).close()
+
     def _spawn(self, slot: int) -> None:
-        self._children[slot] = Child(self._service, self._environment and self._environment(slot))
+        environment = self._environment and self._environment(slot)
+        self._children[slot] = Child("probe_kit._execution.worker:serve", environment)
 
     def pid(self, slot: int) -> int:
         """The process id."""
@@ -65,10 +68,7 @@ class ProcessPool:
             self._children[slot].connection.send(message)
 
     def receive(self) -> Iterator[tuple[int, Any]]:
-        """Wait until a process sends something; number and message of all that did, `Ended` of one that died.
-
-        Raises the ProbeKitError that a process sends.
-        """
+        """Wait until a worker sends something; number and message of all that did, `Lost` of one that died."""
         connections = [child.connection for child in self._children.values()]
         while not (ready := wait(connections, LONGEST_WAIT_S)):
             pass
@@ -78,9 +78,8 @@ class ProcessPool:
             try:
                 message = child.connection.recv()
             except (EOFError, ConnectionResetError):
-                message = Ended(child.close())
-            if isinstance(message, ProbeKitError):
-                raise message
+                code = child.close()
+                message = Lost(f"worker {slot}", self._exits.get(code, f"ended with code {code}"))
             yield slot, message
 
 

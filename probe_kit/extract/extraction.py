@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,17 +12,14 @@ from probe_kit.errors import EpisodesFailedError, UsageError
 from probe_kit.extract.needs import space_needed
 from probe_kit.extract.plan import RowPlan
 from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_answer_model
-from probe_kit.extract.rollout.events import Done, Event
+from probe_kit.extract.rollout.events import Done, Failed
 from probe_kit.extract.settings import (
     AskSettings,
     ExtractSettings,
     Settings,
     run_label,
 )
-from probe_kit.extract.workers.local import run_here
-from probe_kit.extract.workers.processes import run_in_processes
-from probe_kit.extract.workers.ray import run_on_ray
-from probe_kit.extract.workers.scheduler import Scheduler
+from probe_kit.extract.workers import play
 from probe_kit.hashing import canonical_json
 from probe_kit.runs.commits import failure_key
 from probe_kit.runs.disk import check_if_full
@@ -97,37 +95,32 @@ class Extraction(Prepared):
         return self.plan.only(one for one in self.plan.episodes if one.episode_id in added)
 
     def _play(self, writer: RunWriter[RowPlan], remaining: list[int], progress: Progress | None) -> None:
-        scheduler = Scheduler(remaining)
-        total = len(self.plan.episodes)
-
-        def on_event(event: Event) -> None:
-            if progress and isinstance(event, Done):
-                progress(total - len(remaining) + len(scheduler.done), total, event.outcome["outcome"])
-            if event.number in scheduler.given_up:
-                failed = scheduler.given_up[event.number]
-                writer.give_up(failed.number, failed.reason, failed.traceback)
-            if len(scheduler.given_up) >= HOPELESS and not scheduler.done:
-                raise self._failure(scheduler, writer)
-
-        if self.settings.machine.ray:
-            run_on_ray(self.settings, writer.location.address, scheduler, on_event)
-        elif self.settings.machine.workers:
-            run_in_processes(self.settings, writer.location.address, scheduler, on_event)
-        else:
-            run_here(self, writer, scheduler, on_event)
-        if scheduler.given_up:
+        total, done, given_up = len(self.plan.episodes), 0, list[Failed]()
+        with closing(play(self, writer, remaining)) as events:
+            for event in events:
+                if isinstance(event, Done):
+                    done += 1
+                    if progress:
+                        progress(total - len(remaining) + done, total, event.outcome["outcome"])
+                    continue
+                given_up.append(event)
+                writer.give_up(event.number, event.reason, event.traceback)
+                if len(given_up) >= HOPELESS and not done:
+                    raise _failure(writer, given_up, done)
+        if given_up:
             seal(writer.location)
-            raise self._failure(scheduler, writer)
+            raise _failure(writer, given_up, done)
 
-    def _failure(self, scheduler: Scheduler, writer: RunWriter[RowPlan]) -> EpisodesFailedError:
-        error = EpisodesFailedError(
-            f"{len(scheduler.given_up)} episodes failed twice and were given up; {len(scheduler.done)} others "
-            "were finished and are kept. The same command tries them again; --partial reads the run without them"
-        )
-        for number, failed in scheduler.given_up.items():
-            where = f" (traceback in {writer.location}/{failure_key(number)})" if failed.traceback else ""
-            error.add_note(f"{writer.plan.episode(number).episode_id}: {failed.reason}{where}")
-        return error
+
+def _failure(writer: RunWriter[RowPlan], given_up: list[Failed], done: int) -> EpisodesFailedError:
+    error = EpisodesFailedError(
+        f"{len(given_up)} episodes failed twice and were given up; {done} others were finished and are kept. The "
+        "same command tries them again; --partial reads the run without them"
+    )
+    for failed in given_up:
+        where = f" (traceback in {writer.location}/{failure_key(failed.number)})" if failed.traceback else ""
+        error.add_note(f"{writer.plan.episode(failed.number).episode_id}: {failed.reason}{where}")
+    return error
 
 
 def prepare(

@@ -17,8 +17,7 @@ from probe_kit.train.crossval.category_problem import POOLED, CategoryProblem, c
 from probe_kit.train.data.captured_call import restrict_to_call
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
 from probe_kit.train.data.samples import is_token_view, read_samples, sites_of
-from probe_kit.train.execution.dispatch import probe_columns
-from probe_kit.train.execution.executor import ExecutionSettings, Key, Probed
+from probe_kit.train.execution import ExecutionSettings, Key, Probed, probe_columns
 from probe_kit.train.labels.label_results import LabelResults
 from probe_kit.train.labels.label_sweep import train_label_probes
 from probe_kit.train.labels.labels import Labels

@@ -1,4 +1,4 @@
-"""Promises of the pool behind `extract --workers` and `train --jobs`."""
+"""Promises of the pool behind `extract --workers`, `train --jobs` and `study run --workers`."""
 
 import os
 import signal
@@ -7,40 +7,44 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from probe_kit._execution.process_pool import Ended, ProcessPool
+from probe_kit._execution.process_pool import ProcessPool
+from probe_kit._execution.worker import Idle, Lost, Work
 from probe_kit.errors import UsageError
-from tests.support.echo_service import DIE, FAIL, LEAVE
+from tests.support.echo_work import BREAK, DIE, FAIL
 
-SERVICE = "echo_service:serve"
 SETUP = b"x" * 1_000_000
 """More than a socket holds before it is read."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _importable() -> Iterator[None]:
-    """Children find the service by its name alone."""
+@pytest.fixture(scope="module")
+def echo() -> Iterator[Work]:
+    """The function under a name by which children find it too."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(Path(__file__).parents[1] / "support")
-        yield
+        yield import_module("echo_work").echo
 
 
 @pytest.fixture(scope="module")
-def shared(_importable: None) -> Iterator[ProcessPool]:
-    with ProcessPool(SERVICE, SETUP, 2, lambda slot: {"ECHO_SLOT": str(slot)}) as pool:
+def shared(echo: Work) -> Iterator[ProcessPool]:
+    exits = {-signal.SIGTERM: "was terminated"}
+    with ProcessPool(echo, SETUP, 2, lambda slot: {"ECHO_SLOT": str(slot)}, exits) as pool:
+        answers(pool, {0: 1, 1: 1})
         yield pool
 
 
-def answers(pool: ProcessPool, count: int) -> dict[int, Any]:
-    """The next message of `count` processes."""
-    found: dict[int, Any] = {}
-    while len(found) < count:
-        found |= dict(pool.receive())
-    return found
+def answers(pool: ProcessPool, counts: dict[int, int]) -> dict[int, list[Any]]:
+    """The next messages of each worker, as many as given."""
+    messages: dict[int, list[Any]] = {slot: [] for slot in counts}
+    while any(len(messages[slot]) < count for slot, count in counts.items()):
+        for slot, message in pool.receive():
+            messages[slot].append(message)
+    return messages
 
 
 def is_running(pid: int) -> bool:
@@ -50,47 +54,54 @@ def is_running(pid: int) -> bool:
     return False
 
 
-def test_each_process_gets_the_setup_and_its_own_environment(shared: ProcessPool) -> None:
+def test_each_worker_gets_the_setup_its_own_environment_and_task_after_task(shared: ProcessPool) -> None:
     for slot in (0, 1):
         shared.send(slot, f"to {slot}")
-    assert answers(shared, 2) == {slot: (SETUP, str(slot), f"to {slot}") for slot in (0, 1)}
+    assert answers(shared, {0: 2, 1: 2}) == {slot: [(SETUP, str(slot), f"to {slot}"), Idle()] for slot in (0, 1)}
 
 
-def test_an_error_of_a_process_is_raised_with_its_class_and_the_process_lives(shared: ProcessPool) -> None:
-    shared.send(1, FAIL)
-    with pytest.raises(UsageError, match="asked to fail"):
-        answers(shared, 1)
-    shared.send(1, "next")
-    assert answers(shared, 1) == {1: (SETUP, "1", "next")}
-
-
-@pytest.mark.parametrize(("how", "code"), [(DIE, -signal.SIGKILL), (LEAVE, 0)])
-def test_a_process_that_ends_is_named_with_its_code_and_can_be_started_again(
-    shared: ProcessPool, how: str, code: int
+@pytest.mark.parametrize(
+    ("task", "lost"),
+    [(DIE, Lost("worker 0", "ended with code -9")), (BREAK, Lost("worker 0", "ended with code 1"))],
+)
+def test_a_worker_that_ends_is_named_with_its_code_and_can_be_started_again(
+    shared: ProcessPool, task: str, lost: Lost
 ) -> None:
     before = shared.pid(0)
-    shared.send(0, how)
-    assert answers(shared, 1) == {0: Ended(code)}
-    shared.restart(0)
-    shared.send(0, "again")
-    assert answers(shared, 1) == {0: (SETUP, "0", "again")}
+    shared.send(0, task)
+    assert answers(shared, {0: 1}) == {0: [lost]}
+    shared.start(0)
+    assert answers(shared, {0: 1}) == {0: [Idle()]}
     assert shared.pid(0) != before
 
 
-def test_a_message_to_a_dead_process_is_no_error_before_it_is_received(shared: ProcessPool) -> None:
-    os.kill(shared.pid(0), signal.SIGKILL)
+def test_an_error_of_ours_is_a_message(shared: ProcessPool) -> None:
+    shared.send(1, FAIL)
+    (error, lost) = answers(shared, {1: 2})[1]
+    assert isinstance(error, UsageError)
+    assert str(error) == "asked to fail"
+    assert lost == Lost("worker 1", "ended with code 0")
+    shared.start(1)
+    answers(shared, {1: 1})
+
+
+def test_a_message_to_a_dead_worker_is_no_error_before_it_is_received(shared: ProcessPool) -> None:
+    os.kill(shared.pid(0), signal.SIGTERM)
     time.sleep(0.1)
     shared.send(0, "too late")
-    assert answers(shared, 1) == {0: Ended(-signal.SIGKILL)}
-    shared.restart(0)
+    assert answers(shared, {0: 1}) == {0: [Lost("worker 0", "was terminated")]}
+    shared.start(0)
+    answers(shared, {0: 1})
 
 
-def test_all_processes_end_with_the_pool_and_an_error_in_its_body_is_kept() -> None:
+def test_all_workers_end_with_the_pool_and_an_error_in_its_body_is_kept(echo: Work) -> None:
     pids: list[int] = []
 
     def use() -> None:
-        with ProcessPool(SERVICE, None, 2) as pool:
+        with ProcessPool(echo, None, 2) as pool:
             pids.extend(pool.pid(slot) for slot in (0, 1))
+            pool.stop(0)
+            assert pool.slots == {1}
             raise KeyError("body")
 
     with pytest.raises(KeyError, match="body"):
@@ -98,13 +109,14 @@ def test_all_processes_end_with_the_pool_and_an_error_in_its_body_is_kept() -> N
     assert not any(map(is_running, pids))
 
 
-def test_ctrl_c_reaches_the_parent_alone_and_ends_the_processes(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("echo")
+def test_ctrl_c_reaches_the_parent_alone_and_ends_the_workers(tmp_path: Path) -> None:
     """A terminal sends it to the whole group; the pool's processes are in sessions of their own."""
-    code = f"""
+    code = """
 from probe_kit._execution.process_pool import ProcessPool
-with ProcessPool({SERVICE!r}, None, 1) as pool:
+from echo_work import echo
+with ProcessPool(echo, None, 1) as pool:
     print(pool.pid(0), flush=True)
-    pool.send(0, "up")
     print(list(pool.receive()), flush=True)
     list(pool.receive())
 """
@@ -114,7 +126,7 @@ with ProcessPool({SERVICE!r}, None, 1) as pool:
     )  # fmt: skip
     assert driver.stdout is not None
     pid = int(driver.stdout.readline())
-    assert "up" in driver.stdout.readline()
+    assert "Idle" in driver.stdout.readline()
     assert os.getpgid(pid) != os.getpgid(driver.pid)
     os.killpg(driver.pid, signal.SIGINT)
     _, errors = driver.communicate(timeout=60)

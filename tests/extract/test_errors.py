@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from probe_kit._execution.ray_pool import RayWorker
 from probe_kit.env import SceneSpec
 from probe_kit.errors import (
     CaptureChangedActionError,
@@ -23,7 +24,7 @@ from probe_kit.errors import (
 from probe_kit.extract import Extraction, ExtractSettings, extract_run, prepare
 from probe_kit.extract.rollout.stage import LocalStage
 from probe_kit.extract.rollout.stage_process import ProcessStage
-from probe_kit.extract.workers.ray import RayActor
+from probe_kit.extract.workers import play_episodes
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import open_run
@@ -87,10 +88,12 @@ def test_a_worker_process_hands_its_error_on(suite: Suite, tmp_path: Path) -> No
         extraction.run(tmp_path / "run")
 
 
-def test_a_ray_actor_answers_with_its_error_instead_of_dying(suite: Suite, tmp_path: Path) -> None:
+def test_a_worker_on_a_cluster_answers_with_its_error_instead_of_dying(suite: Suite, tmp_path: Path) -> None:
     """Raised, it would come back as one of Ray's, or as that of a dead actor, and cost episodes."""
     extraction = spoiled_after_planning(suite, tmp_path)
-    answer = RayActor(extraction.settings, str(tmp_path / "run")).begin()
+    actor = RayWorker((play_episodes, (extraction.settings, str(tmp_path / "run"))))
+    actor.work()
+    answer = actor._reports.get()
     assert isinstance(answer, SuiteError)
     assert "changed" in str(answer)
 

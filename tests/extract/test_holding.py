@@ -1,17 +1,14 @@
 """Every writer of a run holds a lock, the owner and each worker, so that no process clears its files."""
 
 import fcntl
-from multiprocessing import Pipe
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, extract_run, prepare
-from probe_kit.extract.workers.processes import MORE, serve
-from probe_kit.extract.workers.ray import RayActor
+from probe_kit.extract.workers import play_episodes
 from probe_kit.runs.folder import Folder
 from probe_kit.runs.layout import RUN_FILE
 from probe_kit.suite import Suite
@@ -66,40 +63,17 @@ def test_an_extraction_in_one_process_holds_its_run(
 
 def test_a_worker_holds_the_run_itself(settings: ExtractSettings, tmp_path: Path, unheld: list[str]) -> None:
     address = begun(settings, tmp_path / "run")
-    ours, theirs = Pipe()
-    worker = Thread(target=_serve, args=(theirs,), daemon=True)
-    worker.start()
-    ours.send((settings, address))
-    numbers = iter(EPISODES)
-    done: list[int] = []
-    while len(done) < len(EPISODES):
-        message = ours.recv()
-        if message == MORE:
-            ours.send(next(numbers, None))
-        else:
-            done.append(message.number)
-    ours.close()
-    worker.join()
+    left, done = list(EPISODES), list[int]()
+
+    def take() -> int | None:
+        if len(done) == len(EPISODES):
+            raise EOFError  # the executor hung up
+        return left.pop(0) if left else None
+
+    with pytest.raises(EOFError):
+        play_episodes((settings, address), take, lambda event: done.append(event.number))
     assert done == EPISODES
     assert (tmp_path / "run" / "certificate.json").is_file()
-    assert unheld == []
-
-
-def _serve(connection: Any) -> None:
-    try:
-        serve(connection)
-    except (EOFError, OSError):
-        return  # the driver hung up, which ends the process
-
-
-def test_an_actor_on_a_cluster_holds_the_run_itself(
-    settings: ExtractSettings, tmp_path: Path, unheld: list[str]
-) -> None:
-    actor = RayActor(settings, begun(settings, tmp_path / "run"))
-    assert actor.begin() is None
-    assert isinstance(played := actor.play(EPISODES), list)
-    assert [event.number for event in played] == EPISODES
-    actor._opened.close()
     assert unheld == []
 
 

@@ -26,9 +26,9 @@ class TwoNodes:
         name: str = self.second.node_id
         return name
 
-    def is_playing(self, what: str = "RayActor.play") -> bool:
-        """Whether an actor or task of ours plays on the second node. Ray puts its name into the process title."""
-        return any(what in " ".join(process.cmdline()) for process in self._tree()[1:])
+    def is_playing(self) -> bool:
+        """Whether an actor of ours is on the second node. Ray puts its name into the process title."""
+        return any("RayWorker" in " ".join(process.cmdline()) for process in self._tree()[1:])
 
     def lose_the_second(self) -> None:
         """SIGKILL for its raylet and everything that runs under it, the simulators of its actor included."""

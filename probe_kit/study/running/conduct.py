@@ -14,18 +14,8 @@ from probe_kit.runs.store import locate
 from probe_kit.study.ledger import NOT_TRIED_AGAIN, Failure, Ledger
 from probe_kit.study.planning.cost import units
 from probe_kit.study.planning.plan import PlannedCell, StudyPlan, cells_by_model, given_up
-from probe_kit.study.running.model_task import (
-    STOPS_ALL,
-    Event,
-    Made,
-    ModelTask,
-    Report,
-    RunTask,
-    play_model,
-    played_by,
-)
-from probe_kit.study.running.processes import play_in_processes
-from probe_kit.study.running.ray import play_on_ray
+from probe_kit.study.running.model_task import STOPS_ALL, Event, Made, ModelTask, Report, RunTask, played_by
+from probe_kit.study.running.playing import play_models
 
 
 def conduct_study(
@@ -57,13 +47,8 @@ def conduct_study(
     with course.ledger.opened():
         pass  # a place that cannot be written is no model's failure
     tasks = list(course.checked(missing))
-    if tasks and ray is not None:
-        play_on_ray(tasks, ray, course.note)
-    elif tasks and slots:
-        play_in_processes(tasks, slots, course.note)
-    else:
-        for task in tasks:
-            play_model(task, course.note)
+    if tasks:
+        play_models(tasks, course.note, slots, ray)
     course.note_found()
     return course.failures
 

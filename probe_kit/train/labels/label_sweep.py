@@ -14,8 +14,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.statistics.folds import sums_by_group
 from probe_kit.train.data.run_reader import RunReader, check_several_wordings, seed_text_of
 from probe_kit.train.data.samples import Samples, is_token_view, sites_of
-from probe_kit.train.execution.dispatch import probe_columns
-from probe_kit.train.execution.executor import Columns, ExecutionSettings, Problems
+from probe_kit.train.execution import Columns, ExecutionSettings, Problems, probe_columns
 from probe_kit.train.labels.controls.label_controls import add_label_controls, prepare_controls
 from probe_kit.train.labels.controls.untrained import add_untrained_control, same_frames
 from probe_kit.train.labels.label_probe import LabelProbe

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 import torch
 
+from probe_kit._execution.executor import WorkerLostWarning
 from probe_kit._terminal.plain_text import UNSAFE
 from probe_kit.env import SceneSpec
 from probe_kit.errors import CaptureChangedActionError, EpisodesFailedError, PolicyFailedError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run
-from probe_kit.extract.workers.worker_errors import WorkerLostWarning
 from probe_kit.hooks import Observation
 from probe_kit.hooks.checkpoints.containment import contained
 from probe_kit.hooks.checkpoints.third_party import while_acting
@@ -315,7 +315,9 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     about.mkdir(parents=True)
     (folder / "their_policy.py").write_text(HANGING, encoding="utf-8")
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: their-policy\nVersion: 1.0\n", encoding="utf-8")
-    (about / "entry_points.txt").write_text("[probe_kit.policies]\nx = their_policy:FAMILY\n", encoding="utf-8")
+    (about / "entry_points.txt").write_text(
+        "[probe_kit.policies]\ntheirs = their_policy:FAMILY\n", encoding="utf-8"
+    )
     monkeypatch.syspath_prepend(folder)
     return "theirs"
 

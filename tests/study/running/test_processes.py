@@ -1,15 +1,16 @@
 """Playing in processes: the numbers of this process, also if processes are killed."""
 
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import psutil
 import pytest
 
+from probe_kit._execution.executor import WorkerLostWarning
 from probe_kit.errors import WorkerDiedError
-from probe_kit.extract.workers.worker_errors import WorkerLostWarning
 from probe_kit.study import Moved, conduct_study, load_study, plan_study
-from probe_kit.study.running import processes
+from probe_kit.study.running import playing
 from probe_kit.suite import Suite
 from tests.study.running.small_study import EPISODES, bytes_of, small_study
 
@@ -47,7 +48,9 @@ def test_a_killed_process_is_replaced_and_nothing_changes(
             killed.append(victims[0])
             psutil.Process(victims[0]).kill()
 
-    with pytest.warns(WorkerLostWarning, match="ended with code -9; what it had not stored is played again"):
+    with pytest.warns(
+        WorkerLostWarning, match=r"ended with code -9; the model it held \(.*\) will be tried again"
+    ):
         assert conduct_study(plan_study(load_study(file)), kill_one, slots=2) == []
     assert killed
     assert bytes_of(file) == bytes_of(played_here)
@@ -64,11 +67,11 @@ def test_a_model_whose_process_always_dies_fails_and_the_others_are_played(
 ) -> None:
     """Its processes are ended from outside as soon as they have its model; the other one finds what it needs."""
     file = small_study(tmp_path, small_suite)
-    monkeypatch.setattr(processes, "_SERVICE", "deadly_service:serve")
+    monkeypatch.setattr(playing, "play_here", import_module("deadly_work").play_but_the_first)
     with pytest.warns(WorkerLostWarning):
         (failure,) = conduct_study(plan_study(load_study(file)), slots=2)
     assert (failure.model, failure.stage, failure.error) == ("first", "playing", "WorkerDiedError")
-    assert "its process ended with code 7, 3 times" in failure.reason
+    assert "ended with code 7, 3 times without an episode in between" in failure.reason
     states = {one.cell.name: one.state for one in plan_study(load_study(file)).cells}
     assert states == {
         "first/still": "failed",
@@ -82,12 +85,15 @@ def test_a_model_whose_process_always_dies_fails_and_the_others_are_played(
 def test_processes_that_die_before_they_begin_end_the_study(
     small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes, "_SERVICE", "deadly_service:stillborn")
-    with pytest.raises(WorkerDiedError, match="3 processes ended with code 7 before they began"):
+    monkeypatch.setattr(playing, "play_here", import_module("deadly_work").stillborn)
+    with (
+        pytest.warns(WorkerLostWarning),
+        pytest.raises(WorkerDiedError, match=r"3 workers in a row ended before their first task.*code 7"),
+    ):
         conduct_study(plan_study(load_study(small_study(tmp_path, small_suite))), slots=1)
 
 
 def _players() -> Iterator[psutil.Process]:
     for child in psutil.Process().children(recursive=True):
-        if processes._SERVICE in " ".join(child.cmdline()):
+        if "probe_kit._execution.worker:serve" in " ".join(child.cmdline()):
             yield child

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from probe_kit._execution.executor import WorkerLostWarning
 from probe_kit._system.installing import install_command
 from probe_kit.errors import MissingExtraError
-from probe_kit.extract.workers.worker_errors import WorkerLostWarning
 from probe_kit.runs.layout import COMMITS
 from probe_kit.study import conduct_study, load_study, plan_study
 from probe_kit.suite import Suite
@@ -34,13 +34,13 @@ def test_two_nodes_of_which_one_is_lost_give_the_numbers_of_this_process(
     assert conduct_study(plan_study(load_study(here))) == []
 
     def lose(nodes: TwoNodes) -> int:
-        wait_for(lambda: nodes.is_playing("play_there") and _committed(there))
+        wait_for(lambda: nodes.is_playing() and _committed(there))
         nodes.lose_the_second()
         return _committed(there)
 
     with two_nodes() as nodes, ThreadPoolExecutor(1) as thread:
         kept = thread.submit(lose, nodes)
-        with pytest.warns(WorkerLostWarning, match=r"of the Ray cluster that played \w+ is lost"):
+        with pytest.warns(WorkerLostWarning, match=r"of the Ray cluster is lost: .*; the model it held"):
             assert conduct_study(plan_study(load_study(there)), ray=nodes.address) == []
     assert 0 < kept.result() < 4 * 24
     assert bytes_of(there) == bytes_of(here)

@@ -1,15 +1,17 @@
-import os
 import re
-import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from types import SimpleNamespace
+from importlib import import_module
+from itertools import islice
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from probe_kit._execution.executor import WorkerLostWarning
 from probe_kit._system.installing import install_command
 from probe_kit.errors import MissingExtraError, TooFewGroupsError, UsageError, WorkerDiedError
 from probe_kit.hooks import Site
@@ -17,10 +19,7 @@ from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.crossval.category_problem import CategoryProblem
 from probe_kit.train.crossval.site_probe import nested_folds
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.execution.dispatch import probe_columns
-from probe_kit.train.execution.executor import ExecutionSettings, Key, Probed
-from probe_kit.train.execution.processes import ProcessExecutor
-from probe_kit.train.execution.ray import RayExecutor
+from probe_kit.train.execution import ExecutionSettings, Key, Probed, probe_columns
 
 ITEMS = np.repeat(np.arange(10), 2)
 LABELS = np.tile([True, False], 10)
@@ -64,17 +63,27 @@ def test_what_a_process_raises_keeps_its_class() -> None:
         list(probe_columns(columns([]), {"color": of_one_class}, ExecutionSettings(jobs=2)))
 
 
-def test_a_process_that_dies_is_named_with_a_way_out() -> None:
-    executor = ProcessExecutor({"color": PROBLEM}, 1)
+@pytest.fixture
+def deadly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Any]:
+    """A problem whose first fits kill their process, by their number."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "support")
+    kind = import_module("deadly_work").DeadlyProblem
+    return lambda kills: kind(PROBLEM, tmp_path, kills)
 
-    def probe() -> None:
-        executor.submit(*next(columns([])))
-        list(executor.finished())
 
-    with executor:
-        os.kill(executor.pool.pid(0), signal.SIGKILL)
-        with pytest.raises(WorkerDiedError, match=r"code -9.*fewer --jobs"):
-            probe()
+def test_a_column_whose_process_is_killed_is_fitted_by_another(deadly: Any) -> None:
+    held = (
+        r"worker \d ended with code -9; the column it held \(backbone\.\d\d\.residual mean\) will be tried again"
+    )
+    with pytest.warns(WorkerLostWarning, match=held):
+        together = dict(probe_columns(columns([]), {"color": deadly(1)}, ExecutionSettings(jobs=2)))
+    assert_same_numbers(columns_of(ExecutionSettings()), together)
+
+
+@pytest.mark.filterwarnings("ignore::probe_kit._execution.executor.WorkerLostWarning")
+def test_a_column_that_kills_two_processes_is_named_with_a_way_out(deadly: Any) -> None:
+    with pytest.raises(WorkerDiedError, match=r"column backbone\.00\.residual mean .*code -9.*fewer --jobs"):
+        list(probe_columns(islice(columns([]), 1), {"color": deadly(2)}, ExecutionSettings(jobs=2)))
 
 
 def test_an_address_without_a_cluster_is_a_wrong_usage() -> None:
@@ -96,38 +105,9 @@ def test_without_ray_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) 
         columns_of(ExecutionSettings(ray="auto"))
 
 
-LOST = ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "ObjectLostError")
-
-
-@pytest.mark.parametrize("name", LOST)
-def test_a_task_that_ray_repeated_in_vain_says_how_to_go_on(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    class LostError(Exception):
-        """As Ray raises it."""
-
-    class OtherError(Exception):
-        """Another one."""
-
-    def get(_task: str) -> None:
-        raise LostError("its node is gone")
-
-    kinds = dict.fromkeys(
-        ("WorkerCrashedError", "OutOfMemoryError", "NodeDiedError", "ObjectLostError"), OtherError
-    )
-
-    def wait(tasks: list[str], num_returns: int) -> tuple[list[str], list[str]]:
-        return tasks[:num_returns], tasks[num_returns:]
-
-    executor = RayExecutor({}, "auto")
-    there = SimpleNamespace(get=get, wait=wait, exceptions=SimpleNamespace(**{**kinds, name: LostError}))
-    monkeypatch.setattr(executor, "_ray", there, raising=False)
-    monkeypatch.setattr(executor, "_tasks", {"a task": ("mean", Site("backbone", 0))})
-    with pytest.raises(WorkerDiedError, match=r"its node is gone\. The same command continues"):
-        list(executor.finished())
-
-
 def test_ray_is_imported_for_ray_only() -> None:
     code = (
-        "import sys, probe_kit.train.execution.dispatch; "
+        "import sys, probe_kit.train.execution; "
         "print([m for m in ('ray', 'torch', 'pybullet') if m in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8").stdout == "[]\n"

@@ -1,0 +1,189 @@
+"""The executor: hands tasks to workers, and tries again what a lost worker held."""
+
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
+
+from probe_kit._execution.worker import Idle, Lost
+from probe_kit.errors import ProbeKitError, UsageError, WorkerDiedError
+
+MOST_STILLBORN = 3
+"""So many workers in a row that die before their first task are no accident of one of them."""
+_NAMED_TASKS = 3
+"""Of the tasks of a lost worker, the warning names so many."""
+
+
+class WorkerLostWarning(UserWarning):
+    """A worker died in mid-run; what it had not finished is tried again. No number changes."""
+
+
+class Pool(Protocol):
+    """Workers, here or elsewhere; see `ProcessPool` and `RayPool`."""
+
+    def __enter__(self) -> Self: ...
+    def __exit__(self, *_: object) -> None: ...
+    @property
+    def slots(self) -> set[int]:
+        """The numbers of the workers."""
+
+    def start(self, slot: int) -> None:
+        """Start a worker again."""
+
+    def stop(self, slot: int) -> None:
+        """End an idle worker."""
+
+    def send(self, slot: int, message: object) -> None:
+        """Send a task."""
+
+    def receive(self) -> Iterator[tuple[int, Any]]:
+        """Wait for messages of workers."""
+
+
+@dataclass(frozen=True)
+class GivenUp[T]:
+    """The event of a task that was lost with its worker once too often."""
+
+    task: T
+    reason: str
+
+
+class TaskQueue[T]:
+    """Tasks for workers, handed out in order.
+
+    A task that failed, or was in the hands of a worker that died, is suspect: it is tried again when all others
+    are handed out, by a worker that holds nothing else, so that it can take no other task down with it.
+
+    tasks: by key, read one ahead. noun: a word for one of them. tries: failures after which it is given up.
+    fits: whether a worker can do a task; all tasks are then read at once.
+    """
+
+    def __init__(
+        self, tasks: Iterable[tuple[Hashable, T]], noun: str, tries: int = 2,
+        fits: Callable[[int, T], bool] | None = None,
+    ) -> None:  # fmt: skip
+        self.noun = noun
+        self._unread, self._tries, self._fits = iter(tasks), tries, fits
+        self._fresh: dict[Hashable, T] = {} if fits is None else dict(self._unread)
+        self._suspects: dict[Hashable, T] = {}
+        self._held: dict[int, dict[Hashable, T]] = defaultdict(dict)
+        self._failures: Counter[Hashable] = Counter()
+        self._read = False
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to do or in the hands of a worker."""
+        self.read_ahead()
+        return not (self._fresh or self._suspects or any(self._held.values()))
+
+    def read_ahead(self) -> None:
+        """Read the next task, so that it is ready when a worker asks for it."""
+        if not self._fresh and not self._read:
+            self._fresh = dict([task]) if (task := next(self._unread, None)) else {}
+            self._read = not self._fresh
+
+    def take(self, slot: int) -> T | None:
+        """Return the next task for a worker; None if it should finish what it holds, or wait."""
+        held = self._held[slot]
+        if any(key in self._failures for key in held):
+            return None
+        self.read_ahead()
+        for waiting in (self._fresh, {} if held else self._suspects):
+            for key, task in waiting.items():
+                if self._fits is None or self._fits(slot, task):
+                    held[key] = waiting.pop(key)
+                    return task
+        return None
+
+    def holds(self, slot: int) -> dict[Hashable, T]:
+        """Return the tasks in the hands of a worker."""
+        return dict(self._held[slot])
+
+    def end(self, slot: int, key: Hashable) -> None:
+        """Note that a worker is done with a task."""
+        self._held[slot].pop(key, None)
+
+    def replace(self, slot: int, key: Hashable, task: T) -> None:
+        """Replace a task in the hands of a worker by what is left of it."""
+        if key in self._held[slot]:
+            self._held[slot][key] = task
+
+    def advanced(self, key: Hashable) -> None:
+        """Note that a task moves on: its failures so far count no longer."""
+        self._failures.pop(key, None)
+
+    def retry(self, slot: int, key: Hashable, counts: bool = True) -> bool:
+        """Take a task that failed back from a worker. Returns whether it is tried again.
+
+        counts: False for a failure that is no sign against the task.
+        """
+        task = self._held[slot].pop(key)
+        self._failures[key] += counts
+        if self._failures[key] < self._tries:
+            self._suspects[key] = task
+            return True
+        return False
+
+
+def work_off[T](pool: Pool, queue: TaskQueue[T]) -> Iterator[tuple[int, Any]]:
+    """Let the workers of a pool do all tasks of a queue; yields number of worker and event, as they come.
+
+    The caller ends every task in the queue, and retries what fails. A worker that dies is replaced, with a
+    warning; a task that is lost once too often is the event `GivenUp`. A worker without further tasks is stopped.
+    Raises the ProbeKitError that a worker sends, and WorkerDiedError if workers die before their first task.
+    """
+    if queue.finished:
+        return
+    idle, begun, stillborn = set[int](), set[int](), 0
+    with pool:
+        while not queue.finished:
+            _hand_out(pool, queue, idle)
+            queue.read_ahead()
+            for slot, message in pool.receive():
+                if isinstance(message, ProbeKitError):
+                    raise message
+                if isinstance(message, Idle):
+                    idle.add(slot)
+                    begun.add(slot)
+                    stillborn = 0
+                elif isinstance(message, Lost):
+                    stillborn += slot not in begun and message.counts
+                    if stillborn >= MOST_STILLBORN:
+                        raise WorkerDiedError(_died_early(message))
+                    idle.discard(slot)
+                    begun.discard(slot)
+                    pool.start(slot)
+                    yield from ((slot, given_up) for given_up in _take_back(queue, slot, message))
+                else:
+                    yield slot, message
+
+
+def _hand_out(pool: Pool, queue: TaskQueue[Any], idle: set[int]) -> None:
+    for slot in sorted(idle):
+        task = queue.take(slot)
+        idle.discard(slot)
+        if task is not None or queue.holds(slot):
+            pool.send(slot, task)
+        else:
+            pool.stop(slot)
+    if not pool.slots:
+        raise UsageError(f"no worker can take a {queue.noun} that is left: none of them has what it needs")
+
+
+def _take_back[T](queue: TaskQueue[T], slot: int, lost: Lost) -> Iterator[GivenUp[T]]:
+    held = queue.holds(slot)
+    names = [*map(str, held)][:_NAMED_TASKS] + ["…"] * (len(held) > _NAMED_TASKS)
+    count = f"{len(held)} {queue.noun}s" if len(held) > 1 else f"the {queue.noun}"
+    again = f"{count} it held ({', '.join(names)}) will be tried again" if held else f"it held no {queue.noun}"
+    warnings.warn(f"{lost}; {again}", WorkerLostWarning, stacklevel=3)
+    for key, task in held.items():
+        if not queue.retry(slot, key, lost.counts):
+            yield GivenUp(task, str(lost))
+
+
+def _died_early(lost: Lost) -> str:
+    return (
+        f"{MOST_STILLBORN} workers in a row ended before their first task; the last one: {lost}. Their last words "
+        "are above. Fewer workers take less memory; without workers the error shows in this process"
+    )

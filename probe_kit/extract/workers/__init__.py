@@ -1,1 +1,0 @@
-"""Scheduling of episodes on workers: this process, several processes, or actors on a Ray cluster."""
