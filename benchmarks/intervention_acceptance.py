@@ -34,7 +34,7 @@ from probe_kit.intervene import (
     Steering,
     run_intervention,
 )
-from probe_kit.intervene.replay.conditions import Intervention
+from probe_kit.intervene.kinds.base import Intervention
 from probe_kit.runs import Run
 from probe_kit.suite import Suite, build_suite
 

@@ -22,12 +22,13 @@ from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Policy, load_policy
 from probe_kit.intervene import ConditionOutcomes, ImageSwap, Interchange, ReplaySession, ReplaySource
-from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
-from probe_kit.intervene.kinds.image_swap.verdict import classify_behaviour
-from probe_kit.intervene.kinds.site_effects import patch_effects
-from probe_kit.intervene.replay.conditions import ReplayBatch, replay
-from probe_kit.intervene.replay.session import ReplayInput, open_session
+from probe_kit.intervene.kinds.image_swap import image_swap_effects
+from probe_kit.intervene.kinds.site_maps import patch_effects
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.replay import ReplayBatch, replay
+from probe_kit.intervene.results.verdict import classify_behaviour
 from probe_kit.intervene.runner import outcomes_of
+from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.runs import Run
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite import Suite, build_suite
@@ -91,7 +92,7 @@ class Frames:
 
     run: Run
     bench: ReplaySession
-    questions: Sequence[ReplayInput]
+    questions: Sequence[Pair]
 
     def answers(self, policy: Policy, asked: ImageSwap | Interchange, file: Path) -> ConditionOutcomes:
         """The outcomes of one policy; loaded from `file` if it exists."""
@@ -159,7 +160,7 @@ def main() -> None:
     run = run_of(arguments.folder, suite, arguments.model)
     with open_session(run, ReplaySource(suite.folder)) as bench, bench.ready():
         items = dict.fromkeys(run.episodes["item_id"].astype(str))
-        questions = [replace(one, stored=None) for item in items for one in bench.replay_inputs(item)]
+        questions = [replace(one, stored=None) for item in items for one in bench.pairs(item)]
         frames = Frames(run, bench, questions)
         networks = range(arguments.networks)
         measure(frames, arguments.model, arguments.folder, networks, arguments.inside, arguments.shuffles)

@@ -40,11 +40,11 @@ def command_markdown(path: str) -> str:
 
 def kinds_markdown() -> str:
     """What every kind of intervention does, and what the options mean to it."""
-    from probe_kit.intervene.kinds.registry import KINDS
+    from probe_kit.intervene.kinds import every_kind
 
     rows = []
-    for kind in KINDS.values():
-        rows.append(f"| `{kind.name}` | | {_text(kind.summary)} |")
+    for kind in every_kind():
+        rows.append(f"| `{kind.kind}` | | {_text(kind.summary)} |")
         rows += [
             f"| | `--{name.replace('_', '-')}` | {_text(meaning)} |" for name, meaning in kind.options.items()
         ]

@@ -29,8 +29,7 @@ from probe_kit.extract.source_commands.dataset_commands import app as dataset_ap
 from probe_kit.extract.source_commands.environment_commands import check_environment
 from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.intervene.commands import KindHelp, intervene
-from probe_kit.intervene.list_command import list_runs
-from probe_kit.intervene.show_command import show
+from probe_kit.intervene.run_commands import list_runs, show
 from probe_kit.retention.commands import retention
 from probe_kit.study.commands import app as study_app
 from probe_kit.suite.commands import app as suite_app

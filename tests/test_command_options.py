@@ -24,7 +24,7 @@ from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
 from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.hooks.contract.protocol import ROTATIONS, ProtocolName
 from probe_kit.hooks.family import Dtype
-from probe_kit.intervene.kinds.registry import KINDS
+from probe_kit.intervene.kinds import kind_names
 from probe_kit.retention.behaviour.vlm_answers import SCORES
 from probe_kit.retention.choices import AnswerScore, Family, Section, TableFormat
 from probe_kit.runs.export.export import FORMATS
@@ -81,7 +81,7 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("train", "--folds"): FOLD_UNITS,
     ("train", "--incomplete"): INCOMPLETE,
     ("train", "--controls"): BASELINES | LABEL_CONTROLS,
-    ("intervene", "--kind"): KINDS,
+    ("intervene", "--kind"): kind_names(),
     ("intervene", "--readout"): get_args(Readout),
     ("intervene", "--format"): get_args(get_args(Format)[0]),
     ("run export", "--dtype"): get_args(SaeDtype),

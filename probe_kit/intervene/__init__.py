@@ -8,35 +8,27 @@ from typing import TYPE_CHECKING
 from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.intervene.kinds.attention.attention_mass import AttentionRow, AttentionShares, stored_attention
-    from probe_kit.intervene.kinds.attention.intervention import AttentionReadout
-    from probe_kit.intervene.kinds.attribution.effects import AttributionEffect
-    from probe_kit.intervene.kinds.attribution.intervention import AttributionPatching
-    from probe_kit.intervene.kinds.closed_loop.effects import ClosedLoopEffect
-    from probe_kit.intervene.kinds.closed_loop.intervention import ClosedLoop
-    from probe_kit.intervene.kinds.erase import ConceptErasure, ErasureEffect
-    from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, stored_image_swaps
-    from probe_kit.intervene.kinds.image_swap.intervention import ImageSwap
-    from probe_kit.intervene.kinds.image_swap.verdict import (
-        Behaviour,
-        Places,
-        UseVerdict,
-        classify_all,
-        classify_use,
+    from probe_kit.intervene.kinds.attention import (
+        AttentionReadout,
+        AttentionRow,
+        AttentionShares,
+        stored_attention,
     )
-    from probe_kit.intervene.kinds.instruction_swap.effects import InputSensitivity, InstructionSwapEffect
-    from probe_kit.intervene.kinds.instruction_swap.intervention import InstructionSwap
-    from probe_kit.intervene.kinds.interchange.intervention import Interchange
-    from probe_kit.intervene.kinds.joint.effects import JointEffect, stored_joint_places
-    from probe_kit.intervene.kinds.joint.intervention import JointPlaces
-    from probe_kit.intervene.kinds.site_effects import PatchEffect
-    from probe_kit.intervene.kinds.steer.intervention import Steering
-    from probe_kit.intervene.replay.session import ReplaySession, ReplaySource
-    from probe_kit.intervene.results.best_targets import best_patch_targets
+    from probe_kit.intervene.kinds.attribution import AttributionPatching
+    from probe_kit.intervene.kinds.closed_loop import ClosedLoop, ClosedLoopEffect
+    from probe_kit.intervene.kinds.erase import ConceptErasure, ErasureEffect
+    from probe_kit.intervene.kinds.image_swap import ImageSwap, ImageSwapEffect, stored_image_swaps
+    from probe_kit.intervene.kinds.instruction_swap import InputSensitivity, InstructionSwap, InstructionSwapEffect
+    from probe_kit.intervene.kinds.interchange import Interchange
+    from probe_kit.intervene.kinds.joint import JointEffect, JointPlaces, stored_joint_places
+    from probe_kit.intervene.kinds.site_maps import PatchEffect, best_patch_targets, stored_site_effects
+    from probe_kit.intervene.kinds.steer import Steering
+    from probe_kit.intervene.outcomes import ConditionOutcomes, stored_interventions
+    from probe_kit.intervene.patching.attribution import AttributionEffect
     from probe_kit.intervene.results.results import InterventionResult, load_effects
-    from probe_kit.intervene.results.site_maps import stored_site_effects
+    from probe_kit.intervene.results.verdict import Behaviour, Places, UseVerdict, classify_all, classify_use
     from probe_kit.intervene.runner import run_intervention
-    from probe_kit.intervene.store.answers import ConditionOutcomes, stored_interventions
+    from probe_kit.intervene.sessions.session import ReplaySession, ReplaySource
 
 __all__ = [
     "AttentionReadout",
@@ -81,41 +73,41 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "InputSensitivity": "kinds.instruction_swap.effects",
-        "InstructionSwapEffect": "kinds.instruction_swap.effects",
-        "InstructionSwap": "kinds.instruction_swap.intervention",
-        "stored_site_effects": "results.site_maps",
-        "PatchEffect": "kinds.site_effects",
-        "Steering": "kinds.steer.intervention",
-        "AttributionEffect": "kinds.attribution.effects",
-        "AttributionPatching": "kinds.attribution.intervention",
-        "Interchange": "kinds.interchange.intervention",
-        "ConditionOutcomes": "store.answers",
-        "AttentionRow": "kinds.attention.attention_mass",
-        "AttentionReadout": "kinds.attention.intervention",
-        "AttentionShares": "kinds.attention.attention_mass",
-        "stored_attention": "kinds.attention.attention_mass",
-        "ReplaySession": "replay.session",
-        "ClosedLoopEffect": "kinds.closed_loop.effects",
-        "ClosedLoop": "kinds.closed_loop.intervention",
-        "best_patch_targets": "results.best_targets",
+        "InputSensitivity": "kinds.instruction_swap",
+        "InstructionSwapEffect": "kinds.instruction_swap",
+        "InstructionSwap": "kinds.instruction_swap",
+        "stored_site_effects": "kinds.site_maps",
+        "PatchEffect": "kinds.interchange",
+        "Steering": "kinds.steer",
+        "AttributionEffect": "patching.attribution",
+        "AttributionPatching": "kinds.attribution",
+        "Interchange": "kinds.interchange",
+        "ConditionOutcomes": "outcomes",
+        "AttentionRow": "kinds.attention",
+        "AttentionReadout": "kinds.attention",
+        "AttentionShares": "kinds.attention",
+        "stored_attention": "kinds.attention",
+        "ReplaySession": "sessions.session",
+        "ClosedLoopEffect": "kinds.closed_loop",
+        "ClosedLoop": "kinds.closed_loop",
+        "best_patch_targets": "kinds.site_maps",
         "InterventionResult": "results.results",
         "ConceptErasure": "kinds.erase",
         "ErasureEffect": "kinds.erase",
-        "ImageSwap": "kinds.image_swap.intervention",
-        "ImageSwapEffect": "kinds.image_swap.effects",
-        "UseVerdict": "kinds.image_swap.verdict",
-        "ReplaySource": "replay.session",
-        "Behaviour": "kinds.image_swap.verdict",
-        "JointEffect": "kinds.joint.effects",
-        "JointPlaces": "kinds.joint.intervention",
-        "Places": "kinds.image_swap.verdict",
-        "stored_joint_places": "kinds.joint.effects",
+        "ImageSwap": "kinds.image_swap",
+        "ImageSwapEffect": "kinds.image_swap",
+        "UseVerdict": "results.verdict",
+        "ReplaySource": "sessions.session",
+        "Behaviour": "results.verdict",
+        "JointEffect": "kinds.joint",
+        "JointPlaces": "kinds.joint",
+        "Places": "results.verdict",
+        "stored_joint_places": "kinds.joint",
         "run_intervention": "runner",
-        "classify_use": "kinds.image_swap.verdict",
-        "classify_all": "kinds.image_swap.verdict",
+        "classify_use": "results.verdict",
+        "classify_all": "results.verdict",
         "load_effects": "results.results",
-        "stored_image_swaps": "kinds.image_swap.effects",
-        "stored_interventions": "store.answers",
+        "stored_image_swaps": "kinds.image_swap",
+        "stored_interventions": "outcomes",
     },
 )

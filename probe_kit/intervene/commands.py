@@ -1,7 +1,9 @@
-"""`probe-kit intervene`."""
+"""`probe-kit intervene`. The meaning of an option to a kind is in the kind's file."""
 
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -9,16 +11,112 @@ from rich.panel import Panel
 from rich.text import Text
 
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import counter, marked, out, print_json_text, print_text, progress, say
+from probe_kit._terminal.console import counter, marked, out, print_json_text, print_text, progress, say, split
+from probe_kit._terminal.options import LISTED, Names, choices, further_option, one_of
 from probe_kit._terminal.panelled_help import PanelledHelp
-from probe_kit.intervene import command_options as own
-from probe_kit.intervene.kinds.registry import KINDS, intervention_of
+from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.interventions import Readout
+from probe_kit.intervene.kinds import every_kind, kind_names, kind_of
 
 if TYPE_CHECKING:
-    from probe_kit.intervene.replay.conditions import Intervention
-    from probe_kit.intervene.replay.session import ReplaySource
+    from probe_kit.intervene.kinds.base import Intervention
     from probe_kit.intervene.results.results import InterventionResult
+    from probe_kit.intervene.sessions.session import ReplaySource
     from probe_kit.runs import Run
+
+
+_inside_option = partial(typer.Option, rich_help_panel="Inside the network")
+
+
+class Numbers(tuple[float, ...]):
+    """Comma-separated numbers."""
+
+    __slots__ = ()
+
+    @classmethod
+    def parse(cls, text: "str | Numbers") -> "Numbers":
+        """The numbers of `text`; a default that is no text is returned as it is. Raises UsageError."""
+        if not isinstance(text, str):
+            return text
+        try:
+            return cls(map(float, split(text) or ()))
+        except ValueError:
+            raise UsageError(f"--coefficients is {text!r}; expected numbers such as 1,2,4") from None
+
+
+KindName = Annotated[
+    str,
+    typer.Option(
+        "--kind",
+        parser=one_of(kind_names()),
+        metavar=choices(kind_names()),
+        help="Kind of intervention; see below.",
+    ),
+]
+Checkpoint = Annotated[
+    str | None,
+    typer.Option(
+        "--checkpoint", help="Checkpoint folder or Hugging Face id, OWNER/NAME[@REVISION]. Default: the run's."
+    ),
+]
+Sites = Annotated[
+    Names | None,
+    _inside_option(
+        "--sites",
+        **LISTED,
+        help="Sites, comma-separated: backbone.*, backbone.02, expert.03@0-4, backbone.02.heads.* or kv.*.",
+    ),
+]
+Roles = Annotated[
+    Names | None,
+    _inside_option(
+        "--roles",
+        **LISTED,
+        help="Token roles, comma-separated: all, image, image.left, image.right, language, state, action.",
+    ),
+]
+Direction = Annotated[
+    str | None,
+    _inside_option(
+        "--direction",
+        help="Direction or subspace: none, mean-difference, probe, mean-difference:K, leace, inlp:K.",
+    ),
+]
+Controls = Annotated[
+    int | None, _inside_option("--controls", help="Number of matched random directions.", min=0, max=100)
+]
+Coefficients = Annotated[
+    Numbers | None,
+    _inside_option(
+        "--coefficients",
+        parser=Numbers.parse,
+        metavar="1,2,…",
+        help="Coefficients, comma-separated, in half class-mean differences.",
+    ),
+]
+TargetSide = Annotated[
+    str | None, _inside_option("--target-side", help="Target side: wrong, correct, left or right.")
+]
+ReadoutName = Annotated[
+    Readout,
+    further_option(
+        "--readout",
+        help="first-chunk: measure the first inference. per-step: measure every inference along the unedited "
+        "episode (teacher-forced), for policies with one action per inference.",
+    ),
+]
+WeightsSeed = Annotated[
+    int | None, further_option("--weights-seed", help="Seed of the untrained weights. Default: that of the run.")
+]
+SceneFiles = Annotated[
+    list[str] | None,
+    further_option(
+        "--scene-file",
+        metavar="NAME=FILE",
+        help="File of the scene, if the run had one and it was moved: background=FILE or arm_urdf=FILE. Repeat "
+        "for several.",
+    ),
+]
 
 
 class KindHelp(PanelledHelp):
@@ -27,39 +125,42 @@ class KindHelp(PanelledHelp):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """The most used options, then a line per kind."""
         super().format_help(ctx, formatter)
-        width = max(map(len, KINDS)) + 1
-        for name, kind in KINDS.items():
-            typer.echo(f" {name:{width}}{kind.summary}")
+        kinds = every_kind()
+        width = max(len(kind.kind) for kind in kinds) + 1
+        for kind in kinds:
+            typer.echo(f" {kind.kind:{width}}{kind.summary}")
         typer.echo()
 
     def format_whole_help(self, ctx: Any, formatter: Any) -> None:
         """All options, then what each kind does and what the options mean to it."""
         super().format_whole_help(ctx, formatter)
-        for name, kind in KINDS.items():
+        for kind in every_kind():
             lines = [f"--{option.replace('_', '-')}: {meaning}" for option, meaning in kind.options.items()]
             text = Text("\n".join([kind.summary, *lines]))
             width = Console().width  # as Typer's own panels have it
-            out.print(Panel(text, title=f"--kind {name}", title_align="left", border_style="dim", width=width))
+            out.print(
+                Panel(text, title=f"--kind {kind.kind}", title_align="left", border_style="dim", width=width)
+            )
 
 
 def intervene(
     run: common.RunFolder,
-    kind: own.KindName = "image-swap",
+    kind: KindName = "image-swap",
     categories: common.Categories = None,
     items: common.Items = None,
-    sites: own.Sites = None,
-    roles: own.Roles = None,
-    direction: own.Direction = None,
-    controls: own.Controls = None,
-    coefficients: own.Coefficients = None,
-    target_side: own.TargetSide = None,
+    sites: Sites = None,
+    roles: Roles = None,
+    direction: Direction = None,
+    controls: Controls = None,
+    coefficients: Coefficients = None,
+    target_side: TargetSide = None,
     seed: common.Seed = 0,
-    readout: own.ReadoutName = "first-chunk",
+    readout: ReadoutName = "first-chunk",
     suite: common.SuiteFolder = None,
-    checkpoint: own.Checkpoint = None,
+    checkpoint: Checkpoint = None,
     model_options: common.ModelOptions = None,
-    weights_seed: own.WeightsSeed = None,
-    scene_files: own.SceneFiles = None,
+    weights_seed: WeightsSeed = None,
+    scene_files: SceneFiles = None,
     wording: common.Wording = None,
     device: common.Device = "cpu",
     style: common.Format = "table",
@@ -85,7 +186,9 @@ def intervene(
         "coefficients": coefficients, "target_side": target_side, "seed": seed or None,
     }  # fmt: skip
     given = {name: value for name, value in inside.items() if value is not None}
-    intervention = intervention_of(kind, opened, of_every_kind, given)
+    check_options(kind, given)
+    intervention = kind_of(kind).from_options(opened, **of_every_kind, **given)
+    intervention.check_run(opened)
     files = {name: Path(str(place)) for name, place in read_pairs(scene_files or []).items()}
     source = ReplaySource(suite, checkpoint, read_pairs(model_options or []), weights_seed, device, files)
     result = _run(opened, intervention, source)
@@ -93,14 +196,25 @@ def intervene(
     say(marked("stored as {}; next: [bold]probe-kit retention {}[/]", result.key, run))
 
 
+def check_options(name: str, options: Mapping[str, Any]) -> None:
+    """Raise UsageError for an option that does not apply to a kind. options: by name, of the command line."""
+    for option in options:
+        if option not in kind_of(name).options:
+            others = [kind.kind for kind in every_kind() if option in kind.options]
+            raise UsageError(
+                f"--{option.replace('_', '-')} does not apply to --kind {name}; remove it or choose another "
+                f"kind: {', '.join(others)}"
+            )
+
+
 def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "InterventionResult":
     """With progress. Says so if the result was stored before."""
     from probe_kit.intervene import run_intervention
-    from probe_kit.intervene.edits.unread import unread_note
-    from probe_kit.intervene.kinds.image_swap.verdict import groups_for_not_used
+    from probe_kit.intervene.outcomes import is_stored
+    from probe_kit.intervene.places import unread_note
+    from probe_kit.intervene.results.verdict import groups_for_not_used
     from probe_kit.intervene.runner import check_supported, too_few_groups, unread_sites
-    from probe_kit.intervene.store.answers import is_stored
-    from probe_kit.intervene.store.settings import check_run_fits, key_of, settings_of
+    from probe_kit.intervene.settings import check_run_fits, key_of, settings_of
 
     check_run_fits(run)
     check_supported(run, intervention)

@@ -1,7 +1,7 @@
 """Running an intervention: replay what is missing, store it, and read the result."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -9,26 +9,22 @@ from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import CaptureChangedActionError
 from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS
 from probe_kit.hooks.registry import get_family
-from probe_kit.intervene.edits.sites import check_roles_have_tokens, resolve_sites
-from probe_kit.intervene.edits.unread import unread_places
-from probe_kit.intervene.kinds.base import ConditionName, Measurement
-from probe_kit.intervene.kinds.image_swap.intervention import ImageSwap
-from probe_kit.intervene.kinds.image_swap.verdict import groups_for_not_used
-from probe_kit.intervene.kinds.interchange.intervention import ROLES
-from probe_kit.intervene.kinds.reach import tiles_apart
-from probe_kit.intervene.replay.conditions import Condition, Intervention, ReplayBatch
-from probe_kit.intervene.replay.per_step import evaluate_per_step
-from probe_kit.intervene.replay.session import Progress, ReplaySession, ReplaySource, open_session
+from probe_kit.intervene.kinds.base import ConditionName, Intervention, Measurement
+from probe_kit.intervene.kinds.image_swap import ImageSwap, tiles_apart
+from probe_kit.intervene.kinds.interchange import Interchange
+from probe_kit.intervene.outcomes import ConditionOutcomes, is_stored, save
+from probe_kit.intervene.places import check_roles_have_tokens, resolve_sites, unread_places
+from probe_kit.intervene.replay import Condition, ReplayBatch
 from probe_kit.intervene.results.results import InterventionResult, effects_csv, load_effects
-from probe_kit.intervene.store.answers import ConditionOutcomes, is_stored, save
-from probe_kit.intervene.store.settings import PER_STEP, check_run_fits, items_of, key_of, settings_of
+from probe_kit.intervene.results.verdict import groups_for_not_used
+from probe_kit.intervene.rollout import evaluate_per_step
+from probe_kit.intervene.sessions.opening import open_session
+from probe_kit.intervene.sessions.session import LoadPolicy, Progress, ReplaySession, ReplaySource
+from probe_kit.intervene.settings import PER_STEP, check_run_fits, key_of, settings_of
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.results import tidy_bundle
 from probe_kit.runs.resume_pieces import Pieces
 from probe_kit.runs.run import Run
-
-if TYPE_CHECKING:
-    from probe_kit.hooks import Policy
 
 REDO = "the same `probe-kit intervene` then plays it again"
 
@@ -38,7 +34,7 @@ def run_intervention(
     intervention: Intervention | None = None,
     source: ReplaySource | None = None,
     *,
-    load: "Callable[[Run, ReplaySource], Policy] | None" = None,
+    load: LoadPolicy | None = None,
     progress: Progress | None = None,
     on_fit_progress: Progress | None = None,
 ) -> InterventionResult:
@@ -52,6 +48,7 @@ def run_intervention(
     """
     intervention = intervention or ImageSwap()
     check_run_fits(run)
+    intervention.check_run(run)
     check_supported(run, intervention)
     settings = settings_of(intervention, run)
     key = key_of(settings)
@@ -68,15 +65,15 @@ def _execute(
     settings: Mapping[str, Any],
     key: str,
     source: ReplaySource,
-    load: "Callable[[Run, ReplaySource], Policy] | None",
+    load: LoadPolicy | None,
     progress: Progress | None,
     on_fit_progress: Progress | None,
 ) -> None:
     pieces = Pieces.of(run.location, INTERVENTIONS, key, run.stamp, REDO)
-    wanted, patterns = items_of(run, intervention), _patterns(settings)
+    wanted, patterns = intervention.items_in(run), _patterns(settings)
     with open_session(run, source, load) as session, session.ready():
         session.on_fit_progress = on_fit_progress or notebook_progress("items learnt from")
-        _check_roles(session, settings, getattr(type(intervention), "roles", ROLES))
+        _check_roles(session, settings, getattr(type(intervention), "roles", Interchange.roles))
         items = intervention.eligible_items(session, wanted)
         conditions = intervention.conditions(session)
         parts = _replay_items(
@@ -144,7 +141,7 @@ def too_few_groups(run: Run, intervention: Intervention) -> dict[str, int]:
     """
     if not isinstance(intervention, ImageSwap):
         return {}
-    asked = run.episodes[run.episodes["item_id"].isin(items_of(run, intervention))]
+    asked = run.episodes[run.episodes["item_id"].isin(intervention.items_in(run))]
     counts = asked.groupby("category", sort=False)["group_id"].nunique()
     return {str(name): int(count) for name, count in counts.items() if count < groups_for_not_used()}
 
@@ -177,7 +174,7 @@ def _replay_item(
     session: ReplaySession, intervention: Intervention, item: str, conditions: Sequence[Condition]
 ) -> ReplayBatch:
     if intervention.readout == PER_STEP:
-        return evaluate_per_step(session, session.replay_inputs(item), conditions)
+        return evaluate_per_step(session, session.pairs(item), conditions)
     return intervention.play(session, item, conditions)
 
 

@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from probe_kit.errors import UsageError
-from probe_kit.intervene.results.site_maps import stored_steering
+from probe_kit.intervene.kinds.site_maps import stored_steering
 from probe_kit.retention.displays import curves_side_by_side, dose_response, layer_curve
 from probe_kit.retention.displays.base.report_figure import ONLY_FILLED, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import BLUE, VERMILION, footer, panels, plain

@@ -26,7 +26,7 @@ from probe_kit.demo.organisms import (
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import extract_run
 from probe_kit.intervene import ImageSwap, InstructionSwap, UseVerdict, run_intervention
-from probe_kit.intervene.kinds.image_swap.verdict import Behaviour
+from probe_kit.intervene.results.verdict import Behaviour
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.behaviour.success_rate import SuccessRate, regime
 from probe_kit.retention.columns.sentences import verdict

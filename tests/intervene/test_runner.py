@@ -32,9 +32,9 @@ from probe_kit.intervene import (
     run_intervention,
     stored_interventions,
 )
-from probe_kit.intervene.replay.rollout import planned_of
-from probe_kit.intervene.replay.session import ReplaySession, load_policy_of, open_session
 from probe_kit.intervene.runner import too_few_groups
+from probe_kit.intervene.sessions.opening import open_session
+from probe_kit.intervene.sessions.session import ReplaySession, load_policy_of
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.runs.sources import RunSources
@@ -79,35 +79,35 @@ def test_too_few_groups_are_said_to_show_nothing(effects: InterventionResult) ->
 def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Run, session: ReplaySession) -> None:
     """State and noise stay; and what one layout sees exchanged is what the other one sees, set up by itself."""
     item = str(copy.episodes["item_id"][0])
-    original, swapped = session.replay_inputs(item)
-    planned = replace(planned_of(session, swapped), scene_seed=planned_of(session, original).scene_seed)
+    original, swapped = session.pairs(item)
+    planned = replace(session.planned(swapped), scene_seed=session.planned(original).scene_seed)
     alone = Stage(session.scene, None)
     looked = alone.look(planned)
     alone.close()
     assert isinstance(looked, Seen)
-    np.testing.assert_array_equal(original.swapped.image, looked.observation.image)
+    np.testing.assert_array_equal(original.source.image, looked.observation.image)
     assert looked.facts["first_frame_sha256"] == copy.episodes["first_frame_sha256"][swapped.row]
-    np.testing.assert_array_equal(original.swapped.image, swapped.seen.image)
-    np.testing.assert_array_equal(swapped.swapped.image, original.seen.image)
-    assert (original.seen.image != original.swapped.image).any()
-    np.testing.assert_array_equal(original.seen.state, original.swapped.state)
-    assert original.seen.instruction == original.swapped.instruction
+    np.testing.assert_array_equal(original.source.image, swapped.clean.image)
+    np.testing.assert_array_equal(swapped.source.image, original.clean.image)
+    assert (original.clean.image != original.source.image).any()
+    np.testing.assert_array_equal(original.clean.state, original.source.state)
+    assert original.clean.instruction == original.source.instruction
     assert original.seed != swapped.seed
 
 
 def test_left_of_the_middle_is_positive(session: ReplaySession, copy: Run) -> None:
-    (replay_input, _) = session.replay_inputs(str(copy.episodes["item_id"][0]))
+    (replay_input, _) = session.pairs(str(copy.episodes["item_id"][0]))
     still = np.zeros((4, 7), np.float32)
     left = still.copy()
     left[:, 1] = 0.05
-    at_rest = session.lateral_displacement(still, replay_input.seen)
-    assert at_rest == pytest.approx(replay_input.seen.state[1] - 0.028, abs=1e-6)
-    assert session.lateral_displacement(left, replay_input.seen) == pytest.approx(at_rest + 0.2, abs=1e-6)
+    at_rest = session.lateral_displacement(still, replay_input.clean)
+    assert at_rest == pytest.approx(replay_input.clean.state[1] - 0.028, abs=1e-6)
+    assert session.lateral_displacement(left, replay_input.clean) == pytest.approx(at_rest + 0.2, abs=1e-6)
 
 
 def test_another_policy_is_noticed_by_what_it_does(session: ReplaySession, copy: Run) -> None:
-    (replay_input, _) = session.replay_inputs(str(copy.episodes["item_id"][0]))
-    chunk = session.act(replay_input.seen, replay_input.seed)
+    (replay_input, _) = session.pairs(str(copy.episodes["item_id"][0]))
+    chunk = session.act(replay_input.clean, replay_input.seed)
     assert session.replay_error(replay_input, chunk) == 0.0
     with pytest.raises(CaptureChangedActionError, match="differs from the stored one"):
         session.replay_error(replay_input, chunk + 0.1)
@@ -298,7 +298,7 @@ def test_without_a_named_suite_the_embedded_one_is_found_or_drawn_again(
     with open_session(
         run, ReplaySource(), lambda *_: twin
     ) as session:  # the first frames are the run's, or this raises
-        assert len(session.replay_inputs(str(copy.episodes["item_id"].iloc[0]))) == 2
+        assert len(session.pairs(str(copy.episodes["item_id"].iloc[0]))) == 2
     assert len(list((tmp_path / "suites").iterdir())) == 1
 
 

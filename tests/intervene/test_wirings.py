@@ -11,23 +11,21 @@ from probe_kit import patching as pt
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site, capture
 from probe_kit.intervene import ConditionOutcomes, ImageSwapEffect, UseVerdict, classify_all
-from probe_kit.intervene.edits.sites import resolve_sites
 from probe_kit.intervene.kinds.base import Measurement
-from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
-from probe_kit.intervene.kinds.interchange.intervention import PatchedFromSource, patches_within
-from probe_kit.intervene.kinds.joint.effects import (
+from probe_kit.intervene.kinds.image_swap import image_swap_effects
+from probe_kit.intervene.kinds.interchange import patch_of, patches_within
+from probe_kit.intervene.kinds.joint import (
     JointEffect,
+    JointPlaces,
     describe_joint_places,
     describe_remainder,
-    measured_joint_places,
 )
-from probe_kit.intervene.kinds.joint.intervention import JointPlaces
-from probe_kit.intervene.kinds.joint.table import few_groups_notes
-from probe_kit.intervene.kinds.site_effects import patch_effects
-from probe_kit.intervene.replay.conditions import Condition
-from probe_kit.intervene.results.site_maps import localised_sites
-from probe_kit.intervene.results.ties import describe_tie, tie_at_site
-from probe_kit.intervene.store.settings import PER_STEP
+from probe_kit.intervene.kinds.site_maps import localised_sites, patch_effects
+from probe_kit.intervene.patching import Cell
+from probe_kit.intervene.places import resolve_sites
+from probe_kit.intervene.replay import Condition
+from probe_kit.intervene.results.evidence import describe_tie, tie_at_site
+from probe_kit.intervene.settings import PER_STEP
 from tests.intervene.wirings import WIRINGS, WORDS, WiredSession, outcomes_of, replay_inputs
 
 pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
@@ -138,7 +136,7 @@ def patched(session: WiredSession, name: str, *patterns: str, role: str = "all")
     """With every place of these patterns patched, one at a time."""
     places = [place for pattern in patterns for place in resolve_sites(pattern, session.policy)]
     sites = tuple(site for place in places for site in place.sites)
-    conditions: list[Condition] = [PatchedFromSource(place, role, sites) for place in places]
+    conditions: list[Condition] = [patch_of(Cell(place, role), sites) for place in places]
     return outcomes_of(session, [name], conditions)
 
 
@@ -173,7 +171,7 @@ def joint(
     outcomes = outcomes_of(session, [name], conditions[2:])
     entries = asked.certificate_entries(conditions, None)  # type: ignore[arg-type]
     measurement = Measurement(outcomes, SUITE, asked.parameters(), entries, lambda _: b"")
-    rows = measured_joint_places(measurement)
+    rows = JointPlaces.effects(measurement)
     return {row.cells if row.part == "cell" else row.part: row for row in rows}
 
 
@@ -182,8 +180,8 @@ def test_a_single_place_is_read_and_is_the_smallest_set(wired: WiredSession) -> 
     assert (rows["kv.01 language"].finding, rows["kv.02 language"].finding) == ("read here", "nothing alone")
     assert (rows["minimal"].cells, rows["minimal"].finding) == ("kv.01 language", "read here")
     assert describe_joint_places(list(rows.values())) == "read at kv.01 language"
-    assert few_groups_notes([rows["minimal"]], None) == []  # type: ignore[arg-type]
-    (note,) = few_groups_notes([replace(rows["minimal"], n_groups=4)], None)  # type: ignore[arg-type]
+    assert JointPlaces.notes([rows["minimal"]], None) == []  # type: ignore[arg-type]
+    (note,) = JointPlaces.notes([replace(rows["minimal"], n_groups=4)], None)  # type: ignore[arg-type]
     assert note.startswith("copied: the smallest set is scored in 4 groups, in which no p can be below 0.062")
 
 
@@ -288,9 +286,9 @@ def probed_direction(session: WiredSession, name: str, site: Site) -> np.ndarray
     features, labels = [], []
     for one in replay_inputs(name):
         with capture(session.policy, [site]) as cache:
-            session.act(one.seen, one.seed)
+            session.act(one.clean, one.seed)
         features.append(cache[site][0, WORDS].mean(0).numpy())
-        labels.append(one.side_correct)
+        labels.append(one.side)
     weights = LogisticRegression(C=0.1).fit(np.array(features), labels).coef_[0]
     return (weights / np.linalg.norm(weights)).astype(np.float32)
 
@@ -300,8 +298,8 @@ def tie_of(session: WiredSession, name: str, layer: int, called: str = "mean-dif
     (place,) = resolve_sites(f"backbone.{layer:02d}", session.policy)
     direction = OneDirection(probed_direction(session, name, place.only_site))
     roles = ("language", "all", "image", "state")
-    conditions: list[Condition] = [PatchedFromSource(place, role, place.sites) for role in roles]
-    conditions += patches_within(called, direction, place, "language", place.sites)
+    conditions: list[Condition] = [patch_of(Cell(place, role), place.sites) for role in roles]
+    conditions += patches_within(called, direction, Cell(place, "language"), place.sites)
     rows = patch_effects(outcomes_of(session, [name], conditions), SUITE)
     layer, along = rows[: len(roles)], rows[len(roles) :]
     return tie_at_site(layer[0], [row for row in along if not row.is_control], layer)

@@ -8,10 +8,10 @@ import pandas as pd
 
 from probe_kit.hooks import Site, capture
 from probe_kit.intervene import ImageSwap, Interchange, JointPlaces, UseVerdict
-from probe_kit.intervene.edits.sites import ALL
-from probe_kit.intervene.replay.conditions import Intervention
+from probe_kit.intervene.kinds.base import Intervention
+from probe_kit.intervene.places import ALL
 from probe_kit.intervene.results.results import verdicts_of
-from probe_kit.intervene.store.settings import FORMAT
+from probe_kit.intervene.settings import FORMAT
 from probe_kit.train import ArrayRun, train_probes
 from tests.intervene.answers import store_outcomes
 from tests.intervene.wirings import BLOCKS, IMAGE, WORDS, WiredSession, outcomes_of, replay_inputs
@@ -28,11 +28,13 @@ def wired_run(session: WiredSession, names: Sequence[str], folder: Path) -> Arra
     features: dict[tuple[Site, str], list[np.ndarray]] = {(site, view): [] for site in sites for view in VIEWS}
     for one in inputs:
         with capture(session.policy, sites) as cache:
-            session.act(one.seen, one.seed)
+            session.act(one.clean, one.seed)
         for site, view in features:
             features[site, view].append(cache[site][0, VIEWS[view]].mean(0).numpy())
-    columns = ("episode_id", "item_id", "group_id", "category", "side_correct", "layout")
-    episodes = pd.DataFrame({name: [getattr(one, name) for one in inputs] for name in columns})
+    columns = {"episode_id": "episode", "item_id": "item", "group_id": "group", "side_correct": "side"}
+    episodes = pd.DataFrame({name: [getattr(one, field) for one in inputs] for name, field in columns.items()})
+    episodes["category"] = [one.category for one in inputs]
+    episodes["layout"] = ["original" if one.episode.endswith(":o") else "swapped" for one in inputs]
     episodes["outcome"], episodes["side_placed"] = "correct", episodes["side_correct"]
     run = ArrayRun(folder, "wired", SUITE, episodes, {key: np.array(rows) for key, rows in features.items()})
     session.run = run  # type: ignore[assignment]

@@ -23,8 +23,9 @@ from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.sites import kv_stream
 from probe_kit.hooks.families.shared.prompt_kv import kv_tap
 from probe_kit.intervene import ConditionOutcomes
-from probe_kit.intervene.replay.conditions import CleanRun, Condition, ImagesSwapped, ReplayBatch, replay
-from probe_kit.intervene.replay.session import ReplayInput, ReplaySession
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.replay import CleanRun, Condition, ReplayBatch, SourceRun, replay
+from probe_kit.intervene.sessions.scene import SceneSession
 from probe_kit.models.prompt_kv import PromptKV
 
 WIDTH, BLOCKS, CHUNK, METRES = 24, 3, 4, 0.15
@@ -312,22 +313,22 @@ def _embedded(name: str, item: str, answer: float, other: float) -> Tensor:
 # -- episodes --------------------------------------------------------------------------------------------------
 
 
-class WiredSession(ReplaySession):
+class WiredSession(SceneSession):
     """A replay session without a simulator: the tiles lie left and right of zero."""
 
     def __init__(self, iterations: int = 2) -> None:
         self.policy, self.on_fit_progress = WiredPolicy(iterations), None
         inputs = [one for name in WIRINGS for one in replay_inputs(name)]
-        columns = {"category": [one.category for one in inputs], "item_id": [one.item_id for one in inputs]}
+        columns = {"category": [one.category for one in inputs], "item_id": [one.item for one in inputs]}
         self.run = SimpleNamespace(model="wired", episodes=pd.DataFrame(columns))  # type: ignore[assignment]
         self._middle, self._across = np.zeros(2), np.array([0.0, 1.0])
 
-    def replay_inputs(self, item_id: str) -> list[ReplayInput]:
+    def pairs(self, item: str) -> list[Pair]:
         """Both layouts of one item."""
-        return [one for one in replay_inputs(item_id.rpartition("-")[0]) if one.item_id == item_id]
+        return [one for one in replay_inputs(item.rpartition("-")[0]) if one.item == item]
 
 
-def replay_inputs(name: str, x: float = 0.0) -> list[ReplayInput]:
+def replay_inputs(name: str, x: float = 0.0) -> list[Pair]:
     """Two layouts of every item, each a group of its own. x: where the hand is, zero before the first chunk."""
     state = np.array([x, 0, 0.13, 0, 0, 0, 0, 0.8], np.float32)
     found = []
@@ -338,18 +339,17 @@ def replay_inputs(name: str, x: float = 0.0) -> list[ReplayInput]:
         for number, sign in enumerate((1.0, -1.0)):
             side: Literal["left", "right"] = "left" if sign * answer > 0 else "right"
             found.append(
-                ReplayInput(
-                    row=len(found),
-                    episode_id=f"{name}-{item}:{'os'[number]}",
-                    item_id=f"{name}-{item}",
-                    group_id=f"{name}-{item}",
-                    category=name,
-                    side_correct=side,
-                    layout=("original", "swapped")[number],
-                    seen=layouts[number],
-                    swapped=layouts[1 - number],
+                Pair(
+                    clean=layouts[number],
+                    source=layouts[1 - number],
                     seed=1000 + item,
-                    tiles={},
+                    toward=-1 if side == "left" else 1,
+                    group=f"{name}-{item}",
+                    item=f"{name}-{item}",
+                    row=len(found),
+                    episode=f"{name}-{item}:{'os'[number]}",
+                    category=name,
+                    side=side,
                 )
             )
     return found
@@ -369,7 +369,7 @@ def outcomes_of(
 
     calls: inferences of an episode, whose displacements are summed; the hand leaves its place after the first.
     """
-    conditions: list[Condition] = [CleanRun(), ImagesSwapped(), *further]
+    conditions: list[Condition] = [CleanRun(), SourceRun(), *further]
     inputs = [one for name in names for one in replay_inputs(name)]
     found = replay(session, inputs, conditions)
     for _ in range(calls - 1):
@@ -378,14 +378,12 @@ def outcomes_of(
     return _stored(conditions, inputs, found)
 
 
-def _stored(
-    conditions: Sequence[Condition], inputs: Sequence[ReplayInput], found: ReplayBatch
-) -> ConditionOutcomes:
+def _stored(conditions: Sequence[Condition], inputs: Sequence[Pair], found: ReplayBatch) -> ConditionOutcomes:
     columns: dict[str, Any] = {
         name: np.array([getattr(one, own) for one in inputs])
         for name, own in (
-            ("episodes", "episode_id"), ("items", "item_id"), ("groups", "group_id"), ("categories", "category"),
-            ("sides", "side_correct"),
+            ("episodes", "episode"), ("items", "item"), ("groups", "group"), ("categories", "category"),
+            ("sides", "side"),
         )
     }  # fmt: skip
     return ConditionOutcomes(

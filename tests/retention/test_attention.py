@@ -8,8 +8,8 @@ import pytest
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene import AttentionShares
-from probe_kit.intervene.store.answers import ATTENTION_FILE
-from probe_kit.intervene.store.settings import FORMAT
+from probe_kit.intervene.outcomes import ATTENTION_FILE
+from probe_kit.intervene.settings import FORMAT
 from probe_kit.retention import retention_table
 from probe_kit.retention.displays import AttentionDisplay, attention_curve, collect_figures
 from probe_kit.train import ArrayRun

@@ -7,7 +7,7 @@ import pytest
 
 from probe_kit.errors import ActivationsLeftOutError, RunDamagedError, UsageError
 from probe_kit.extract.recordings.recorded_plan import SIDE
-from probe_kit.intervene.store.settings import check_run_fits
+from probe_kit.intervene.settings import check_run_fits
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, copy_run, export_run, verify_run
 from probe_kit.runs.store import locate

@@ -15,8 +15,8 @@ from probe_kit.env.scoring.rules import RULES
 from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.kinds.image_swap.effects import stored_image_swaps
-from probe_kit.intervene.store.answers import stored_interventions
+from probe_kit.intervene.kinds.image_swap import stored_image_swaps
+from probe_kit.intervene.outcomes import stored_interventions
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run
 from probe_kit.runs.store import locate

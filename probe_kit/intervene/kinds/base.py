@@ -1,58 +1,53 @@
-"""What every kind of intervention is made of: names of conditions, effects, and their test against controls.
+"""The parts that every kind of intervention shares: settings, names of conditions, effects, tests, tables.
 
-Loads neither torch nor a simulator.
+Loads neither torch nor a simulator, and neither do the kinds: tables read them without a model.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS
-from probe_kit.intervene.kinds.reach import TILES_APART
-from probe_kit.intervene.store.answers import ConditionOutcomes
-from probe_kit.intervene.store.settings import FIRST_CHUNK
+from probe_kit.hooks.contract.interventions import InterventionKind, Readout
+from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
+from probe_kit.intervene.places import SEPARATOR
+from probe_kit.intervene.replay import Condition, ReplayBatch, replay
+from probe_kit.intervene.settings import FIRST_CHUNK, categories_in, items_of
+from probe_kit.intervene.tokens import TILES
+from probe_kit.runs.run import Run
 from probe_kit.statistics.sign_flips import max_t
+from probe_kit.suite.categories import category_of
+from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit.intervene.sessions.session import ReplaySession
+
 Values = NDArray[np.float64]
-SEPARATOR = "|"
 CONTROL = "control-"
+TILES_APART = 0.31
+"""Metres between the tiles of the default scene; taken for a run that stores no scene."""
 
 
-# -- what a kind's functions are given and give ---------------------------------------------------------------
-
-
-class EffectLike(Protocol):
-    """One row of effects."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values by column."""
-
-
-class CategoryVerdict(Protocol):
-    """The verdict of a category, and what it rests on."""
-
-    @property
-    def verdict(self) -> str:
-        """In a few words."""
-
-    @property
-    def explanation(self) -> str:
-        """What it rests on, or why there is none."""
+# -- the kind -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What effects are computed from.
+    """The stored numbers that effects are computed from.
 
-    seed_text: of the run, by which random draws are made. read: a further stored file by its name.
-    tiles_apart: metres between the tiles of the run's scene.
+    seed_text: of the run, by which random draws are made. read: a further stored file by its name. key: of the
+    intervention. tiles_apart: metres between the tiles of the run's scene.
     """
 
     outcomes: ConditionOutcomes
@@ -65,21 +60,157 @@ class Measurement:
 
     @property
     def readout(self) -> str:
-        """`first-chunk` or `per-step`."""
+        """Return `first-chunk` or `per-step`."""
         return str(self.settings.get("readout", FIRST_CHUNK))
+
+
+class CategoryVerdict(Protocol):
+    """The verdict of a category, and the numbers it rests on."""
+
+    @property
+    def verdict(self) -> str:
+        """Return it in a few words."""
+
+    @property
+    def explanation(self) -> str:
+        """Return the numbers it rests on, or why there is none."""
+
+    def describe(self, swap: Any) -> str:
+        """Return what an image swap showed, in sentences."""
 
 
 @dataclass(frozen=True)
 class TableContext:
-    """What a table says besides its rows. subject: model and suite. verdicts: by category.
+    """The words of a table besides its rows. subject: model and suite. verdicts: by category.
 
-    explains: whether the caption says what each verdict rests on, which sentences say too.
+    legend: of the verdicts. explains: whether the caption says what each verdict rests on, as sentences do.
     """
 
     measurement: Measurement
     subject: str
-    verdicts: Mapping[str, CategoryVerdict]
+    verdicts: Mapping[str, CategoryVerdict] = MappingProxyType({})
+    legend: str = ""
     explains: bool = True
+
+
+@dataclass(frozen=True, kw_only=True)
+class Intervention(ABC):
+    """One kind of intervention: its settings as fields, its conditions, and how their numbers are read.
+
+    categories: of the run; None for all. items: so many of each category, the first ones; None for all. readout:
+    the part of the policy's answer that is read, see `Readout`.
+
+    Of the class. kind: its name on the command line. summary: a line of help. position: in help. options: those of
+    sites, roles, direction, controls, coefficients, target_side and seed that it takes, and their meaning.
+    has_verdict: whether `classify_use` classifies its rows. is_descriptive: whether it edits and tests nothing.
+    asks_where: whether it edits places of the network, so that a line says which layer matters.
+    """
+
+    kind: ClassVar[str]
+    summary: ClassVar[str]
+    position: ClassVar[int] = 100
+    options: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    has_verdict: ClassVar[bool] = False
+    is_descriptive: ClassVar[bool] = False
+    asks_where: ClassVar[bool] = False
+
+    categories: tuple[str, ...] | None = None
+    items: int | None = None
+    readout: Readout = FIRST_CHUNK
+
+    def __post_init__(self) -> None:
+        if self.items is not None and self.items < 1:
+            raise UsageError(f"items is {self.items}; expected at least 1")
+        if self.readout not in get_args(Readout):
+            raise UsageError(f"readout is {self.readout!r}; expected one of {', '.join(get_args(Readout))}")
+
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """Return it as the command builds it. options: those that are given. Raises UsageError."""
+        del run
+        return cls(**options)
+
+    @property
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
+        """Return the interventions that a family must support for it."""
+        return capabilities_for(getattr(self, "sites", ()), getattr(self, "roles", ()))
+
+    @property
+    def fits_first(self) -> bool:
+        """Whether items are inferred beforehand, for directions, erasers or a search."""
+        return False
+
+    def parameters(self) -> dict[str, Any]:
+        """Return its own settings as plain JSON; with the run they decide its numbers."""
+        common = {field.name for field in fields(Intervention)}
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name not in common}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+    def check_run(self, run: Run) -> None:
+        """Raise UnknownCategoryError for a category that the run lacks, UsageError for a run that does not fit."""
+        categories_in(run, self.categories)
+
+    def items_in(self, run: Run) -> list[str]:
+        """Return the items of a run that are replayed."""
+        return items_of(run, self.categories, self.items)
+
+    def eligible_items(self, session: "ReplaySession", items: Sequence[str]) -> list[str]:
+        """Return those of the items that it can be asked of; the others are passed over, and counted."""
+        del session
+        return list(items)
+
+    @abstractmethod
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Return all conditions, in the order in which they are stored; the first is `CleanRun`."""
+
+    def play(self, session: "ReplaySession", item: str, conditions: Sequence[Condition]) -> ReplayBatch:
+        """Play the conditions on the pairs of one item."""
+        return replay(session, session.pairs(item), conditions)
+
+    def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
+        """Return further entries of its certificate, as plain JSON."""
+        del conditions, batch
+        return {}
+
+    def extra_files(self, run: Run, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, bytes]:
+        """Return further files to store, by name."""
+        del run, conditions, batch
+        return {}
+
+    @staticmethod
+    @abstractmethod
+    def effects(measurement: Measurement) -> Sequence["Effect"]:
+        """Return the rows of a stored measurement."""
+
+    @staticmethod
+    @abstractmethod
+    def table(rows: Sequence[Any], context: TableContext) -> "ResponsiveTable":
+        """Return the rows as a table for a terminal."""
+
+    @staticmethod
+    def sentences(rows: Sequence[Any], context: TableContext) -> list[str]:
+        """Return the finding, a sentence per category; none of a kind that only describes."""
+        del rows, context
+        return []
+
+    @staticmethod
+    def notes(rows: Sequence[Any], measurement: Measurement) -> list[str]:
+        """Return sentences that a reader must know."""
+        del rows, measurement
+        return []
+
+    @staticmethod
+    def keys_in_use(run: RunReader) -> set[str] | None:
+        """Return keys of the stored ones that tables and figures read; None if none is preferred."""
+        del run
+        return None
+
+
+def capabilities_for(sites: Sequence[str], roles: Sequence[str]) -> tuple[InterventionKind, ...]:
+    """Return the interventions that a family must support for edits at such places and roles."""
+    reads_kv = any(pattern.partition(".")[0] == KV_STREAM for pattern in sites)
+    further: dict[InterventionKind, bool] = {"kv": reads_kv, "tiles": bool(set(roles) & set(TILES))}
+    return ("edit", *(kind for kind, is_needed in further.items() if is_needed))
 
 
 # -- names of conditions -------------------------------------------------------------------------------------
@@ -118,8 +249,8 @@ class ConditionName:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EffectRow:
-    """What one edit did in one category; the columns that all kinds of edits have.
+class EffectRow(Effect):
+    """The effect of one edit in one category, with the columns that all kinds of edits have.
 
     place: sites that were edited. role: of the tokens. direction: empty if they were edited in full. net, net_ci:
     the kind's share of episodes, with its 95 % interval by groups. max_action_change: largest difference in any
@@ -127,7 +258,6 @@ class EffectRow:
     changed nothing. relative_change: how far tokens were moved, in their own norms. key: of the intervention.
     """
 
-    category: str
     place: str
     role: str
     direction: str
@@ -144,16 +274,12 @@ class EffectRow:
 
     @property
     def name(self) -> str:
-        """What was edited, in a few words."""
+        """Return the edit in a few words."""
         return " ".join(filter(None, (self.place, self.role, self.direction)))
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
 
 
 def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName) -> dict[str, Any]:
-    """The columns of `EffectRow` that need no statistics, of one condition. outcomes: of one category."""
+    """Return the columns of `EffectRow` that need no statistics, of one condition. outcomes: of one category."""
     logged = dict(zip(LOG_FIELDS, outcomes.edit_log[row].T, strict=True))
     norm = float((logged["norm"] * logged["fires"]).sum())
     return {
@@ -171,7 +297,7 @@ def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName) -
 
 
 class ControlTest(NamedTuple):
-    """One condition against its controls. controls: their rows. beyond: (E,) what it does beyond their mean.
+    """One condition against its controls. controls: their rows. beyond: (E,) its values less their mean.
 
     t, p, p_fwe: one-sided, by sign flips of whole groups; p_fwe against the largest t of the category. All are
     None for a condition that is not tested.
@@ -192,47 +318,54 @@ def test_against_controls(
     untested: Collection[int],
     no_controls: Collection[int],
 ) -> list[ControlTest]:
-    """Every condition that is no control against its own controls, in the order of the conditions.
+    """Compare every condition that is no control with its own controls, in the order of the conditions.
 
-    values: (K, E) what is tested to be above zero. outcomes: of one category. seed_text: of the run, by which
-    sign flips are drawn. untested: further rows that are not tested. no_controls: rows that are no controls.
+    values: (K, E) tested to be above zero. outcomes: of one category. seed_text: of the run, by which sign flips
+    are drawn. untested: further rows that are not tested. no_controls: rows that are no controls.
     """
     controls = [
         [at for at, other in enumerate(names) if other.is_control_of(name) and at not in no_controls]
         for name in names
     ]
-    found = [ControlTest(own) for own in controls]
+    tests = [ControlTest(rows) for rows in controls]
     tested = [at for at, name in enumerate(names) if not name.is_control and at not in untested]
     if not tested:
-        return found
+        return tests
     beyond = np.array(
         [values[at] - values[controls[at]].mean(axis=0) if controls[at] else values[at] for at in tested]
     )
-    seed = derive_seed("sign flips", seed_text, str(outcomes.categories[0]))
-    for at, own, *tests in zip(tested, beyond, *max_t(beyond, outcomes.items, outcomes.groups, seed), strict=True):
-        found[at] = ControlTest(controls[at], own, *map(float, tests))
-    return found
+    seed = flips_seed(outcomes, seed_text)
+    numbers = max_t(beyond, outcomes.items, outcomes.groups, seed)
+    for at, excess, *statistics in zip(tested, beyond, *numbers, strict=True):
+        tests[at] = ControlTest(controls[at], excess, *map(float, statistics))
+    return tests
 
 
-def count_edits(found: Sequence[str], tried: int, most: int = 3) -> str:
-    """How many of the edits that were tried, and the first of them by name."""
-    if not found:
-        return f"none of {tried}"
-    named, further = found[:most], len(found) - most
-    return f"{len(found)} of {tried} ({', '.join(named)}{f' and {further} more' if further > 0 else ''})"
+def flips_seed(outcomes: ConditionOutcomes, seed_text: str) -> int:
+    """Return the seed of the sign flips of one category."""
+    return derive_seed("sign flips", seed_text, str(outcomes.categories[0]))
 
 
-def by_category[Row: EffectRow](rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Rows of edits by category, controls and clean conditions left out."""
-    found: dict[str, list[Row]] = {}
+def mean_of(values: Values, otherwise: float | None = None) -> float | None:
+    """Return the mean of some numbers, and `otherwise` if there are none."""
+    return float(values.mean()) if values.size else otherwise
+
+
+def by_category[Row: Effect](rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Return rows by category."""
+    parts: dict[str, list[Row]] = {}
     for row in rows:
-        if not row.is_control:
-            found.setdefault(row.category, []).append(row)
-    return found
+        parts.setdefault(row.category, []).append(row)
+    return parts
 
 
-def frame_of(rows: Sequence[EffectLike]) -> "pd.DataFrame":
-    """One line per row; intervals as two columns at the end."""
+def edits_by_category[Row: EffectRow](rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Return rows of edits by category, without controls."""
+    return by_category(row for row in rows if not row.is_control)
+
+
+def frame_of(rows: Sequence[Effect]) -> "pd.DataFrame":
+    """Return one line per row; intervals as two columns at the end."""
     import pandas as pd
 
     flat = []
@@ -244,3 +377,68 @@ def frame_of(rows: Sequence[EffectLike]) -> "pd.DataFrame":
         }
         flat.append({**plain, **ends})
     return pd.DataFrame(flat)
+
+
+# -- tables and sentences ------------------------------------------------------------------------------------
+
+
+def effect_table[Row](
+    title: str,
+    caption: str,
+    heading: str,
+    lines: Sequence[tuple[str, Row]],
+    parts: Mapping[str, Mapping[str, Callable[[Row], str]]],
+    is_bold: Callable[[Row], bool] = lambda _: False,
+) -> "ResponsiveTable":
+    """Return a table. lines: name and row of each. parts: by title, the text of a row's cell by column."""
+    from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
+
+    cells = {
+        part: tuple(tuple(Cell(text(row)) for text in columns.values()) for _, row in lines)
+        for part, columns in parts.items()
+    }
+    return ResponsiveTable(
+        title=title,
+        caption=caption,
+        name=heading,
+        names=tuple(name for name, _ in lines),
+        styles=tuple("bold" if is_bold(row) else "" for _, row in lines),
+        parts=tuple(Part(part, tuple(columns), cells[part]) for part, columns in parts.items()),
+    )
+
+
+def lines_of[Row: Effect](rows: Iterable[Row], name: Callable[[Row], str]) -> list[tuple[str, Row]]:
+    """Return rows with the name of their line: the category, and the name of the row."""
+    return [(f"{row.category} · {name(row)}", row) for row in rows]
+
+
+def text_of(value: float | None, form: str = ".2f", missing: str = "–") -> str:
+    """Return a number in a format, and zero without a sign unless the format asks for one."""
+    if value is None:
+        return missing
+    text = format(value, form)
+    return text.lstrip("-") if "+" not in form and float(text) == 0 else text
+
+
+def interval_text(
+    value: float | None, limits: tuple[float, float] | None, form: str = ".2f", missing: str = "–"
+) -> str:
+    """Return `value [low, high]`."""
+    if value is None or limits is None:
+        return missing
+    return f"{text_of(value, form)} [{text_of(limits[0], form)}, {text_of(limits[1], form)}]"
+
+
+def count_edits(names: Sequence[str], tried: int, most: int = 3) -> str:
+    """Return how many of the edits that were tried, and the first of them by name."""
+    if not names:
+        return f"none of {tried}"
+    further = len(names) - most
+    return f"{len(names)} of {tried} ({', '.join(names[:most])}{f' and {further} more' if further > 0 else ''})"
+
+
+def category_sentences[Row: Effect](
+    parts: Mapping[str, Sequence[Row]], finding: Callable[[Sequence[Row]], str]
+) -> list[str]:
+    """Return one sentence per category."""
+    return [f"{category_of(name).title}: {finding(rows)}." for name, rows in parts.items()]

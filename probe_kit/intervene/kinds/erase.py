@@ -1,6 +1,6 @@
 """Concept erasure: the linearly decodable answer is removed from each token, with random controls.
 
-Holds the intervention, its effects and their table. The fits are in `edits.linear_erasure`, which interchange and
+Holds the intervention, its effects and their table. The fits are in `erasers`, which interchange and
 steer share with it (`--direction mean-difference:K`). Erasure is a supplement, and the weakest. A policy may read
 what is not linear. An answer that is erased at one place may pass at another, and what is removed along with it
 disrupts the task. Erasers that know only the mean over tokens blind a probe and leave the behaviour, so that there
@@ -9,7 +9,7 @@ is one per position.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,49 +18,43 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edit_engine import apply_patch
 from probe_kit.hooks.capturing.token_edits import Identity, TokenIndex
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.edits.linear_erasure import Eraser, Method, PaddedTokens
-from probe_kit.intervene.edits.sites import SiteGroup, resolve_all, roles_of
+from probe_kit.intervene.erasers import Eraser, Method, PaddedTokens
 from probe_kit.intervene.kinds.base import (
     ConditionName,
     EffectRow,
+    Intervention,
     Measurement,
     TableContext,
-    by_category,
+    category_sentences,
     common_columns,
     count_edits,
+    edits_by_category,
+    effect_table,
+    lines_of,
+    mean_of,
     test_against_controls,
+    text_of,
 )
-from probe_kit.intervene.kinds.image_swap.effects import SMALLEST_EFFECT_OF_INTEREST, net_interval
-from probe_kit.intervene.kinds.site_effects import LOCALISATION_SHARE
-from probe_kit.intervene.replay.conditions import (
-    CleanRun,
-    Condition,
-    ConditionContext,
-    ConditionResult,
-    Intervention,
-    ReplayBatch,
-)
-from probe_kit.intervene.replay.image_tokens import TILES, role_tokens
-from probe_kit.intervene.replay.passed_over import PassedOver
-from probe_kit.intervene.replay.session import ReplaySession
-from probe_kit.intervene.replay.token_features import (
-    TokenFeatures,
-    by_episode,
-    collect_token_features,
-    fit_by_fold,
-)
-from probe_kit.intervene.store.answers import CLEAN, ERASE, PROBE_ACCURACY, ConditionOutcomes
-from probe_kit.intervene.store.settings import FIRST_CHUNK, items_of
+from probe_kit.intervene.kinds.image_swap import SMALLEST_EFFECT_OF_INTEREST, net_interval
+from probe_kit.intervene.kinds.interchange import cells_at
+from probe_kit.intervene.outcomes import CLEAN, ERASE, PROBE_ACCURACY, ConditionOutcomes
+from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
+from probe_kit.intervene.patching.patch import Cell
+from probe_kit.intervene.places import resolve_all
+from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, ReplayBatch
+from probe_kit.intervene.settings import FIRST_CHUNK
+from probe_kit.intervene.tokens import TILES, role_tokens
 from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold
 from probe_kit.statistics.paired_signs import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.suite.categories import category_of
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
+    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit.intervene.directions import TokenFeatures
+    from probe_kit.intervene.sessions.session import ReplaySession
 
 LEACE = "leace"
 Finding = Literal[
@@ -88,10 +82,21 @@ _LEGEND = (
 class ConceptErasure(Intervention):
     """Every place and role: written back as it was, erased, and with matched random subspaces taken away instead.
 
-    sites: patterns of places of one site each. roles: whose tokens. method: see `linear_erasure.Method`. controls:
+    sites: patterns of places of one site each. roles: whose tokens. method: see `erasers.Method`. controls:
     so many of the same rank. What erases an episode was fitted on the tokens of the other folds' episodes, of the
     items that are played. Raises UsageError for a method that does not exist.
     """
+
+    kind: ClassVar[str] = ERASE
+    summary: ClassVar[str] = "Remove the decodable answer (weaker than interchange)."
+    position: ClassVar[int] = 8
+    options: ClassVar[Mapping[str, str]] = {
+        "sites": "where tokens are erased, one site each; required",
+        "roles": "of the erased tokens; default image",
+        "direction": "leace (default), mean-difference:K or inlp:K, K directions per token",
+        "controls": "random subspaces of the same rank; default 5",
+        "seed": "of controls and folds; default 0",
+    }
 
     sites: tuple[str, ...]
     roles: tuple[str, ...] = ("image",)
@@ -114,106 +119,128 @@ class ConceptErasure(Intervention):
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
-        """`direction` is its method. Raises UsageError without sites."""
+        """Return it with `direction` as its method. Raises UsageError without sites."""
         if "sites" not in options:
             raise UsageError("--kind erase needs --sites, such as --sites backbone.02")
         method = options.pop("direction", LEACE)
         return super().from_options(run, method=method, **options)
 
     @property
-    def kind(self) -> str:
-        """`erase`."""
-        return ERASE
-
-    @property
     def fits_first(self) -> bool:
-        """Always."""
+        """Whether erasers are fitted first: always."""
         return True
 
-    def parameters(self) -> dict[str, Any]:
-        """Where, how and beside how many controls."""
-        return {
-            "sites": list(self.sites), "roles": list(self.roles), "method": self.method,
-            "controls": self.controls, "seed": self.seed,
-        }  # fmt: skip
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Return clean, then every cell untouched, erased and with its controls. Raises UnknownSiteError."""
+        from probe_kit.intervene.directions import PassedOver, collect_token_features
 
-    def conditions(self, session: ReplaySession) -> Sequence[Condition]:
-        """Clean, then every place and role untouched, erased and with its controls. Raises UnknownSiteError."""
-        found = resolve_all(self.sites, session.policy)
-        wanted = {place: roles_of(session.policy, place.stream, self.roles) for place in found.values()}
-        if not any(wanted.values()):
-            raise UsageError(f"no token of {', '.join(found)} has the role {', '.join(self.roles)}")
-        cells: dict[tuple[SiteGroup, str], _FittedErasers] = {}
+        places = resolve_all(self.sites, session.policy)
+        cells = cells_at(session, places.values(), self.roles)
+        if not cells:
+            raise UsageError(f"no token of {', '.join(places)} has the role {', '.join(self.roles)}")
+        erased: dict[Cell, dict[str, ErasedCondition]] = {}
         passed_over = PassedOver(session, self.sites)
-        for place, role, category, own in collect_token_features(session, items_of(session.run, self), wanted):
-            with passed_over.fitting(place, role):
-                self._fit(cells.setdefault((place, role), _FittedErasers()), place, role, category, own)
-        left = passed_over.left(cells)
-        return [CleanRun(), *(erased for (place, role), cell in left.items() for erased in cell.at(place, role))]
+        for cell, category, features in collect_token_features(session, self.items_in(session.run), cells):
+            with passed_over.fitting(cell):
+                self._fit(erased.setdefault(cell, {}), cell, category, features)
+        return [CleanRun(), *(one for by_name in passed_over.left(erased).values() for one in by_name.values())]
 
-    def certificate_entries(self, conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, Any]:
-        """How well a fresh probe reads the answer behind each condition, by category."""
-        del found
-        return {
-            PROBE_ACCURACY: {
-                one.name: dict(one.probe_accuracy) for one in conditions if isinstance(one, ErasedCondition)
-            }
-        }
+    def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
+        """Return how well a fresh probe reads the answer behind each condition, by category."""
+        del batch
+        erased = [one for one in conditions if isinstance(one, ErasedCondition)]
+        return {PROBE_ACCURACY: {one.name: dict(one.probe_accuracy) for one in erased}}
 
-    def _fit(self, cell: "_FittedErasers", place: SiteGroup, role: str, category: str, own: TokenFeatures) -> None:
-        """Add one category's erasers, and what is readable with each and without."""
-        fits = fit_by_fold(own, place.only_site, role, Method.of(self.method), self.controls, self.seed, category)
+    def _fit(
+        self, by_name: "dict[str, ErasedCondition]", cell: Cell, category: str, features: "TokenFeatures"
+    ) -> None:
+        """Add one category's erasers, and what is readable with each and without; untouched comes first."""
+        from probe_kit.intervene.directions import by_episode, fit_by_fold
+
+        fits = fit_by_fold(features, cell, Method.of(self.method), self.controls, self.seed, category)
         folds = [fold for fold, _ in fits]
-        cell.probe_accuracy.setdefault(UNTOUCHED, {})[category] = _probe_accuracy(own, folds, None)
-        for name, of_episode in by_episode(own, fits).items():
-            cell.erasers.setdefault(name, {}).update(of_episode)
-            fitted = [by_name[name] for _, by_name in fits]
-            cell.probe_accuracy.setdefault(name, {})[category] = _probe_accuracy(own, folds, fitted)
+        erasers: dict[str, dict[str, Eraser]] = {UNTOUCHED: {}, **by_episode(features, fits)}
+        for name, of_episode in erasers.items():
+            condition = by_name.setdefault(name, ErasedCondition(cell, name, {}, {}))
+            condition.erasers.update(of_episode)
+            fitted = [by_fold[name] for _, by_fold in fits] if of_episode else None
+            condition.probe_accuracy[category] = _probe_accuracy(features, folds, fitted)
+
+    @staticmethod
+    def effects(measurement: Measurement) -> "list[ErasureEffect]":
+        """Return one per category and condition."""
+        accuracies = measurement.certificate.get(PROBE_ACCURACY, {})
+        return erasure_effects(measurement.outcomes, measurement.seed_text, measurement.key, accuracies)
+
+    @staticmethod
+    def table(rows: "Sequence[ErasureEffect]", context: TableContext) -> "ResponsiveTable":
+        """Return one line per category and place; controls are columns of what is compared with them."""
+        edits = [row for row in rows if row.finding not in ("control", "identity patch")]
+        return effect_table(
+            f"What is lost without it? {context.subject}, erase",
+            _LEGEND,
+            "category · erased",
+            lines_of(edits, lambda row: row.name),
+            {"What the action does": _ACTION, "What a probe reads": _PROBE},
+            lambda row: row.finding == "effect",
+        )
+
+    @staticmethod
+    def sentences(rows: "Sequence[ErasureEffect]", context: TableContext) -> list[str]:
+        """Return one per category: which erasures take the answer from the action."""
+        del context
+        return category_sentences(edits_by_category(rows), _finding)
+
+    @staticmethod
+    def notes(rows: "Sequence[ErasureEffect]", measurement: Measurement) -> list[str]:
+        """Return how weak the evidence is, probes at chance, and controls that disrupt."""
+        del measurement
+        blind = [row for row in rows if row.finding == "no effect" and (row.probe_accuracy or 1.0) < CHANCE_LIKE]
+        broken = [row for row in rows if row.finding == "controls also disrupt"]
+        return [
+            "Erasure is weaker evidence than interchange: what is read need not be linear, and may pass "
+            "elsewhere. Loss beyond the controls is evidence of use. Absence of loss is not evidence against it.",
+            *(
+                f"{row.category}, {row.name}: the probe is at chance, and the action is as before."
+                for row in blind
+            ),
+            *(
+                f"{row.category}, {row.name}: random subspaces of the same rank disrupt the action too."
+                for row in broken
+            ),
+        ]
+
+
+KIND = ConceptErasure
 
 
 @dataclass(frozen=True)
 class ErasedCondition:
-    """The tokens of one role at one place, without what an eraser takes away.
+    """The tokens of one cell, without what an eraser takes away.
 
-    erasers: by episode, fitted without it; empty to write back what is there. readable: by category, the held-out
-    accuracy of a probe fitted on what is left, of the mean over tokens.
+    erasers: by episode, fitted without it; empty to write back what is there. probe_accuracy: by category, the
+    held-out accuracy of a probe fitted on what is left, of the mean over tokens.
     """
 
-    place: SiteGroup
-    role: str
-    what: str
-    erasers: Mapping[str, Eraser] = field(repr=False)
-    probe_accuracy: Mapping[str, float]
+    cell: Cell
+    direction: str
+    erasers: dict[str, Eraser] = field(repr=False)
+    probe_accuracy: dict[str, float]
 
     @property
     def name(self) -> str:
-        """See `ConditionName`."""
-        coefficient = ZERO if self.what == UNTOUCHED else ""
-        return str(ConditionName(self.place.name, self.role, self.what, coefficient))
+        """Return place, role and direction, see `ConditionName`."""
+        coefficient = ZERO if self.direction == UNTOUCHED else ""
+        return str(ConditionName(self.cell.place.name, self.cell.role, self.direction, coefficient))
 
     def play(self, context: ConditionContext) -> ConditionResult:
-        """The clean inference without it."""
-        replay_input, session = context.replay_input, context.session
-        tokens = role_tokens(session.policy, replay_input, self.place.stream, self.role, context.memo)
-        change = ApplyEraser(self.erasers[replay_input.episode_id]) if self.erasers else Identity()
-        with apply_patch(session.policy, self.place.sites, tokens, change) as edit_log:
-            chunk = session.act(replay_input.seen, replay_input.seed)
+        """Infer without it."""
+        pair, session, place = context.pair, context.session, self.cell.place
+        tokens = role_tokens(session.policy, pair, place.stream, self.cell.role, context.memo)
+        change = ApplyEraser(self.erasers[pair.episode]) if self.erasers else Identity()
+        with apply_patch(session.policy, place.sites, tokens, change) as edit_log:
+            chunk = session.act(pair.clean, pair.seed)
         return ConditionResult(chunk, edit_log)
-
-
-@dataclass
-class _FittedErasers:
-    """One place and role. erasers: by name and episode. readable: by name and category."""
-
-    erasers: dict[str, dict[str, Eraser]] = field(default_factory=dict)
-    probe_accuracy: dict[str, dict[str, float]] = field(default_factory=dict)
-
-    def at(self, place: SiteGroup, role: str) -> list[ErasedCondition]:
-        """Untouched first, then every eraser."""
-        return [
-            ErasedCondition(place, role, name, self.erasers.get(name, {}), own)
-            for name, own in self.probe_accuracy.items()
-        ]
 
 
 @dataclass(frozen=True)
@@ -234,7 +261,7 @@ class ApplyEraser:
         return after
 
 
-def _probe_accuracy(own: TokenFeatures, folds: Sequence[Fold], erasers: Sequence[Eraser] | None) -> float:
+def _probe_accuracy(own: "TokenFeatures", folds: Sequence[Fold], erasers: Sequence[Eraser] | None) -> float:
     """Held-out accuracy of a probe on the mean over tokens; chance is one half."""
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
@@ -311,12 +338,6 @@ class ErasureEffect(EffectRow):
         return {**super().to_json(), "finding": self.finding}
 
 
-def measured_erasure(measurement: Measurement) -> list[ErasureEffect]:
-    """The effects of a stored erasure."""
-    read = measurement.certificate.get(PROBE_ACCURACY, {})
-    return erasure_effects(measurement.outcomes, measurement.seed_text, measurement.key, read)
-
-
 def erasure_effects(
     outcomes: ConditionOutcomes, seed_text: str, key: str = "", probe_accuracy: ProbeAccuracies = _NOTHING
 ) -> list[ErasureEffect]:
@@ -325,21 +346,6 @@ def erasure_effects(
         row
         for category, own in outcomes.by_category()
         for row in _of_category(own, category, seed_text, key, probe_accuracy)
-    ]
-
-
-def erasure_notes(rows: Sequence[ErasureEffect], _: Measurement) -> list[str]:
-    """What a reader must know."""
-    blind = [row for row in rows if row.finding == "no effect" and (row.probe_accuracy or 1.0) < CHANCE_LIKE]
-    broken = [row for row in rows if row.finding == "controls also disrupt"]
-    return [
-        "Erasure is weaker evidence than interchange: what is read need not be linear, and may pass elsewhere. "
-        "Loss beyond the controls is evidence of use. Absence of loss is not evidence against it.",
-        *(f"{row.category}, {row.name}: the probe is at chance, and the action is as before." for row in blind),
-        *(
-            f"{row.category}, {row.name}: random subspaces of the same rank disrupt the action too."
-            for row in broken
-        ),
     ]
 
 
@@ -371,9 +377,9 @@ def _of_category(
                 net=float(net[at].mean()),
                 net_ci=net_interval(net[at], outcomes, seed_text),
                 mean_displacement=float(away[at].mean()),
-                control_kept=_mean(kept, test.controls),
-                control_net=_mean(net.mean(axis=1), test.controls),
-                control_displacement=_mean(away.mean(axis=1), test.controls),
+                control_kept=None if kept is None else mean_of(kept[test.controls]),
+                control_net=mean_of(net.mean(axis=1)[test.controls]),
+                control_displacement=mean_of(away.mean(axis=1)[test.controls]),
                 p=None if test.beyond is None else paired_greater_p(test.beyond, outcomes.items, outcomes.groups),
                 p_fwe=test.p_fwe,
                 probe_accuracy_before=probe_accuracy.get(before, {}).get(category),
@@ -384,71 +390,31 @@ def _of_category(
     return rows
 
 
-def _mean(values: NDArray[np.float64] | None, rows: Sequence[int]) -> float | None:
-    return None if values is None or not rows else float(values[list(rows)].mean())
-
-
-# -- table -------------------------------------------------------------------------------------------------
-
-
-def erasure_table(rows: Sequence[ErasureEffect], context: TableContext) -> "ResponsiveTable":
-    """One line per category and place; controls are columns of what is compared with them."""
-    from probe_kit._terminal.responsive_table import Part, ResponsiveTable
-
-    shown = [row for row in rows if row.finding not in ("control", "identity patch")]
-    return ResponsiveTable(
-        title=f"What is lost without it? {context.subject}, erase",
-        caption=_LEGEND,
-        name="category · erased",
-        names=tuple(f"{row.category} · {row.name}" for row in shown),
-        styles=tuple("bold" if row.finding == "effect" else "" for row in shown),
-        parts=(
-            Part(
-                "What the action does",
-                ("goes there %", "controls %", "kept", "controls", "displacement cm", "p", "relative change"),
-                tuple(_action_cells(row) for row in shown),
-            ),
-            Part(
-                "What a probe reads",
-                ("probe accuracy %", "finding"),
-                tuple(_probe_cells(row) for row in shown),
-            ),
-        ),
-    )
-
-
-def erasure_sentences(rows: Sequence[ErasureEffect], _: TableContext) -> list[str]:
-    """One per category: which erasures take the answer from the action."""
-    return [f"{category_of(name).title}: {_finding(own)}." for name, own in by_category(rows).items()]
-
-
 def _finding(rows: Sequence[ErasureEffect]) -> str:
     tried = [row for row in rows if row.finding != "identity patch"]
     if tried and all(row.finding == "no baseline effect" for row in tried):
         return "the unedited action does not go to the correct picture, so that nothing can be lost"
-    found = [f"{row.name} keeps {row.kept:.2f}" for row in tried if row.finding == "effect"]
-    return f"erasures that take the answer from the action beyond their controls: {count_edits(found, len(tried))}"
+    taken = [f"{row.name} keeps {row.kept:.2f}" for row in tried if row.finding == "effect"]
+    return f"erasures that take the answer from the action beyond their controls: {count_edits(taken, len(tried))}"
 
 
-def _action_cells(row: ErasureEffect) -> "tuple[Cell, ...]":
-    from probe_kit._terminal.responsive_table import Cell
-
-    beside = None if row.control_net is None else row.right_before - row.control_net
-    texts = (
-        f"{100 * row.right_before:.1f} → {100 * row.right:.1f}", "–" if beside is None else f"{100 * beside:.1f}",
-        "n/a" if row.kept is None else f"{row.kept:.2f}",
-        "–" if row.control_kept is None else f"{row.control_kept:.2f}",
-        f"{-100 * row.mean_displacement:+.2f}", "–" if row.p is None else f"{row.p:.2g}",
-        f"{row.relative_change:.2f}",
-    )  # fmt: skip
-    return tuple(map(Cell, texts))
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{100 * share:.1f}"
 
 
-def _probe_cells(row: ErasureEffect) -> "tuple[Cell, ...]":
-    from probe_kit._terminal.responsive_table import Cell
+def _accuracies(row: ErasureEffect) -> str:
+    if row.probe_accuracy_before is None or row.probe_accuracy is None:
+        return "–"
+    return f"{_percent(row.probe_accuracy_before)} → {_percent(row.probe_accuracy)}"
 
-    unknown = row.probe_accuracy_before is None or row.probe_accuracy is None
-    read = (
-        "–" if unknown else f"{100 * (row.probe_accuracy_before or 0):.1f} → {100 * (row.probe_accuracy or 0):.1f}"
-    )
-    return Cell(read), Cell(row.finding)
+
+_ACTION: Mapping[str, Any] = {
+    "goes there %": lambda row: f"{_percent(row.right_before)} → {_percent(row.right)}",
+    "controls %": lambda row: _percent(None if row.control_net is None else row.right_before - row.control_net),
+    "kept": lambda row: text_of(row.kept, missing="n/a"),
+    "controls": lambda row: text_of(row.control_kept),
+    "displacement cm": lambda row: f"{-100 * row.mean_displacement:+.2f}",
+    "p": lambda row: text_of(row.p, ".2g"),
+    "relative change": lambda row: f"{row.relative_change:.2f}",
+}
+_PROBE: Mapping[str, Any] = {"probe accuracy %": _accuracies, "finding": lambda row: row.finding}

@@ -17,20 +17,14 @@ from probe_kit._system.lazy import lazy_names
 if TYPE_CHECKING:
     from probe_kit.hooks.capturing.head_outputs import project_heads
     from probe_kit.hooks.capturing.logit_lens import logit_lens
-    from probe_kit.intervene.kinds.joint.cells import Cell, all_but
+    from probe_kit.intervene.pairs import Pair
     from probe_kit.intervene.patching.attribution import Screen, attribute_cells
-    from probe_kit.intervene.patching.cells import find_cells
     from probe_kit.intervene.patching.inference import HookPoint, run_with_cache, run_with_hooks
-    from probe_kit.intervene.patching.pairs import Pair, find_pairs
-    from probe_kit.intervene.patching.patch import patch_cells
+    from probe_kit.intervene.patching.patch import Cell, all_but, find_cells, patch_cells
     from probe_kit.intervene.patching.patterns import AttentionPattern, attention_patterns
-    from probe_kit.intervene.patching.sets import (
-        MinimalCells,
-        compare_alone_and_without,
-        find_minimal_cells,
-    )
+    from probe_kit.intervene.patching.sets import MinimalCells, compare_alone_and_without, find_minimal_cells
     from probe_kit.intervene.patching.sweep import Sweep, sweep_cells
-    from probe_kit.intervene.replay.session import open_session
+    from probe_kit.intervene.sessions.opening import find_pairs, open_session
 
 __all__ = [
     "AttentionPattern",
@@ -60,21 +54,21 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "AttentionPattern": "patterns",
-        "Cell": "probe_kit.intervene.kinds.joint.cells",
+        "Cell": "patch",
         "HookPoint": "inference",
         "MinimalCells": "sets",
-        "Pair": "pairs",
+        "Pair": "probe_kit.intervene.pairs",
         "Screen": "attribution",
         "Sweep": "sweep",
-        "all_but": "probe_kit.intervene.kinds.joint.cells",
+        "all_but": "patch",
         "attention_patterns": "patterns",
         "attribute_cells": "attribution",
         "compare_alone_and_without": "sets",
-        "find_cells": "cells",
+        "find_cells": "patch",
         "find_minimal_cells": "sets",
-        "find_pairs": "pairs",
+        "find_pairs": "probe_kit.intervene.sessions.opening",
         "logit_lens": "probe_kit.hooks.capturing.logit_lens",
-        "open_session": "probe_kit.intervene.replay.session",
+        "open_session": "probe_kit.intervene.sessions.opening",
         "patch_cells": "patch",
         "project_heads": "probe_kit.hooks.capturing.head_outputs",
         "run_with_cache": "inference",

@@ -1,9 +1,13 @@
-"""A screen by gradients over pairs: estimates for all cells, and exact patches of the anchors that test them."""
+"""A screen by gradients over pairs: estimates for all cells, and exact patches of the anchors that test them.
+
+One backward pass gives the estimates of all cells of a pair. As in attribution patching (Syed et al. 2023,
+https://arxiv.org/abs/2310.10348).
+"""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,35 +15,252 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.edits.sites import mask_of
-from probe_kit.intervene.kinds.attribution.effects import (
-    AttributionEffect,
-    order_cells,
+from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.outcomes import Effect
+from probe_kit.intervene.pairs import Given, Pair
+from probe_kit.intervene.patching.inference import infer
+from probe_kit.intervene.patching.patch import Cell, sites_of_cells
+from probe_kit.intervene.patching.sweep import (
+    DRAWS,
+    SwapShare,
+    Sweep,
+    share_columns,
     share_fields,
-    worst_anchor,
+    share_of_whole,
+    sweep_cells,
 )
-from probe_kit.intervene.kinds.attribution.screen import complete_cuts, sum_over_cells
-from probe_kit.intervene.kinds.attribution.table import describe_screen
-from probe_kit.intervene.kinds.joint.cells import Cell
-from probe_kit.intervene.kinds.swap_shares import share_of_whole
-from probe_kit.intervene.patching.inference import roles_of_tokens, run_with_cache
-from probe_kit.intervene.patching.pairs import Pair
-from probe_kit.intervene.patching.sweep import DRAWS, Sweep, sweep_cells
+from probe_kit.intervene.places import ALL, RESIDUAL, PlaceName, SiteGroup, resolve_sites
+from probe_kit.intervene.tokens import role_token_mask
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
     import pandas as pd
     from torch import Tensor
 
-    from probe_kit.hooks import Policy
+    from probe_kit.hooks import ActivationCache, Model, Policy
 
+Ends = Literal["clean", "both"]
+"""Where gradients are taken: at the clean input, or as the mean of that and of the source."""
 Slope = Callable[["Tensor"], "Tensor"]
-"""From actions (chunk, 7) to a number with a graph, such as metres to the left."""
+"""From actions (chunk, D) to a number with a graph, such as metres to the left."""
+EVERY_BLOCK = f"{KV_STREAM}.*"
+"""The anchor that is all of `kv`."""
+AGREEMENT = 3.0
+"""Factor within which an anchor's estimate must lie of its exact effect."""
+LOCALISATION_SHARE = 0.5
+"""Share of the whole effect from which a place is called localised."""
+FIRST = 3
+"""Cells that a sentence names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttributionEffect(Effect):
+    """One cell in one category.
+
+    place, role: of its tokens. is_anchor: a complete cut, patched exactly to test the screen. is_drawn: patched
+    exactly although its estimate was not among the largest. estimate, exact: shares of the image swap with 95 %
+    intervals by groups, None where the swap itself is not significant or no exact patch was made. p_fwe: of the
+    exact patch, one-sided, max-T over those of the category. rank: by estimate among the cells of its kind, 1 for
+    the largest; None in a void screen. finding: of the category's screen: `anchored`, `void`, or `n/a` where no
+    anchor carries the effect.
+    """
+
+    place: str
+    role: str
+    is_anchor: bool
+    is_drawn: bool
+    n_episodes: int
+    n_groups: int
+    estimate: float | None
+    estimate_ci: tuple[float, float] | None
+    exact: float | None
+    exact_ci: tuple[float, float] | None
+    p_fwe: float | None
+    rank: int | None = None
+    finding: str = "n/a"
+    key: str = ""
+
+    @property
+    def name(self) -> str:
+        """Return place and role."""
+        return f"{self.place} {self.role}"
+
+    @property
+    def kind(self) -> str:
+        """Return the kind of cells that it is ordered among; empty for an anchor."""
+        return "" if self.is_anchor else kind_of_place(self.place)
+
+
+# -- estimates -----------------------------------------------------------------------------------------------
+
+
+class Estimates(NamedTuple):
+    """One pair's outputs of the clean and the source's inference, and (C,) the estimate of every cell's patch."""
+
+    clean: Any
+    source: Any
+    by_cell: NDArray[np.float64]
+
+
+def estimate_patches(
+    model: "Policy",
+    pair: Pair,
+    cells: Sequence[Cell],
+    slope: Slope,
+    ends: Ends = "clean",
+    act: Callable[[Given, int], Any] | None = None,
+) -> Estimates:
+    """Return Σ (source − clean) · ∂ slope / ∂ activation, over the tokens and features of every cell.
+
+    act: how an inference is made; by default `infer`. Two inferences, and one with a backward pass; two of these
+    for both ends.
+    """
+    from probe_kit.hooks import capture, gradients_at
+
+    act = act or partial(infer, model)
+    sites = sites_of_cells(cells)
+    captured = []
+    for given in (pair.clean, pair.source):
+        with capture(model, sites) as cache:
+            captured.append((act(given, pair.seed), cache))
+    (clean, activations), (moved, source) = captured
+    slopes = []
+    for given in (pair.clean, pair.source)[: 1 + (ends == "both")]:
+        assert isinstance(given, Observation)
+        slopes.append(gradients_at(model, [given], [pair.seed], sites, lambda chunks: slope(chunks[0]))[1])
+    memo: dict[Any, Any] = {}
+    masks = [role_token_mask(model, pair, cell.place.stream, cell.role, memo) for cell in cells]
+    return Estimates(clean, moved, sum_over_cells(activations, source, slopes, cells, masks))
+
+
+def sum_over_cells(
+    clean: "ActivationCache",
+    source: "ActivationCache",
+    slopes: "Sequence[ActivationCache]",
+    cells: Sequence[Cell],
+    masks: Sequence[NDArray[np.bool_]],
+) -> NDArray[np.float64]:
+    """Return (C,) Σ (source − clean) · slope over the tokens and features of every cell, in one inference.
+
+    slopes: the gradients at the same sites, of which the mean is taken. masks: (T,) the tokens of every cell.
+    """
+    products = {
+        site: (source[site].float() - clean[site].float())[0] * sum(one[site][0] for one in slopes) / len(slopes)
+        for site in sites_of_cells(cells)
+    }
+    return np.array(
+        [
+            sum(float(_of_head(products[site], cell.place)[tokens].sum()) for site in cell.place.sites)
+            for cell, tokens in zip(cells, masks, strict=True)
+        ]
+    )
+
+
+def _of_head(product: "Tensor", place: SiteGroup) -> NDArray[np.float64]:
+    """Return (T, D) of all features, or of those of the place's head."""
+    if place.head is not None:
+        width = product.shape[-1] // place.heads
+        product = product[:, place.head * width : (place.head + 1) * width]
+    features: NDArray[np.float64] = product.double().cpu().numpy()
+    return features
+
+
+def complete_cuts(model: "Model", places: Sequence[SiteGroup]) -> list[Cell]:
+    """Return the anchors of a screen: all of `kv`, and all tokens of each backbone layer in which a place lies."""
+    streams = {name: stream for name, stream in model.streams.items() if stream.part == "backbone"}
+    layers = [f"{place.stream}.{place.sites[0].layer:02d}" for place in places if place.stream in streams]
+    cuts = [place for name in dict.fromkeys(layers) for place in resolve_sites(name, model)]
+    if model.prompt_kv is not None:
+        blocks = resolve_sites(EVERY_BLOCK, model)
+        cuts.insert(0, SiteGroup(EVERY_BLOCK, tuple(site for block in blocks for site in block.sites)))
+    elif not cuts:
+        cuts = resolve_sites(f"{next(iter(streams))}.00", model)
+    return [Cell(place, ALL) for place in cuts]
+
+
+# -- order ---------------------------------------------------------------------------------------------------
+
+
+def worst_anchor(rows: Sequence[AttributionEffect]) -> AttributionEffect | None:
+    """Return, of the anchors that carry half of the effect, the one that its estimate misses most, if any."""
+    carrying = [row for row in rows if row.is_anchor and (row.exact or 0.0) >= LOCALISATION_SHARE]
+    return min(carrying, key=_agreement, default=None)
+
+
+def _agreement(row: AttributionEffect) -> float:
+    """Return 1 for an exact estimate, towards 0 for one that is too small, too large or of the other sign."""
+    ratio = (row.estimate or 0.0) / (row.exact or 1.0)
+    return 0.0 if ratio <= 0 else min(ratio, 1 / ratio)
+
+
+def order_cells(rows: Sequence[AttributionEffect]) -> list[AttributionEffect]:
+    """Return rows of one category with rank and finding: the anchors, then the cells of each kind."""
+    worst = worst_anchor(rows)
+    finding = "n/a" if worst is None else "anchored" if _agreement(worst) * AGREEMENT >= 1 else "void"
+    rows = [replace(row, finding=finding) for row in rows]
+    ordered = [row for row in rows if row.is_anchor]
+    for kind in dict.fromkeys(row.kind for row in rows if not row.is_anchor):
+        cells = [row for row in rows if row.kind == kind]
+        if finding == "anchored":
+            cells = sorted(cells, key=lambda row: -abs(row.estimate or 0.0))
+            cells = [replace(row, rank=at + 1) for at, row in enumerate(cells)]
+        ordered += cells
+    return ordered
+
+
+def kind_of_place(name: str) -> str:
+    """Return what a place can be compared with: `kv`, `backbone`, `backbone heads`, `expert iterations`."""
+    place = PlaceName.parse(name)
+    further = [place.quantity * (place.quantity != RESIDUAL), "iterations" * (place.iterations is not None)]
+    return " ".join(filter(None, (place.stream, *further)))
+
+
+def describe_screen(rows: Sequence[AttributionEffect]) -> str:
+    """Return the test on the anchors, and the first cells of each kind unless the screen is void; one category."""
+    worst = worst_anchor(rows)
+    if worst is None:
+        return "no anchor carries the effect, so that there is no order"
+    if worst.finding == "void":
+        return f"{describe_void(rows)}; no order is shown"
+    kinds = dict.fromkeys(row.kind for row in rows)
+    firsts = [_first([row for row in rows if row.kind == kind]) for kind in kinds]
+    drawn = [abs(row.exact) for row in rows if row.is_drawn and row.exact is not None]
+    missed = [f"of {len(drawn)} drawn cells the largest exact effect is {max(drawn):.2f}"] if drawn else []
+    return "; ".join([_compared(worst), *filter(None, firsts), *missed])
+
+
+def describe_void(rows: Sequence[AttributionEffect]) -> str:
+    """Return why a screen is void."""
+    worst = worst_anchor(rows)
+    assert worst is not None
+    return f"screen void: {_compared(worst)}"
+
+
+def _first(rows: Sequence[AttributionEffect]) -> str:
+    """Return the largest estimates of one kind; empty for the anchors, which have no rank."""
+    first = [
+        f"{row.name} {_two(row.estimate)}{'' if row.exact is None else f', exact {_two(row.exact)}'}"
+        for row in rows
+        if row.rank is not None and row.rank <= FIRST
+    ]
+    return f"first of {rows[0].kind}: {', '.join(first)}" if first else ""
+
+
+def _compared(anchor: AttributionEffect) -> str:
+    return f"gradients give {_two(anchor.estimate)} where the patch gives {_two(anchor.exact)} ({anchor.name})"
+
+
+def _two(value: float | None) -> str:
+    """Return two digits, and zero without a sign."""
+    return "–" if value is None else f"{round(value, 2) + 0.0:.2f}"
+
+
+# -- in Python -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Screen:
-    """What gradients estimate of each cell, and whether they can be believed.
+    """Estimates by gradients of each cell, and whether they can be believed.
 
     rows: the anchors, then the cells of each kind by rank; in a void screen in the order in which they were given.
     cells: by name.
@@ -50,17 +271,17 @@ class Screen:
 
     @property
     def finding(self) -> str:
-        """`anchored`, `void`, or `n/a` where no anchor carries the effect of the source."""
+        """Return `anchored`, `void`, or `n/a` where no anchor carries the effect of the source."""
         return self.rows[0].finding
 
     @property
     def anchor(self) -> AttributionEffect | None:
-        """Of the complete cuts that carry the effect, the one that its estimate misses most; None without one."""
+        """Return the complete cut that carries the effect and that its estimate misses most; None without one."""
         return worst_anchor(self.rows)
 
     @cached_property
     def table(self) -> "pd.DataFrame":
-        """One row per anchor and cell.
+        """Return one row per anchor and cell.
 
         Columns: cells; kind, empty for an anchor; rank within the kind, NaN unless the screen is anchored;
         estimate with estimate_low, estimate_high; exact with exact_low, exact_high, of anchors alone. Shares are
@@ -69,17 +290,20 @@ class Screen:
         import pandas as pd
 
         return pd.DataFrame(
-            {
-                "cells": [row.name for row in self.rows],
-                "kind": [row.kind for row in self.rows],
-                "rank": [np.nan if row.rank is None else row.rank for row in self.rows],
-                **_columns("estimate", [(row.estimate, row.estimate_ci) for row in self.rows]),
-                **_columns("exact", [(row.exact, row.exact_ci) for row in self.rows]),
-            }
+            [
+                {
+                    "cells": row.name,
+                    "kind": row.kind,
+                    "rank": np.nan if row.rank is None else row.rank,
+                    **share_columns("estimate", _share(row.estimate, row.estimate_ci)),
+                    **share_columns("exact", _share(row.exact, row.exact_ci)),
+                }
+                for row in self.rows
+            ]
         )
 
     def choose(self, top: int = 20, drawn: int = 20, seed: int = 0) -> tuple[tuple[Cell, ...], tuple[Cell, ...]]:
-        """Cells for exact patches: of each kind the `top` largest estimates, and `drawn` of all other cells.
+        """Return cells for exact patches: of each kind the `top` largest estimates, and `drawn` of all others.
 
         The largest exact effect of the drawn ones bounds what the screen missed. Raises UsageError for a screen
         that is not anchored: it has no order.
@@ -88,55 +312,38 @@ class Screen:
             raise UsageError(f"{self}; patch cells exactly with sweep_cells, or sets with find_minimal_cells")
         ranked = [row for row in self.rows if row.rank is not None]
         largest = [row.name for row in ranked if (row.rank or 0) <= top]
-        rest = [row.name for row in ranked if (row.rank or 0) > top]
-        draw = np.random.default_rng(derive_seed("screen", seed)).permutation(len(rest))[:drawn]
-        names = largest, [rest[at] for at in sorted(draw.tolist())]
-        chosen, others = (tuple(self.cells[name] for name in own) for own in names)
-        return chosen, others
+        others = [row.name for row in ranked if (row.rank or 0) > top]
+        draw = np.random.default_rng(derive_seed("screen", seed)).permutation(len(others))[:drawn]
+        names = largest, [others[at] for at in sorted(draw.tolist())]
+        first, second = (tuple(self.cells[name] for name in part) for part in names)
+        return first, second
 
     def __str__(self) -> str:
         return describe_screen(self.rows)
 
 
 def attribute_cells(model: "Policy", pairs: Sequence[Pair], cells: Sequence[Cell], metric: Slope) -> Screen:
-    """Estimate what a patch of every cell would do, by attribution patching, and test the estimates on anchors.
+    """Estimate the effect of a patch of every cell, by attribution patching, and test the estimates on anchors.
 
-    The estimate is Σ (source − clean) · ∂ metric / ∂ activation at the clean inference (Syed et al. 2023,
-    https://arxiv.org/abs/2310.10348). Anchors are patched exactly: all of `kv`, and all tokens of each layer of
-    the backbone with a cell. If one that carries the effect is missed by more than a factor of 3, the screen is
-    void.
+    Anchors are patched exactly: all of `kv`, and all tokens of each layer of the backbone with a cell. If one that
+    carries the effect is missed by more than a factor of 3, the screen is void.
 
-    metric: of actions (chunk, 7), with a graph, such as `session.lateral_motion`. Cost per pair: two inferences,
+    metric: of actions (chunk, D), with a graph, such as `session.lateral_motion`. Cost per pair: two inferences,
     one with a backward pass, and one per anchor. Raises UnsupportedInterventionError, before any inference, for a
     family without gradients; UsageError without pairs or cells, and for pairs of questions.
     """
-    own = tuple(dict.fromkeys(cells))
+    screened = tuple(dict.fromkeys(cells))
     model.interventions.check("gradients", model.card.family)
-    if not pairs or not own:
-        raise UsageError(f"a screen of {len(own)} cells in {len(pairs)} pairs; give at least one of both")
+    if not pairs or not screened:
+        raise UsageError(f"a screen of {len(screened)} cells in {len(pairs)} pairs; give at least one of both")
     if not all(isinstance(pair.clean, Observation) for pair in pairs):
         raise UsageError("gradients are of actions; give pairs of observations, not of questions")
-    anchors = complete_cuts(model, list(dict.fromkeys(cell.place for cell in own)))
-    every = (*anchors, *(cell for cell in own if cell not in anchors))
-    estimates = np.array([_estimates(model, pair, every, metric) for pair in pairs]).T
+    anchors = complete_cuts(model, list(dict.fromkeys(cell.place for cell in screened)))
+    every = (*anchors, *(cell for cell in screened if cell not in anchors))
+    estimates = np.array([estimate_patches(model, pair, every, metric).by_cell for pair in pairs]).T
     exact = sweep_cells(model, pairs, anchors, lambda actions, _: _number(metric, actions))
     rows = [_row(cell, moved, exact, anchors) for cell, moved in zip(every, estimates, strict=True)]
     return Screen(tuple(order_cells(rows)), {str(cell): cell for cell in every})
-
-
-def _estimates(model: "Policy", pair: Pair, cells: Sequence[Cell], metric: Slope) -> NDArray[np.float64]:
-    """(C,) of one pair, in the unit of the metric."""
-    from probe_kit.hooks import gradients_at
-
-    assert isinstance(pair.clean, Observation)
-    places = list(dict.fromkeys(cell.place.name for cell in cells))
-    _, own = run_with_cache(model, pair.clean, pair.seed, places)
-    _, source = run_with_cache(model, pair.source, pair.seed, places)
-    sites = dict.fromkeys(site for cell in cells for site in cell.place.sites)
-    _, slopes = gradients_at(model, [pair.clean], [pair.seed], sites, lambda actions: metric(actions[0]))
-    roles = roles_of_tokens(model, pair.clean)
-    masks = [mask_of(roles[cell.place.stream], cell.place.stream, cell.role) for cell in cells]
-    return sum_over_cells(own, source, [slopes], cells, masks)
 
 
 def _number(metric: Slope, actions: NDArray[np.float32]) -> float:
@@ -146,11 +353,11 @@ def _number(metric: Slope, actions: NDArray[np.float32]) -> float:
 
 
 def _row(cell: Cell, moved: NDArray[np.float64], exact: Sweep, anchors: Sequence[Cell]) -> AttributionEffect:
-    """Estimate and exact effect of one cell, before it has a rank. moved: (E,) estimated per pair."""
+    """Return estimate and exact effect of one cell, before it has a rank. moved: (E,) estimated per pair."""
     is_anchor = cell in anchors
     at = anchors.index(cell) if is_anchor else 0
-    is_shown = exact.source_p < SIGNIFICANCE
-    estimate = share_of_whole(moved, exact.whole, exact.groups, DRAWS) if is_shown else None
+    is_significant = exact.source_p < SIGNIFICANCE
+    estimate = share_of_whole(moved, exact.whole, exact.groups, DRAWS) if is_significant else None
     return AttributionEffect(
         category="",
         place=cell.place.name,
@@ -162,18 +369,8 @@ def _row(cell: Cell, moved: NDArray[np.float64], exact: Sweep, anchors: Sequence
         **share_fields("estimate", estimate),
         **share_fields("exact", exact.shares[at] if is_anchor else None),
         p_fwe=float(exact.table["p_fwe"][at]) if is_anchor else None,
-        rank=None,
-        finding="n/a",
     )
 
 
-def _columns(
-    name: str, shares: Sequence[tuple[float | None, tuple[float, float] | None]]
-) -> dict[str, list[float]]:
-    """A share and its interval as columns."""
-    limits = [(np.nan, np.nan) if ends is None else ends for _, ends in shares]
-    return {
-        name: [np.nan if value is None else value for value, _ in shares],
-        f"{name}_low": [low for low, _ in limits],
-        f"{name}_high": [high for _, high in limits],
-    }
+def _share(value: float | None, limits: tuple[float, float] | None) -> SwapShare | None:
+    return None if value is None or limits is None else SwapShare(value, *limits)

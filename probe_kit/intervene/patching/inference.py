@@ -11,15 +11,16 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.edits.sites import RESIDUAL, resolve_sites
+from probe_kit.intervene.pairs import Given
+from probe_kit.intervene.places import RESIDUAL, resolve_sites
+from probe_kit.intervene.tokens import ANSWERS_NOTHING, roles_of_tokens
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from probe_kit.hooks import ActivationCache, Model, Prompt, Reading, Roles
+    from probe_kit.hooks import ActivationCache, Model, Reading, Roles
 
-Given = Union[Observation, "Prompt"]
-"""An observation of a policy, or a question to a model that answers."""
+
 Output = Union[NDArray[np.float32], "Reading"]
 """(chunk, 7) actions of a policy, or what a model that answers read."""
 
@@ -37,7 +38,6 @@ class HookPoint:
         return self.site.iteration
 
 
-_ANSWERS_NOTHING = "{} answers no questions: give it an observation"
 HookFunction = Callable[["Tensor", HookPoint], "Tensor"]
 """From an activation (1, T, D) and its place to the activation that passes instead, of the same shape."""
 
@@ -53,20 +53,7 @@ def infer(model: "Model", given: Given, seed: int = 0) -> Output:
         raise UsageError(f"{model.card.family} does not act: give it a question, hooks.Prompt(observation, text)")
     if isinstance(model, AnswerModel):
         return model.read([given])
-    raise UsageError(_ANSWERS_NOTHING.format(model.card.family))
-
-
-def roles_of_tokens(model: "Model", given: Given) -> "dict[str, Roles]":
-    """By stream the roles of its tokens in one inference, those of `kv` among them."""
-    from probe_kit.hooks import AnswerModel
-
-    if isinstance(given, Observation):
-        rows = model.token_roles([given])
-    elif isinstance(model, AnswerModel):
-        rows = model.asked_roles([given])
-    else:
-        raise UsageError(_ANSWERS_NOTHING.format(model.card.family))
-    return {name: own[0] for name, own in rows.items()}
+    raise UsageError(ANSWERS_NOTHING.format(model.card.family))
 
 
 def sites_of(model: "Model", patterns: Sequence[str]) -> list[Site]:

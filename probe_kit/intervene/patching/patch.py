@@ -1,27 +1,38 @@
-"""One patched inference: the activations of cells come from another inference."""
+"""Cells, and one patched inference: the activations of cells come from another inference."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, MutableMapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.capturing.edit_engine import apply_patches
-from probe_kit.hooks.capturing.token_edits import (
-    ReplaceInSubspace,
-    ReplaceWith,
-    TokenEdit,
-    TokenSelection,
-)
+from probe_kit.hooks.capturing.edit_engine import EditLog, apply_patches
+from probe_kit.hooks.capturing.token_edits import ReplaceInSubspace, ReplaceWith, TokenEdit, TokenSelection
+from probe_kit.hooks.contract.interventions import ALL_EDITS
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.edits.sites import mask_of
-from probe_kit.intervene.kinds.joint.cells import Cell
-from probe_kit.intervene.patching.inference import Output, infer, roles_of_tokens, run_with_cache
-from probe_kit.intervene.patching.pairs import Pair
+from probe_kit.hooks.contract.views import plays
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.patching.inference import Output, infer, run_with_cache
+from probe_kit.intervene.places import ALL, SEPARATOR, TILE_ROLES, SiteGroup, positions_of, resolve_sites
+from probe_kit.intervene.tokens import role_tokens
 
 if TYPE_CHECKING:
     from probe_kit.hooks import ActivationCache, Model
+
+
+@dataclass(frozen=True)
+class Cell:
+    """The tokens of one role at one place."""
+
+    place: SiteGroup
+    role: str
+
+    def __str__(self) -> str:
+        return f"{self.place.name} {self.role}"
+
 
 Cells = Cell | Sequence[Cell]
 """One cell, or several that are patched together in one inference."""
@@ -29,18 +40,60 @@ Basis = NDArray[np.floating]
 """(K, D), orthonormal rows."""
 
 
+def all_but(cells: tuple[Cell, ...], left_out: tuple[Cell, ...]) -> tuple[Cell, ...]:
+    """Return the cells without some of them, in their order."""
+    return tuple(cell for cell in cells if cell not in left_out)
+
+
+def sites_of_cells(cells: Sequence[Cell]) -> tuple[Site, ...]:
+    """Return the sites of all cells, each once."""
+    return tuple(dict.fromkeys(site for cell in cells for site in cell.place.sites))
+
+
+def find_cells(model: "Model", *patterns: str) -> tuple[Cell, ...]:
+    """Return the cells that patterns of the form `PLACES|ROLES` name, in their order, each once.
+
+    PLACES as for `--sites`: `backbone.*`, `kv.02`, `expert.03@0-4`, `backbone.*.heads.*`. ROLES, separated by
+    commas: `all`, roles of the stream's tokens such as `image`, or positions such as `7` or `7-11`; without, all
+    tokens. Raises UnknownSiteError for a place that is not there, UsageError for a role that no token can have.
+    """
+    cells = []
+    for pattern in patterns:
+        places, _, roles = pattern.partition(SEPARATOR)
+        for place in resolve_sites(places, model):
+            for role in roles.split(",") if roles else (ALL,):
+                _check_role(model, place.stream, role.strip())
+                cells.append(Cell(place, role.strip()))
+    if not cells:
+        raise UsageError("no pattern was given; name cells such as 'backbone.*|image'")
+    return tuple(dict.fromkeys(cells))
+
+
+def _check_role(model: "Model", stream: str, role: str) -> None:
+    names = model.role_names.get(model.tokens_of(stream), ())
+    has_tiles = getattr(model, "interventions", ALL_EDITS).supports("tiles")
+    if role == ALL or positions_of(role) or any(plays(name, role) for name in names):
+        return
+    if role in TILE_ROLES and has_tiles and any(plays(name, "image") for name in names):
+        return
+    raise UsageError(
+        f"no token of {stream} has the role {role!r}; expected one of {', '.join((ALL, *names))}, or "
+        "positions such as 7-11"
+    )
+
+
 def patch_cells(
     model: "Model", pair: Pair, cells: Cells, *, along: Basis | None = None, rest: bool = False
 ) -> Output:
-    """The output of the clean inference with the cells' activations from the source.
+    """Return the output of the clean inference with the cells' activations from the source.
 
     along: patch only the component within the span of its rows (K, D), at every cell. rest: patch all but that
     component. Two inferences. Raises EmptyRoleError for a role that no token has now, UsageError for a basis that
     is not orthonormal, CaptureError for a source with another number of tokens.
     """
-    own = together(cells)
-    _, source = run_with_cache(model, pair.source, pair.seed, [cell.place.name for cell in own])
-    return infer_patched(model, pair, own, source, along, rest)
+    together = as_tuple(cells)
+    _, source = run_with_cache(model, pair.source, pair.seed, [cell.place.name for cell in together])
+    return infer_patched(model, pair, together, source, along, rest)
 
 
 def infer_patched(
@@ -51,25 +104,42 @@ def infer_patched(
     along: Basis | None = None,
     rest: bool = False,
 ) -> Output:
-    """The same with activations of the source that are captured already; one inference."""
-    roles = roles_of_tokens(model, pair.clean)
-    changes: dict[Site, list[tuple[TokenSelection, TokenEdit]]] = {}
-    for cell in cells:
-        mask = mask_of(roles[cell.place.stream], cell.place.stream, cell.role)
-        tokens = TokenSelection.of(mask, model.card.device)
-        change = cell.place.limit(_change(source, mask.size, along, rest))
-        for site in cell.place.sites:
-            changes.setdefault(site, []).append((tokens, change))
-    with apply_patches(model, changes):
+    """Return the same with activations of the source that are captured already; one inference."""
+    with patched(model, pair, cells, source, along, rest):
         return infer(model, pair.clean, pair.seed)
 
 
-def together(cells: Cells) -> tuple[Cell, ...]:
-    """One cell or several as a tuple. Raises UsageError for none."""
-    found = (cells,) if isinstance(cells, Cell) else tuple(cells)
-    if not found:
+@contextmanager
+def patched(
+    model: "Model",
+    pair: Pair,
+    cells: Sequence[Cell],
+    source: "ActivationCache",
+    along: Basis | None = None,
+    rest: bool = False,
+    memo: MutableMapping[Any, Any] | None = None,
+) -> Iterator[EditLog]:
+    """Patch cells of a pair while the model infers once; every patch of the package is made here.
+
+    memo: what is known of the pair's tokens, shared by its patches. Gives the log of the edits.
+    """
+    memo = {} if memo is None else memo
+    changes: dict[Site, list[tuple[TokenSelection, TokenEdit]]] = {}
+    for cell in cells:
+        tokens = role_tokens(model, pair, cell.place.stream, cell.role, memo)
+        change = cell.place.limit(_change(source, tokens.count, along, rest))
+        for site in cell.place.sites:
+            changes.setdefault(site, []).append((tokens, change))
+    with apply_patches(model, changes) as log:
+        yield log
+
+
+def as_tuple(cells: Cells) -> tuple[Cell, ...]:
+    """Return one cell or several as a tuple. Raises UsageError for none."""
+    together = (cells,) if isinstance(cells, Cell) else tuple(cells)
+    if not together:
         raise UsageError("no cell is given; name at least one with find_cells(model, 'backbone.02|image')")
-    return found
+    return together
 
 
 def _change(source: "ActivationCache", tokens: int, along: Basis | None, rest: bool) -> TokenEdit:

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import EmptyRoleError, RolesMismatchError
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.patching.inference import Given, infer, roles_of_tokens, sites_of
+from probe_kit.intervene.pairs import Given
+from probe_kit.intervene.patching.inference import infer, sites_of
+from probe_kit.intervene.tokens import roles_of_tokens
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Model, Roles

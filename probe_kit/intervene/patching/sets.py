@@ -1,24 +1,118 @@
 """Sets of cells: each alone and all but it, and the smallest set that keeps the effect."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.intervene.kinds.joint.cells import Cell, all_but
-from probe_kit.intervene.kinds.joint.effects import finding_of_cell
-from probe_kit.intervene.kinds.joint.minimal_set import KEEP, find_minimal_set
-from probe_kit.intervene.kinds.joint.search import choosing_half
-from probe_kit.intervene.kinds.swap_shares import SwapShare, share_of_whole
-from probe_kit.intervene.patching.pairs import Pair, groups_and_items
-from probe_kit.intervene.patching.sweep import DRAWS, Metric, Sweep, sweep_cells
+from probe_kit.hashing import derive_seed
+from probe_kit.intervene.pairs import Pair, groups_and_items
+from probe_kit.intervene.patching.patch import Cell, all_but
+from probe_kit.intervene.patching.sweep import (
+    DRAWS,
+    Metric,
+    SwapShare,
+    Sweep,
+    share_columns,
+    share_of_whole,
+    sweep_cells,
+)
+from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from probe_kit.hooks import Model
+
+
+MOST_SINGLY = 30
+"""Cells up to which each is left out in turn; of more, halves are, then quarters and so on (delta debugging)."""
+KEEP = 0.9
+"""Share of the whole set's effect that the smaller one must keep."""
+CARRIES, NOTHING = 0.5, 0.1
+"""Shares of the swap from which a set carries it, and below which, on both sides of 0, it carries nothing."""
+
+
+@dataclass(frozen=True)
+class MinimalSet[C]:
+    """A set of which no cell can be left out. effect: of these cells. tried: how many sets were tried."""
+
+    cells: tuple[C, ...]
+    effect: float
+    tried: int
+
+
+def find_minimal_set[C](
+    cells: Sequence[C], effects: Callable[[Sequence[tuple[C, ...]]], Sequence[float]], keep: float = KEEP
+) -> MinimalSet[C]:
+    """Leave out cells while `keep` of the effect of all of them stays; of equal ones the first is left out.
+
+    effects: the effect of each of some sets. At most n (n + 1) / 2 sets of up to `MOST_SINGLY` cells are tried.
+    Adding cells one by one would stop at once where a majority decides: no first cell has an effect.
+    """
+    have = tuple(cells)
+    (whole,) = effects([have])
+    effect, tried, is_singly = whole, 1, len(have) <= MOST_SINGLY
+    parts = len(have) if is_singly else 2
+    while len(have) > 1:
+        smaller = [_without(have, chunk) for chunk in np.array_split(np.arange(len(have)), parts)]
+        found = effects(smaller)
+        tried += len(smaller)
+        best = int(np.argmax(found))
+        if found[best] >= keep * whole:
+            have, effect = smaller[best], found[best]
+            parts = len(have) if is_singly else max(2, min(parts - 1, len(have)))
+        elif parts < len(have):
+            parts = min(2 * parts, len(have))
+        else:
+            break
+    return MinimalSet(have, effect, tried)
+
+
+def _without[C](cells: tuple[C, ...], left_out: Sequence[int]) -> tuple[C, ...]:
+    gone = set(map(int, left_out))
+    return tuple(cell for number, cell in enumerate(cells) if number not in gone)
+
+
+def pooled_share(moved: NDArray[np.float64], whole: NDArray[np.float64]) -> float:
+    """Return Σ moved · whole / Σ whole² over pairs (E,); 0 where the whole moves nothing."""
+    total = float((whole**2).sum())
+    return float((moved * whole).sum()) / total if total else 0.0
+
+
+def choosing_half(groups: Sequence[str], seed: int) -> tuple[str, ...]:
+    """Return one half of the groups, by a drawn order; the larger one of an odd number stays for scoring."""
+    names = sorted(set(groups))
+    order = np.random.default_rng(derive_seed("joint places", seed, *names)).permutation(len(names))
+    return tuple(sorted(names[at] for at in order[: len(names) // 2]))
+
+
+def carries_nothing(low: float, high: float) -> bool:
+    """Whether an interval of a share of the swap excludes, on both sides of 0, what would matter."""
+    return low > -NOTHING and high < NOTHING
+
+
+def finding_of_cell(alone: SwapShare | None, needed: SwapShare | None, every: SwapShare | None, p: float) -> str:
+    """Return a cell's finding from its shares alone and needed, all cells' share, and p of it alone."""
+    if alone is None or needed is None or every is None:
+        return "n/a"
+    carries = alone.value >= CARRIES and p < SIGNIFICANCE
+    if carries and needed.value >= CARRIES:
+        return "read here"
+    if carries and carries_nothing(needed.low, needed.high):
+        return "enough alone"
+    if carries_nothing(alone.low, alone.high) and needed.value >= CARRIES:
+        return "needed, not enough"
+    if max(alone.high, needed.high) < -NOTHING:
+        return "opposes it"
+    return (
+        "nothing alone"
+        if carries_nothing(alone.low, alone.high) and carries_nothing(needed.low, needed.high)
+        else "in part"
+    )
 
 
 @dataclass(frozen=True)
@@ -62,8 +156,8 @@ def compare_alone_and_without(
         rows.append(
             {
                 "cells": str(cell),
-                **_columns("alone", alone.shares[at]),
-                **_columns("needed", needed),
+                **share_columns("alone", alone.shares[at]),
+                **share_columns("needed", needed),
                 "p_fwe": p,
                 "finding": finding_of_cell(alone.shares[at], needed, swept.shares[0], p),
             }
@@ -95,10 +189,7 @@ def find_minimal_cells(
 
     def effects(sets: Sequence[tuple[Cell, ...]]) -> list[float]:
         swept = sweep_cells(model, chosen, sets, metric)
-        total = float((swept.whole**2).sum())
-        return [
-            float(((one - swept.clean) * swept.whole).sum()) / total if total else 0.0 for one in swept.patched
-        ]
+        return [pooled_share(values - swept.clean, swept.whole) for values in swept.patched]
 
     found = find_minimal_set(own, effects, keep)
     scored = sweep_cells(model, others, [found.cells], metric)
@@ -127,8 +218,3 @@ def _only(swept: Sweep, rows: range) -> Sweep:
         swept.source,
         swept.patched[np.array(rows)],
     )
-
-
-def _columns(name: str, share: SwapShare | None) -> dict[str, float]:
-    value, low, high = (np.nan,) * 3 if share is None else share
-    return {name: value, f"{name}_low": low, f"{name}_high": high}

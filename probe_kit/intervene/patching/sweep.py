@@ -3,19 +3,18 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.intervene.edits.sites import PlaceName
-from probe_kit.intervene.kinds.joint.cells import Cell
-from probe_kit.intervene.kinds.swap_shares import SwapShare, share_of_whole
-from probe_kit.intervene.patching.inference import Given, infer, run_with_cache
-from probe_kit.intervene.patching.pairs import Pair, groups_and_items
-from probe_kit.intervene.patching.patch import Basis, Cells, infer_patched, together
+from probe_kit.intervene.pairs import Given, Pair, groups_and_items
+from probe_kit.intervene.patching.inference import infer, run_with_cache
+from probe_kit.intervene.patching.patch import Basis, Cell, Cells, as_tuple, infer_patched
+from probe_kit.intervene.places import PlaceName
+from probe_kit.statistics.bootstrap import draw_groups, units_seed
 from probe_kit.statistics.paired_signs import paired_greater_p
 from probe_kit.statistics.sign_flips import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -25,6 +24,40 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from probe_kit.hooks import Model
+
+
+class SwapShare(NamedTuple):
+    """A ratio of sums over episodes, with its 95 % interval by groups; 1 is the whole swap."""
+
+    value: float
+    low: float
+    high: float
+
+
+def share_of_whole(
+    moved: NDArray[np.float64], whole: NDArray[np.float64], groups: NDArray[np.str_], seed_text: str
+) -> SwapShare:
+    """Return Σ moved · whole / Σ whole² over episodes (E,), with its interval by groups (E,)."""
+    names, group_of = np.unique(groups, return_inverse=True)
+    above, below = np.bincount(group_of, moved * whole), np.bincount(group_of, whole**2)
+    times = draw_groups(names.size, units_seed(groups, seed_text))
+    drawn = (times @ above) / np.maximum(times @ below, np.finfo(float).tiny)
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return SwapShare(float(above.sum() / below.sum()), float(low), float(high))
+
+
+def share_fields(name: str, share: SwapShare | None) -> dict[str, Any]:
+    """Return a share and its interval as fields of a row of effects."""
+    if share is None:
+        return {name: None, f"{name}_ci": None}
+    return {name: share.value, f"{name}_ci": (share.low, share.high)}
+
+
+def share_columns(name: str, share: SwapShare | None) -> dict[str, float]:
+    """Return a share and its interval as columns of a data frame."""
+    value, low, high = (np.nan,) * 3 if share is None else share
+    return {name: value, f"{name}_low": low, f"{name}_high": high}
+
 
 Metric = Callable[[Any, Given], float]
 """From the output of an inference and what was given to it to a number, such as metres to the left."""
@@ -147,7 +180,7 @@ def sweep_cells(
     metric: of an output and what was given, such as `session.lateral_displacement`; of the same inference as the
     patch. along, rest: see `patch_cells`. Raises UsageError without pairs, and what `patch_cells` raises.
     """
-    sets = tuple(together(own) for own in cells)
+    sets = tuple(as_tuple(own) for own in cells)
     if not pairs or not sets:
         raise UsageError(f"a sweep of {len(sets)} sets of cells in {len(pairs)} pairs; give at least one of both")
     places = list(dict.fromkeys(cell.place.name for own in sets for cell in own))

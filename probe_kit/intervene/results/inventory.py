@@ -1,14 +1,17 @@
 """What interventions a run holds, for `probe-kit run show`."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from probe_kit.intervene.kinds.registry import KINDS
-from probe_kit.intervene.store.answers import read_interventions, stored_interventions
+from probe_kit.intervene.kinds import kind_names, kind_of
+from probe_kit.intervene.outcomes import StoredIntervention, read_interventions, stored_interventions
+from probe_kit.intervene.results.results import effects_of
 from probe_kit.runs.layout import INTERVENTIONS
+from probe_kit.runs.location import Location
 from probe_kit.runs.results import PARTIAL, Bundle
-from probe_kit.runs.store import Location
+from probe_kit.runs.run import Run
 from probe_kit.train.data.run_reader import RunReader
 
 COMMON = frozenset(
@@ -77,8 +80,8 @@ def _used(run: RunReader) -> set[str]:
         by_kind.setdefault(str(one.settings["kind"]), []).append(one.key)
     found: set[str] = set()
     for name, keys in by_kind.items():
-        kind = KINDS.get(name)
-        found |= kind.function("keys_in_use")(run) if kind is not None and kind.keys_in_use else set(keys)
+        preferred = kind_of(name).keys_in_use(run) if name in kind_names() else None
+        found |= set(keys) if preferred is None else preferred
     return found
 
 
@@ -99,3 +102,19 @@ def _listed(bundle: Bundle, current: set[str], used: set[str]) -> ListedInterven
 
 def _plain(value: Any) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def readers_of_results(run: Run) -> Iterator[Callable[[], object]]:
+    """A function per stored intervention, which reads all of it. Raises RunDamagedError where one is none.
+
+    Those of episodes that the run has no more are listed alone, as reading does.
+    """
+    read_interventions(run.location)
+    for wording in run.wordings or (None,):
+        shown = run if wording is None else run.in_wording(wording)
+        for stored in stored_interventions(shown):
+            yield partial(_read, shown, stored)
+
+
+def _read(run: Run, stored: StoredIntervention) -> object:
+    return effects_of(run, stored).to_json()

@@ -10,19 +10,14 @@ import numpy as np
 
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError
-from probe_kit.intervene.edits.unread import unread_note
-from probe_kit.intervene.kinds.base import EffectLike, Measurement, TableContext, frame_of
-from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect, stored_image_swaps
-from probe_kit.intervene.kinds.image_swap.verdict import Places, UseVerdict, classify_all, encoded_in
-from probe_kit.intervene.kinds.kind import Kind
-from probe_kit.intervene.kinds.reach import tiles_apart
-from probe_kit.intervene.kinds.registry import kind_of
-from probe_kit.intervene.results.places import stored_places
-from probe_kit.intervene.results.readouts import stored_other_readouts
-from probe_kit.intervene.results.ties import stored_ties
-from probe_kit.intervene.results.which_layer import which_layer
-from probe_kit.intervene.store.answers import ConditionOutcomes, StoredIntervention, find_stored
-from probe_kit.intervene.store.settings import PER_STEP
+from probe_kit.intervene.kinds import kind_of
+from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, frame_of
+from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps, tiles_apart
+from probe_kit.intervene.outcomes import ConditionOutcomes, Effect, StoredIntervention, find_stored
+from probe_kit.intervene.places import unread_note
+from probe_kit.intervene.results.evidence import stored_other_readouts, stored_places, stored_ties, which_layer
+from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_all, describe_readouts, encoded_in
+from probe_kit.intervene.settings import PER_STEP
 from probe_kit.statistics.sign_flips import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
@@ -33,6 +28,7 @@ if TYPE_CHECKING:
 
     from probe_kit._terminal.responsive_table import ResponsiveTable
     from probe_kit.train.results.probe_results import ProbeResults
+
 
 _VERDICT_COLUMNS = ("verdict", "behaviour", "reversed", "reason", "place", "tie")
 
@@ -81,8 +77,7 @@ class InterventionResult:
     @cached_property
     def effects(self) -> list[Any]:
         """The rows of its kind, such as one `PatchEffect` per category and edit."""
-        found: list[Any] = self._kind.function("effects")(self.measurement)
-        return found
+        return list(self._kind.effects(self.measurement))
 
     @property
     def table(self) -> "pd.DataFrame":
@@ -97,12 +92,12 @@ class InterventionResult:
     @property
     def notes(self) -> tuple[str, ...]:
         """What a reader must know, a sentence each."""
-        own = self._kind.function("notes")(self.effects, self.measurement) if self._kind.notes else ()
+        own = self._kind.notes(self.effects, self.measurement)
         tests = () if self._kind.is_descriptive else (*self._few_groups(), *self._one_step())
         return *self._replayed(), *self._skipped_items(), *self._places(), *tests, *own
 
     @property
-    def _kind(self) -> Kind:
+    def _kind(self) -> type[Intervention]:
         return kind_of(self.kind)
 
     def _places(self) -> list[str]:
@@ -175,20 +170,18 @@ class InterventionResult:
     @property
     def sentences(self) -> tuple[str, ...]:
         """The finding, a sentence per category, and a line about the layer; none of a kind that only describes."""
-        if not self._kind.sentences:
-            return ()
-        return *self._kind.function("sentences")(self.effects, self._context), *self.layers.values()
+        return *self._kind.sentences(self.effects, self._context), *self.layers.values()
 
     def to_rich(self, details: bool = True) -> "ResponsiveTable":
         """The table for a terminal. details: split it where it is wide, else leave columns out by name."""
         context = replace(self._context, explains=details)
-        table: ResponsiveTable = self._kind.function("table")(self.effects, context)
-        return replace(table, splits=details)
+        return replace(self._kind.table(self.effects, context), splits=details)
 
     @property
     def _context(self) -> TableContext:
         subject = f"{self.label}{' (random weights)' if self.random_weights else ''} on {self.suite}"
-        return TableContext(self.measurement, subject, self.verdicts)
+        uses = (self.verdicts.get(row.category) for row in self.effects)
+        return TableContext(self.measurement, subject, self.verdicts, describe_readouts(uses))
 
 
 def load_effects(run: RunReader, key: str | None = None, kind: str | None = None) -> InterventionResult:
@@ -240,5 +233,5 @@ def _newest_probes(run: RunReader) -> "ProbeResults | None":
 
 def effects_csv(measurement: Measurement) -> str:
     """As stored beside the outcomes, without verdicts, which later probes may change."""
-    rows: Sequence[EffectLike] = kind_of(str(measurement.settings["kind"])).function("effects")(measurement)
+    rows: Sequence[Effect] = kind_of(str(measurement.settings["kind"])).effects(measurement)
     return csv_of_frame(frame_of(rows).drop(columns="key", errors="ignore"))

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from typing import Literal, cast
 
 from probe_kit._tables.numbers import Limits, whole
-from probe_kit.intervene.kinds.image_swap.verdict import UNTESTED, UseVerdict
-from probe_kit.intervene.kinds.image_swap.words import describe_swap
+from probe_kit.intervene.results.verdict import UNTESTED, UseVerdict, describe_swap
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.text import is_vlm, model_name
 from probe_kit.retention.rows.parts import StreamPart

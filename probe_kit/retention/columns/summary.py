@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from probe_kit._tables.numbers import Limits, number, points, signed, whole, with_limits
 from probe_kit._tables.table import Cell, Heading, Row, Table
-from probe_kit.intervene.kinds.image_swap.verdict import describe_readouts
+from probe_kit.intervene.results.verdict import describe_readouts
 from probe_kit.retention.columns.findings import finding
 from probe_kit.retention.columns.sentences import chance_only, describe_category, knows, verdict
 from probe_kit.retention.columns.text import (

@@ -9,15 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.edits.sites import ALL, TILE_ROLES
-from probe_kit.intervene.kinds.attention.attention_mass import (
-    ACTION,
-    CORRECT,
-    OTHER,
-    AttentionShares,
-    Axis,
-    stored_attention,
-)
+from probe_kit.intervene.kinds.attention import ACTION, CORRECT, OTHER, AttentionShares, Axis, stored_attention
+from probe_kit.intervene.places import ALL, TILE_ROLES
 from probe_kit.retention.displays.base.panels import Panelled, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.edits.sites import ALL, PlaceName
-from probe_kit.intervene.kinds.site_effects import PatchEffect
-from probe_kit.intervene.results.site_maps import BACKBONE, stored_site_effects
+from probe_kit.intervene.kinds.site_maps import BACKBONE, PatchEffect, stored_site_effects
+from probe_kit.intervene.places import ALL, PlaceName
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure

@@ -8,10 +8,8 @@ from typing import TYPE_CHECKING, Any
 from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import first_of
-from probe_kit.intervene.kinds.image_swap.effects import stored_image_swaps
-from probe_kit.intervene.results.places import stored_places
-from probe_kit.intervene.results.readouts import stored_other_readouts
-from probe_kit.intervene.results.ties import stored_ties
+from probe_kit.intervene.kinds.image_swap import stored_image_swaps
+from probe_kit.intervene.results.evidence import stored_other_readouts, stored_places, stored_ties
 from probe_kit.retention.behaviour.success_rate import (
     SuccessRate,
     capture_only,

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from math import isfinite
 
-from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
-from probe_kit.intervene.kinds.image_swap.verdict import Places, UseVerdict, classify_use, control_for
+from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
+from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_use, control_for
 from probe_kit.retention.rows.parts import SwapEffect
 from probe_kit.retention.rows.row import RetentionRow
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict
+from probe_kit.intervene.results.verdict import UseVerdict
 from probe_kit.retention.behaviour.run_labels import full_name
 from probe_kit.retention.estimators.stream_scores import Limits
 from probe_kit.statistics.estimates.verdict import Verdict

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from probe_kit.hashing import sha256_json
-from probe_kit.intervene.kinds.image_swap.effects import swap_responses_by_episode
+from probe_kit.intervene.kinds.image_swap import swap_responses_by_episode
 from probe_kit.view.payloads.coding import Packed, code_words, pack_log_odds, rounded
 from probe_kit.view.payloads.run_payload import best_places
 from probe_kit.view.viewed_run import ViewedRun

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from probe_kit.env.rotations import from_euler_xyz
 from probe_kit.extract.rollout.executed_actions import executed_actions, with_rotation_vectors
-from probe_kit.intervene.replay.rollout import executed
+from probe_kit.intervene.rollout import executed
 
 # 1 % and 99 % quantiles of BridgeData V2's rotations, in radians.
 LOW, HIGH = np.array([-0.0809, -0.0929, -0.2072]), np.array([0.0819, 0.0779, 0.2038])

@@ -8,7 +8,7 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.linear_model import LinearRegression, LogisticRegression
 
 from probe_kit.errors import UsageError
-from probe_kit.intervene.edits.linear_erasure import (
+from probe_kit.intervene.erasers import (
     Eraser,
     Method,
     PaddedTokens,

@@ -9,7 +9,8 @@ from probe_kit.hooks import Observation, Site, capture, load_model
 from probe_kit.hooks.capturing.edit_engine import apply_patch, apply_patches
 from probe_kit.hooks.capturing.token_edits import ReplaceWith, TokenSelection
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.intervene.edits.sites import PlaceName, list_places, resolve_sites, token_mask
+from probe_kit.intervene.places import PlaceName, list_places, resolve_sites
+from probe_kit.intervene.tokens import token_mask
 
 
 @pytest.mark.parametrize(

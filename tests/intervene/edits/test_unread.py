@@ -6,9 +6,9 @@ from probe_kit.errors import NoDirectionError
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.sites import Stream
 from probe_kit.intervene import Interchange, JointPlaces, Steering
-from probe_kit.intervene.edits.unread import unread_note, unread_places
-from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.places import unread_note, unread_places
 from probe_kit.intervene.runner import unread_sites
+from probe_kit.intervene.sessions.session import ReplaySession
 from probe_kit.runs import Run
 
 STREAMS = {"backbone": Stream("backbone", 4, 8), "expert": Stream("expert", 4, 8, 10)}

@@ -1,8 +1,10 @@
-"""A kind is a folder and one registry entry: help, options, results and lists are made from the entry alone."""
+"""A kind is one file: help, options, results and lists are made from it alone."""
 
 import importlib
 import json
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import get_args
 
@@ -13,22 +15,31 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.hooks import Site
 from probe_kit.hooks.contract.interventions import ASKED_AS, InterventionKind
-from probe_kit.intervene import commands, load_effects
-from probe_kit.intervene.edits.sites import TILE_ROLES
-from probe_kit.intervene.kinds.registry import KINDS
+from probe_kit.intervene import commands, kinds, load_effects
+from probe_kit.intervene.kinds import every_kind, kind_names, kind_of
+from probe_kit.intervene.places import TILE_ROLES
 from probe_kit.intervene.results.inventory import listed_interventions
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
-from tests.intervene.kinds.dimmed_images.kind import KIND
+
+NAME = "dimmed-images"
 
 
 @pytest.fixture
-def with_entry(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """The command as it is where the entry stands in the registry."""
-    monkeypatch.setitem(KINDS, KIND.name, KIND)
+def with_entry(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[ModuleType]:
+    """The command with the file that CONTRIBUTING adds, registered as a package of its own does it."""
+    page = (Path(__file__).parents[3] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    diff = page.partition("+++ b/probe_kit/intervene/kinds/dimmed_images.py\n")[2].partition("\n```")[0]
+    lines = diff.splitlines()
+    assert all(line.startswith("+") for line in lines), "the whole kind is one new file"
+    (tmp_path / "dimmed_images.py").write_text("\n".join(line[1:] for line in lines), encoding="utf-8")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(kinds, "_HOMES", dict(kinds._HOMES))
+    kinds.register(NAME, "dimmed_images")
     yield importlib.reload(commands)
     monkeypatch.undo()
+    sys.modules.pop("dimmed_images", None)
     importlib.reload(commands)
 
 
@@ -43,12 +54,12 @@ def test_a_kind_of_its_own_runs_from_the_command_to_the_tables(
     with_entry: ModuleType, copy: Run, small_suite: Suite
 ) -> None:
     before = retention_table([copy]).to_json()
-    asked = ("--kind", KIND.name, "--categories", "color", "--items", "1", "--coefficients", "0,1")
+    asked = ("--kind", NAME, "--categories", "color", "--items", "1", "--coefficients", "0,1")
     where = (str(copy.path), "--suite", str(small_suite.folder))
     code, shown, said = invoke(with_entry, *where, *asked)
     assert code == 0, said
     assert "Is the image read?" in shown
-    result = load_effects(copy, kind=KIND.name)
+    result = load_effects(copy, kind=NAME)
     dark, same = result.effects
     assert (same.condition, same.median_displacement) == ("dimmed-1", 0.0)
     assert dark.median_displacement > 0
@@ -58,7 +69,7 @@ def test_a_kind_of_its_own_runs_from_the_command_to_the_tables(
     assert [row["condition"] for row in json.loads(shown)["effects"]] == ["dimmed-0", "dimmed-1"]
     assert json.loads(shown)["effects"][0]["median_displacement"] == pytest.approx(dark.median_displacement)
     assert "loaded the stored result" in said
-    assert [(one.kind, one.state) for one in listed_interventions(copy)] == [(KIND.name, "used")]
+    assert [(one.kind, one.state) for one in listed_interventions(copy)] == [(NAME, "used")]
     assert retention_table([copy]).to_json() == before
 
 
@@ -66,8 +77,8 @@ def test_help_names_every_kind_and_what_its_options_mean_to_it(with_entry: Modul
     code, shown, _ = invoke(with_entry, "--help-all")
     assert code == 0
     words = " ".join(shown.replace("│", " ").split())
-    for kind in KINDS.values():
-        assert f"--kind {kind.name}" in words
+    for kind in every_kind():
+        assert f"--kind {kind.kind}" in words
         assert kind.summary in words
         for option, meaning in kind.options.items():
             assert f"--{option.replace('_', '-')}: {meaning}" in words
@@ -76,7 +87,7 @@ def test_help_names_every_kind_and_what_its_options_mean_to_it(with_entry: Modul
 def test_an_option_of_another_kind_is_refused_with_the_kinds_that_take_it(
     with_entry: ModuleType, copy: Run
 ) -> None:
-    code, _, _ = invoke(with_entry, str(copy.path), "--kind", KIND.name, "--coefficients", "1", "--sites", "kv.*")
+    code, _, _ = invoke(with_entry, str(copy.path), "--kind", NAME, "--coefficients", "1", "--sites", "kv.*")
     assert code == 1
     answer = CliRunner().invoke(app, ["intervene", str(copy.path), "--kind", "erase", "--target-side", "left"])
     assert answer.exit_code == 2
@@ -84,17 +95,11 @@ def test_an_option_of_another_kind_is_refused_with_the_kinds_that_take_it(
     assert "--target-side does not apply to --kind erase; remove it or choose another kind: steer" in said
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_every_entry_names_functions_that_exist(name: str) -> None:
-    kind = KINDS[name]
-    for part in (
-        "build",
-        "effects",
-        "table",
-        *("notes",) * bool(kind.notes),
-        *("keys_in_use",) * bool(kind.keys_in_use),
-    ):
-        assert callable(kind.function(part)), part
+@pytest.mark.parametrize("name", kind_names())
+def test_every_file_holds_the_kind_that_it_is_called_after(name: str) -> None:
+    kind = kind_of(name)
+    assert kind.kind == name
+    assert kind.summary.endswith((".", "?"))
 
 
 def test_what_a_family_supports_is_listed_in_the_words_of_the_command() -> None:
@@ -103,7 +108,7 @@ def test_what_a_family_supports_is_listed_in_the_words_of_the_command() -> None:
     for capability, (name, values) in ASKED_AS.items():
         assert capability in get_args(InterventionKind)
         option[name] += values
-    assert sorted(option["--kind"]) == sorted(KINDS)
+    assert sorted(option["--kind"]) == sorted(kind_names())
     assert option["--roles"] == list(TILE_ROLES)
     assert [Site.parse(f"{site.removesuffix('*')}02.keys").stream for site in option["--sites"]] == ["kv"]
     page = CliRunner().invoke(app, ["models", "internvla-m1"]).stdout

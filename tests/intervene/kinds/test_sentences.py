@@ -6,19 +6,17 @@ from typing import Any, cast
 
 import pytest
 
-from probe_kit.intervene.kinds.base import Measurement, TableContext
-from probe_kit.intervene.kinds.closed_loop.effects import ClosedLoopEffect
-from probe_kit.intervene.kinds.closed_loop.table import closed_loop_sentences
-from probe_kit.intervene.kinds.erase import ErasureEffect, erasure_sentences
-from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
-from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict, classify_use
-from probe_kit.intervene.kinds.image_swap.words import image_swap_sentences, instruction_swap_sentences
-from probe_kit.intervene.kinds.joint.effects import EVERY, MINIMAL, JointEffect
-from probe_kit.intervene.kinds.joint.table import joint_sentences
-from probe_kit.intervene.kinds.registry import KINDS
-from probe_kit.intervene.kinds.site_effects import PatchEffect
-from probe_kit.intervene.kinds.site_table import site_sentences
-from probe_kit.intervene.store.answers import CLEAN
+from probe_kit.intervene.kinds import every_kind
+from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext
+from probe_kit.intervene.kinds.closed_loop import ClosedLoop, ClosedLoopEffect
+from probe_kit.intervene.kinds.erase import ConceptErasure, ErasureEffect
+from probe_kit.intervene.kinds.image_swap import ImageSwap, ImageSwapEffect
+from probe_kit.intervene.kinds.instruction_swap import InstructionSwap
+from probe_kit.intervene.kinds.interchange import Interchange
+from probe_kit.intervene.kinds.joint import EVERY, MINIMAL, JointEffect, JointPlaces
+from probe_kit.intervene.kinds.site_maps import PatchEffect
+from probe_kit.intervene.outcomes import CLEAN
+from probe_kit.intervene.results.verdict import UseVerdict, classify_use
 
 SWAPS = {
     "follows": (0.92, 0.02, (0.6, 1.0), 0.001, 1.0, 0.9, (0.8, 1.0)),
@@ -60,12 +58,12 @@ def test_an_image_swap_is_described_by_what_the_action_does_and_then_its_verdict
     response: str, encoded: bool | None, control: str | None
 ) -> None:
     found = classify_use(encoded, swap(response), control)
-    (sentence,) = image_swap_sentences([swap(response)], context(found))
+    (sentence,) = ImageSwap.sentences([swap(response)], context(found))
     assert sentence == f"Public Info (24 items): {SAID[response]} {found.sentence}"
 
 
 def test_an_instruction_swap_is_described_without_a_verdict() -> None:
-    (sentence,) = instruction_swap_sentences([swap("reverses")], context(None))
+    (sentence,) = InstructionSwap.sentences([swap("reverses")], context(None))
     assert sentence == (
         "Public Info (24 items): the action follows a swap of the instruction in 0 % of episodes and does the "
         "reverse in 90 % (net -100 to -60 %)."
@@ -118,7 +116,7 @@ HAVE = "edits that have half of the image swap's effect"
     ],
 )
 def test_edits_of_sites_are_counted_and_the_largest_are_named(rows: Sequence[PatchEffect], said: str) -> None:
-    assert site_sentences(rows, context(None)) == [f"Color: {said}"]
+    assert Interchange.sentences(rows, context(None)) == [f"Color: {said}"]
 
 
 def closed_loop(place: str, net: float, p: float | None, disrupted: bool = False) -> ClosedLoopEffect:
@@ -133,9 +131,9 @@ TURN = "edits that turn the cube to the other picture beyond their controls"
 
 def test_closed_loops_say_what_is_confirmed_and_what_disrupts_the_task() -> None:
     rows = [closed_loop(CLEAN, 0.0, None), closed_loop("backbone.02", 0.8, 0.001), closed_loop("kv.01", 0.1, 0.5)]
-    assert closed_loop_sentences(rows, context(None)) == [f"Color: {TURN}: 1 of 2 (backbone.02 image +0.80)."]
+    assert ClosedLoop.sentences(rows, context(None)) == [f"Color: {TURN}: 1 of 2 (backbone.02 image +0.80)."]
     rows = [closed_loop(CLEAN, 0.0, None), closed_loop("backbone.02", 0.8, None, disrupted=True)]
-    assert closed_loop_sentences(rows, context(None)) == [
+    assert ClosedLoop.sentences(rows, context(None)) == [
         f"Color: {TURN}: none of 1; that disrupt the task: 1 of 1 (backbone.02 image)."
     ]
 
@@ -164,7 +162,7 @@ TAKE = "erasures that take the answer from the action beyond their controls"
     ],
 )
 def test_erasures_say_what_is_lost(row: ErasureEffect, said: str) -> None:
-    (sentence,) = erasure_sentences([row], context(None))
+    (sentence,) = ConceptErasure.sentences([row], context(None))
     assert sentence == f"Color: {said}"
 
 
@@ -178,13 +176,12 @@ def joint(part: str, cells: str, finding: str) -> JointEffect:
 def test_joint_places_say_where_the_answer_is_read_or_that_this_is_open() -> None:
     every = joint(EVERY, "kv.00 + kv.01", "carries it")
     rows = [every, joint("cell", "kv.01 image", "read here")]
-    assert joint_sentences(rows, context(None)) == ["Color: read at kv.01 image."]
+    assert JointPlaces.sentences(rows, context(None)) == ["Color: read at kv.01 image."]
     rows = [every, joint(MINIMAL, "kv.00 + kv.01", "read jointly")]
-    assert joint_sentences(rows, context(None)) == ["Color: no single place: read jointly at kv.00 + kv.01."]
-    assert joint_sentences([every], context(None)) == ["Color: where the answer is read remains open."]
+    assert JointPlaces.sentences(rows, context(None)) == ["Color: no single place: read jointly at kv.00 + kv.01."]
+    assert JointPlaces.sentences([every], context(None)) == ["Color: where the answer is read remains open."]
 
 
 def test_every_kind_that_tests_something_says_what_it_found() -> None:
-    for kind in KINDS.values():
-        assert bool(kind.sentences) != kind.is_descriptive, kind.name
-        assert not kind.sentences or callable(kind.function("sentences"))
+    for kind in every_kind():
+        assert (kind.sentences is not Intervention.sentences) != kind.is_descriptive, kind.kind

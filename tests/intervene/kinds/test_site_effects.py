@@ -6,12 +6,11 @@ from typing import cast
 import numpy as np
 import pytest
 
-from probe_kit.intervene import ConditionOutcomes, PatchEffect, classify_use
+from probe_kit.intervene import ConditionOutcomes, PatchEffect, Steering, classify_use
 from probe_kit.intervene.kinds.base import ConditionName, Measurement
-from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
-from probe_kit.intervene.kinds.image_swap.verdict import Places
-from probe_kit.intervene.kinds.site_effects import patch_effects, steering_notes, target_sign
-from probe_kit.intervene.results.site_maps import localised_sites
+from probe_kit.intervene.kinds.image_swap import image_swap_effects
+from probe_kit.intervene.kinds.site_maps import localised_sites, patch_effects, target_sign
+from probe_kit.intervene.results.verdict import Places
 from tests.intervene.answers import follower, habit, outcomes_of
 
 SUITE = "suite@1#0123456789ab"
@@ -71,9 +70,9 @@ def test_the_note_about_one_vector_is_of_steering_along_one_and_not_of_its_contr
     plain, exchanged = follower(48)
     still = {f"a__image__{name}__2": plain for name in ("mean_difference:1", "control_1")}
     along_tokens = patch_effects(with_changes((plain, exchanged), **still), SUITE)
-    assert steering_notes(along_tokens, cast("Measurement", None)) == []
+    assert Steering.notes(along_tokens, cast("Measurement", None)) == []
     in_all = patch_effects(with_changes((plain, exchanged), a__image__mean_difference__2=plain), SUITE)
-    (note,) = steering_notes(in_all, cast("Measurement", None))
+    (note,) = Steering.notes(in_all, cast("Measurement", None))
     assert note.startswith("color: one vector that is added to every token moves no action")
 
 

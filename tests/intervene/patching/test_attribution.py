@@ -8,7 +8,6 @@ from probe_kit import patching as pt
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.intervene import AttributionPatching
-from probe_kit.intervene.kinds.attribution.effects import measured_attribution
 from probe_kit.intervene.kinds.base import Measurement
 from tests.intervene.wirings import WiredPolicy, WiredSession, outcomes_of
 
@@ -72,7 +71,7 @@ def test_its_numbers_are_those_of_the_command(wired: WiredSession, copied: pt.Sc
     outcomes = outcomes_of(wired, ["copied"], conditions[2:])
     entries = asked.certificate_entries(conditions, None)  # type: ignore[arg-type]
     measurement = Measurement(outcomes, "suite", asked.parameters() | {"kind": asked.kind}, entries, lambda _: b"")
-    stored = {row.name: row for row in measured_attribution(measurement)}
+    stored = {row.name: row for row in AttributionPatching.effects(measurement)}
     assert stored.keys() == set(copied.table["cells"])
     for row in copied.rows:
         assert row.estimate == pytest.approx(stored[row.name].estimate, abs=1e-5), row.name

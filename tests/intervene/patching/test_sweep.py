@@ -5,8 +5,8 @@ import pytest
 
 from probe_kit import patching as pt
 from probe_kit.errors import UnknownCategoryError, UsageError
-from probe_kit.intervene.kinds.interchange.intervention import PatchedFromSource
-from probe_kit.intervene.kinds.site_effects import patch_effects
+from probe_kit.intervene.kinds.interchange import patch_of
+from probe_kit.intervene.kinds.site_maps import patch_effects
 from tests.intervene.wirings import WiredSession, outcomes_of
 
 KV = "kv.*|image,language,state"
@@ -40,7 +40,7 @@ def test_a_sweep_gives_the_numbers_of_the_interchange(copied: pt.Sweep, wired: W
     chosen = [row for row, name in enumerate(copied.names) if name.endswith(("01 image", "01 language", "01 all"))]
     cells = [copied.cells[row][0] for row in chosen]
     sites = tuple(dict.fromkeys(site for cell in cells for site in cell.place.sites))
-    stored = outcomes_of(wired, ["copied"], [PatchedFromSource(own.place, own.role, sites) for own in cells])
+    stored = outcomes_of(wired, ["copied"], [patch_of(own, sites) for own in cells])
     rows = copied.table.iloc[chosen].iterrows()
     for at, (effect, (row, own)) in enumerate(zip(patch_effects(stored, "suite"), rows, strict=True)):
         assert f"{effect.place} {effect.role}" == own["cells"]

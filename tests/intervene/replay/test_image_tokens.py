@@ -9,8 +9,9 @@ import pytest
 from probe_kit.errors import EmptyRoleError, UnsupportedInterventionError, UsageError
 from probe_kit.hooks.registry import find_family
 from probe_kit.intervene import ClosedLoop, ConceptErasure, Interchange, ReplaySource, Steering, run_intervention
-from probe_kit.intervene.replay.image_tokens import TILES, role_token_mask, tokens_overlapping
-from probe_kit.intervene.replay.session import ReplayInput, ReplaySession
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.sessions.session import ReplaySession
+from probe_kit.intervene.tokens import TILES, role_token_mask, tokens_overlapping
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
 
@@ -19,13 +20,13 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture(scope="module")
-def replay_input(session: ReplaySession, copy: Run) -> ReplayInput:
-    return session.replay_inputs(str(copy.episodes["item_id"][0]))[0]
+def replay_input(session: ReplaySession, copy: Run) -> Pair:
+    return session.pairs(str(copy.episodes["item_id"][0]))[0]
 
 
-def test_pictures_differ_where_tiles_are_and_nowhere_else(replay_input: ReplayInput) -> None:
+def test_pictures_differ_where_tiles_are_and_nowhere_else(replay_input: Pair) -> None:
     """Up to light that tiles throw on nothing: there is none."""
-    differs = (replay_input.seen.image != replay_input.swapped.image).any(axis=-1)
+    differs = (replay_input.clean.image != replay_input.source.image).any(axis=-1)
     tiles = replay_input.tiles["left"] | replay_input.tiles["right"]
     assert differs.any()
     assert not (differs & ~tiles).any()
@@ -34,12 +35,12 @@ def test_pictures_differ_where_tiles_are_and_nowhere_else(replay_input: ReplayIn
     assert columns["left"] < columns["right"]
 
 
-def test_the_patches_of_a_tile_lie_where_its_pixels_do(session: ReplaySession, replay_input: ReplayInput) -> None:
+def test_the_patches_of_a_tile_lie_where_its_pixels_do(session: ReplaySession, replay_input: Pair) -> None:
     """Across, the middle of the patches is the middle of the pixels."""
     middles = {}
     for role, side in TILES.items():
         mask = role_token_mask(session.policy, replay_input, "backbone", role, {})
-        images = np.flatnonzero(session.policy.roles([replay_input.seen])["backbone"][0].mask("image"))
+        images = np.flatnonzero(session.policy.roles([replay_input.clean])["backbone"][0].mask("image"))
         assert 0 < mask.sum() < images.size / 2
         assert set(np.flatnonzero(mask)) <= set(images)
         grid = mask[images].reshape(6, 6)
@@ -53,12 +54,12 @@ def test_the_patches_of_a_tile_lie_where_its_pixels_do(session: ReplaySession, r
 
 
 def test_all_pixels_are_seen_by_all_patches_but_the_padding_and_none_by_none(
-    session: ReplaySession, replay_input: ReplayInput
+    session: ReplaySession, replay_input: Pair
 ) -> None:
-    every = np.ones(replay_input.seen.image.shape[:2], bool)
-    seeing = tokens_overlapping(session.policy, replay_input.seen, every).reshape(6, 6)
+    every = np.ones(replay_input.clean.image.shape[:2], bool)
+    seeing = tokens_overlapping(session.policy, replay_input.clean, every).reshape(6, 6)
     assert seeing[1:5].all()
-    assert not tokens_overlapping(session.policy, replay_input.seen, ~every).any()
+    assert not tokens_overlapping(session.policy, replay_input.clean, ~every).any()
     nothing = replace(replay_input, tiles=dict.fromkeys(("left", "right"), ~every))
     with pytest.raises(EmptyRoleError, match="sees the left tile"):
         role_token_mask(session.policy, nothing, "backbone", "image.left", {})
@@ -67,7 +68,7 @@ def test_all_pixels_are_seen_by_all_patches_but_the_padding_and_none_by_none(
 def test_both_tiles_are_held_against_the_same_plain_patches(
     session: ReplaySession, copy: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (replay_input, _) = session.replay_inputs(str(copy.episodes["item_id"][0]))
+    (replay_input, _) = session.pairs(str(copy.episodes["item_id"][0]))
     act, seen = session.policy.act, []
     monkeypatch.setattr(session.policy, "act", lambda own, seeds: seen.append(own[0].image) or act(own, seeds))
     memo: dict[object, object] = {}

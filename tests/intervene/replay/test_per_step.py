@@ -17,8 +17,8 @@ from probe_kit.intervene import (
     ReplaySource,
     run_intervention,
 )
-from probe_kit.intervene.replay.session import open_session
-from probe_kit.intervene.store.settings import key_of, settings_of
+from probe_kit.intervene.sessions.opening import open_session
+from probe_kit.intervene.settings import key_of, settings_of
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
 
@@ -47,9 +47,9 @@ def test_the_plain_condition_is_the_sum_of_what_the_run_commanded(
                 continue
             commanded = np.asarray(copy.trajectory(row).commanded, np.float64)
             (replay_input,) = (
-                one for one in session.replay_inputs(str(copy.episodes["item_id"][row])) if one.episode_id == name
+                one for one in session.pairs(str(copy.episodes["item_id"][row])) if one.episode == name
             )
-            end = replay_input.seen.state[:2].astype(np.float64) + commanded[:, :2].sum(axis=0)
+            end = replay_input.clean.state[:2].astype(np.float64) + commanded[:, :2].sum(axis=0)
             assert found[name] == pytest.approx(session.lateral_offset(end), abs=1e-5)
 
 

@@ -8,16 +8,18 @@ import pytest
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site, capture
 from probe_kit.intervene import ClosedLoop, Interchange, ReplaySource, Steering, run_intervention
-from probe_kit.intervene.edits.linear_erasure import Method, PaddedTokens
-from probe_kit.intervene.edits.sites import resolve_sites
-from probe_kit.intervene.replay.passed_over import PassedOver
-from probe_kit.intervene.replay.session import ReplaySession
-from probe_kit.intervene.replay.token_directions import (
+from probe_kit.intervene.directions import (
+    PassedOver,
     TokenDirections,
+    TokenFeatures,
+    by_episode,
+    fit_by_fold,
     fit_token_directions,
     half_differences_of,
 )
-from probe_kit.intervene.replay.token_features import TokenFeatures, by_episode, fit_by_fold
+from probe_kit.intervene.erasers import Method, PaddedTokens
+from probe_kit.intervene.places import resolve_sites
+from probe_kit.intervene.sessions.session import ReplaySession
 from probe_kit.runs import Run
 
 pytestmark = pytest.mark.slow
@@ -102,16 +104,16 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
     session.on_fit_progress = None
     assert captured == [(done, len(items)) for done in range(1, len(items) + 1)]
     assert isinstance(axes, TokenDirections)
-    replay_inputs = [replay_input for item in items for replay_input in session.replay_inputs(item)]
+    replay_inputs = [replay_input for item in items for replay_input in session.pairs(item)]
     rows = []
     for replay_input in replay_inputs:
         with capture(session.policy, [SITE]) as tape:
-            session.act(replay_input.seen, replay_input.seed)
-        mask = session.policy.token_roles([replay_input.seen])["backbone"][0].mask("image")
+            session.act(replay_input.clean, replay_input.seed)
+        mask = session.policy.token_roles([replay_input.clean])["backbone"][0].mask("image")
         rows.append(tape[SITE][0].double().cpu().numpy()[mask])
     values, left = (
         np.array(rows),
-        np.array([replay_input.side_correct == "left" for replay_input in replay_inputs]),
+        np.array([replay_input.side == "left" for replay_input in replay_inputs]),
     )
     chosen = {
         name: axes.basis("mean-difference:2", name, "color") for name in (q.episode_id for q in replay_inputs)

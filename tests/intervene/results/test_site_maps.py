@@ -20,10 +20,11 @@ from probe_kit.intervene import (
     run_intervention,
     stored_site_effects,
 )
-from probe_kit.intervene.edits.pooled_directions import fit_directions
-from probe_kit.intervene.edits.sites import resolve_sites, token_mask
-from probe_kit.intervene.replay.session import ReplaySession
-from probe_kit.intervene.results.site_maps import keys_in_use
+from probe_kit.intervene.directions import fit_directions
+from probe_kit.intervene.kinds.site_maps import keys_in_use
+from probe_kit.intervene.places import resolve_sites
+from probe_kit.intervene.sessions.session import ReplaySession
+from probe_kit.intervene.tokens import token_mask
 from probe_kit.runs import Run
 
 if TYPE_CHECKING:
@@ -242,10 +243,10 @@ def test_places_that_are_none_are_refused(twin: "Policy", pattern: str) -> None:
 
 
 def test_roles_that_no_token_plays_are_refused(session: ReplaySession, copy: Run) -> None:
-    (replay_input, _) = session.replay_inputs(str(copy.episodes["item_id"][0]))
-    assert token_mask(session.policy, replay_input.seen, "backbone", "image").sum() > 1
+    (replay_input, _) = session.pairs(str(copy.episodes["item_id"][0]))
+    assert token_mask(session.policy, replay_input.clean, "backbone", "image").sum() > 1
     with pytest.raises(EmptyRoleError, match="language"):
-        token_mask(session.policy, replay_input.seen, "backbone", "smell")
+        token_mask(session.policy, replay_input.clean, "backbone", "smell")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from probe_kit.hooks import Site
 from probe_kit.intervene.results.results import load_effects
-from probe_kit.intervene.store.settings import FORMAT
+from probe_kit.intervene.settings import FORMAT
 from probe_kit.train import ArrayRun, train_probes
 from tests.intervene.answers import follower, outcomes_of, store_outcomes
 

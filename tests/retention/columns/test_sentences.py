@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 import pytest
 
-from probe_kit.intervene.kinds.image_swap.effects import ImageSwapEffect
-from probe_kit.intervene.kinds.image_swap.verdict import Places
+from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
+from probe_kit.intervene.results.verdict import Places
 from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
 from probe_kit.retention.columns.sentences import conclusion, describe_category, verdict
 from probe_kit.retention.rows.interventions import add_image_swap

@@ -24,12 +24,11 @@ from probe_kit.intervene import (
     run_intervention,
     stored_attention,
 )
-from probe_kit.intervene.kinds.attention.intervention import AttentionRecorded, shares_by_role
-from probe_kit.intervene.kinds.attention.table import attention_table
+from probe_kit.intervene.kinds.attention import AttentionRecorded, shares_by_role
 from probe_kit.intervene.kinds.base import Measurement, TableContext
-from probe_kit.intervene.replay.conditions import ReplayBatch
-from probe_kit.intervene.replay.image_tokens import TILES
-from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.replay import ReplayBatch
+from probe_kit.intervene.sessions.session import ReplaySession
+from probe_kit.intervene.tokens import TILES
 from probe_kit.runs import Run, open_run, verify_run
 from tests.intervene.answers import follower, outcomes_of
 
@@ -55,11 +54,11 @@ def test_it_is_what_the_policy_tells_by_block_iteration_and_head(
     session: ReplaySession, weighed: AttentionShares
 ) -> None:
     """By hand, on the words of one question."""
-    (replay_input, _) = session.replay_inputs(str(weighed.episodes[0]).partition(":")[0])
-    row, role = list(weighed.episodes).index(replay_input.episode_id), weighed.roles.index("language")
-    words = session.policy.roles([replay_input.seen])["backbone"][0].mask("language")
+    (replay_input, _) = session.pairs(str(weighed.episodes[0]).partition(":")[0])
+    row, role = list(weighed.episodes).index(replay_input.episode), weighed.roles.index("language")
+    words = session.policy.roles([replay_input.clean])["backbone"][0].mask("language")
     with capture_attention(session.policy) as mass:
-        session.act(replay_input.seen, replay_input.seed)
+        session.act(replay_input.clean, replay_input.seed)
     assert weighed.mass.shape == (4, BLOCKS, ITERATIONS, HEADS, len(weighed.roles))
     for (block, step), weights in mass.by_head.items():
         expected = weights[0][:, words].sum(axis=-1)
@@ -134,7 +133,7 @@ def test_means_are_over_what_is_not_asked_for_and_every_episode_counts_alike() -
 
 def headings(shares: AttentionShares) -> tuple[str, ...]:
     measurement = Measurement(outcomes_of({"color": follower(4)}), "suite", {}, {}, lambda _: shares.to_bytes())
-    return attention_table([], TableContext(measurement, "of", {})).parts[0].headings
+    return AttentionReadout.table([], TableContext(measurement, "of", {})).parts[0].headings
 
 
 def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen(weighed: AttentionShares) -> None:

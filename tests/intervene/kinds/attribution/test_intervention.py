@@ -17,13 +17,11 @@ from probe_kit.intervene import (
     load_effects,
     run_intervention,
 )
-from probe_kit.intervene.kinds.attribution.effects import (
+from probe_kit.intervene.kinds.attribution import (
     EXACT,
-    kind_of_place,
-    measured_attribution,
 )
-from probe_kit.intervene.kinds.attribution.table import attribution_sentences, attribution_table
 from probe_kit.intervene.kinds.base import Measurement, TableContext
+from probe_kit.intervene.patching.attribution import kind_of_place
 from probe_kit.intervene.results.results import verdicts_of
 from probe_kit.runs import Run
 from tests.intervene.wirings import WiredSession, outcomes_of, replay_inputs
@@ -53,7 +51,7 @@ def by_name(rows: list[AttributionEffect]) -> dict[str, AttributionEffect]:
 
 def test_what_is_read_linearly_is_ranked_first_and_its_estimate_is_the_effect(wired: WiredSession) -> None:
     found = screened(wired, "copied")
-    rows = by_name(measured_attribution(found))
+    rows = by_name(AttributionPatching.effects(found))
     first, anchor = rows["kv.01 language"], rows["kv.* all"]
     assert (first.rank, first.finding) == (1, "anchored")
     assert first.estimate == pytest.approx(1.0, abs=0.02)
@@ -62,7 +60,7 @@ def test_what_is_read_linearly_is_ranked_first_and_its_estimate_is_the_effect(wi
     assert anchor.estimate == pytest.approx(anchor.exact, abs=0.02)
     assert rows["backbone.01 language"].estimate == pytest.approx(1.0, abs=0.02)
     assert all(abs(row.estimate or 0) < 0.02 for row in rows.values() if row.place in ("kv.00", "kv.02"))
-    (sentence,) = attribution_sentences(list(rows.values()), context(found))
+    (sentence,) = AttributionPatching.sentences(list(rows.values()), context(found))
     assert sentence.startswith("Copied: gradients give 1.0")
     assert "; first of kv: kv.01 language 1.0" in sentence
 
@@ -71,27 +69,27 @@ def test_what_is_read_linearly_is_ranked_first_and_its_estimate_is_the_effect(wi
 def test_a_screen_is_void_where_a_decision_has_no_slope(wired: WiredSession, name: str) -> None:
     """All of `kv` carries everything, and no gradient shows it."""
     found = screened(wired, name)
-    rows = measured_attribution(found)
+    rows = AttributionPatching.effects(found)
     assert {row.finding for row in rows} == {"void"}
     assert {row.rank for row in rows} == {None}
     assert (rows[0].name, rows[0].estimate) == ("kv.* all", 0.0)
     assert rows[0].exact == pytest.approx(1.0, abs=0.02)
-    (sentence,) = attribution_sentences(rows, context(found))
+    (sentence,) = AttributionPatching.sentences(rows, context(found))
     said = "screen void: gradients give 0.00 where the patch gives 1.00 (kv.* all)"
     assert f"{said}; no order is shown" in sentence
-    assert said in str(attribution_table(rows, context(found)).title)
+    assert said in str(AttributionPatching.table(rows, context(found)).title)
 
 
 @pytest.mark.slow
 def test_nothing_is_ordered_where_the_swap_moves_nothing(wired: WiredSession) -> None:
-    rows = measured_attribution(screened(wired, "noise"))
+    rows = AttributionPatching.effects(screened(wired, "noise"))
     assert {(row.finding, row.rank, row.estimate) for row in rows} == {("n/a", None, None)}
-    assert "there is no order" in attribution_sentences(rows, context(screened(wired, "noise")))[0]
+    assert "there is no order" in AttributionPatching.sentences(rows, context(screened(wired, "noise")))[0]
 
 
 def test_the_largest_estimates_and_drawn_cells_are_patched_exactly(wired: WiredSession) -> None:
     found = screened(wired, "copied", sites=("kv.*",), top=1, controls=2)
-    rows = by_name(measured_attribution(found))
+    rows = by_name(AttributionPatching.effects(found))
     exact = {name for name, row in rows.items() if row.exact is not None and not row.is_anchor}
     drawn = {name for name, row in rows.items() if row.is_drawn}
     assert exact == {"kv.01 language", *drawn}
@@ -99,7 +97,7 @@ def test_the_largest_estimates_and_drawn_cells_are_patched_exactly(wired: WiredS
     assert found.certificate["attribution"]["drawn"] == sorted(
         f"{EXACT}|{name.replace(' ', '|')}" for name in drawn
     )
-    (sentence,) = attribution_sentences(list(rows.values()), context(found))
+    (sentence,) = AttributionPatching.sentences(list(rows.values()), context(found))
     assert sentence.endswith("; of 2 drawn cells the largest exact effect is 0.00.")
 
 
@@ -114,7 +112,7 @@ def test_cells_are_ordered_among_their_kind_alone() -> None:
 def test_both_ends_are_the_mean_of_two_gradients(wired: WiredSession) -> None:
     """Where the action is linear they are one."""
     clean, both = (
-        by_name(measured_attribution(screened(wired, "marks", ends=ends))) for ends in ("clean", "both")
+        by_name(AttributionPatching.effects(screened(wired, "marks", ends=ends))) for ends in ("clean", "both")
     )
     assert clean["kv.00 image"].estimate == pytest.approx(both["kv.00 image"].estimate)
 
@@ -124,7 +122,9 @@ def test_a_gradient_at_kv_is_of_what_the_acting_part_reads_alone(wired: WiredSes
     one, at = replay_inputs("copied")[0], Site("kv", 0, "values")
     others = [Site("backbone", layer) for layer in range(4)]
     for sites in ([at], [*others, at]):
-        _, slopes = gradients_at(wired.policy, [one.seen], [one.seed], sites, lambda chunks: chunks[0, :, 1].sum())
+        _, slopes = gradients_at(
+            wired.policy, [one.clean], [one.seed], sites, lambda chunks: chunks[0, :, 1].sum()
+        )
         assert not slopes[at].any(), "block 0 is not read by the acting part"
     assert slopes[others[0]].any()
 

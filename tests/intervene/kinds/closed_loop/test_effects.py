@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from probe_kit.intervene import ClosedLoopEffect, ConditionOutcomes
-from probe_kit.intervene.kinds.closed_loop.effects import closed_loop_effects
-from probe_kit.intervene.kinds.site_effects import PatchEffect
-from probe_kit.intervene.results.best_targets import best_cell
+from probe_kit.intervene.kinds.closed_loop import closed_loop_effects
+from probe_kit.intervene.kinds.site_maps import PatchEffect, best_cell
 
 NAMES = (
     "clean",

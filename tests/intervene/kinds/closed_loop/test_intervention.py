@@ -19,9 +19,10 @@ from probe_kit.intervene import (
     run_intervention,
     stored_image_swaps,
 )
-from probe_kit.intervene.replay.conditions import CleanRun
-from probe_kit.intervene.replay.rollout import roll_out
-from probe_kit.intervene.replay.session import ReplaySession, open_session
+from probe_kit.intervene.replay import CleanRun
+from probe_kit.intervene.rollout import roll_out
+from probe_kit.intervene.sessions.opening import open_session
+from probe_kit.intervene.sessions.session import ReplaySession
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.suite import Suite
 
@@ -146,12 +147,12 @@ def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
 
     class Watching(CleanRun):
         def play(self, context):  # type: ignore[no-untyped-def]
-            seen.append((context.replay_input.seen, context.replay_input.swapped))
+            seen.append((context.pair.clean, context.pair.source))
             return super().play(context)
 
     session: ReplaySession
     with open_session(run, source, lambda *_: twin) as session, session.ready():
-        (replay_input, _) = session.replay_inputs(str(run.episodes["item_id"][0]))
+        (replay_input, _) = session.pairs(str(run.episodes["item_id"][0]))
         roll_out(session, replay_input, Watching())
     assert len(seen) == CALLS
     assert (seen[0][0].state != seen[1][0].state).any()

@@ -7,9 +7,8 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.intervene import ImageSwapEffect
-from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
-from probe_kit.intervene.kinds.reach import TILES_APART
-from probe_kit.intervene.store.answers import ConditionOutcomes
+from probe_kit.intervene.kinds.image_swap import TILES_APART, image_swap_effects
+from probe_kit.intervene.outcomes import ConditionOutcomes
 from tests.intervene.answers import follower, habit, outcomes_of
 
 Kind = Callable[[int], tuple[np.ndarray, np.ndarray]]

@@ -9,8 +9,8 @@ import pytest
 
 import probe_kit
 from probe_kit.intervene import ImageSwapEffect, classify_all, classify_use
-from probe_kit.intervene.kinds.image_swap.effects import image_swap_effects
-from probe_kit.intervene.kinds.image_swap.verdict import classify_behaviour, groups_for_not_used
+from probe_kit.intervene.kinds.image_swap import image_swap_effects
+from probe_kit.intervene.results.verdict import classify_behaviour, groups_for_not_used
 from tests.intervene.answers import Cell, follower, habit, outcomes_of
 
 SUITE = "suite@1#0123456789ab"
@@ -25,7 +25,7 @@ def test_one_module_alone_makes_a_verdict() -> None:
     """The retention table, the demo and the intervention had one each."""
     root = Path(probe_kit.__file__).parent
     made = [path for path in root.rglob("*.py") if re.search(r"\bUseVerdict\(", path.read_text(encoding="utf-8"))]
-    assert [path.relative_to(root).as_posix() for path in made] == ["intervene/kinds/image_swap/verdict.py"]
+    assert [path.relative_to(root).as_posix() for path in made] == ["intervene/results/verdict.py"]
 
 
 @pytest.mark.parametrize(

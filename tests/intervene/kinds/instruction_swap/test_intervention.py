@@ -18,10 +18,10 @@ from probe_kit.intervene import (
     load_effects,
     run_intervention,
 )
-from probe_kit.intervene.edits.sites import resolve_sites, roles_of, token_mask
-from probe_kit.intervene.kinds.instruction_swap.effects import input_sensitivity
-from probe_kit.intervene.kinds.instruction_swap.intervention import counterpart_instruction
-from probe_kit.intervene.replay.session import ReplaySession
+from probe_kit.intervene.kinds.instruction_swap import input_sensitivity
+from probe_kit.intervene.places import resolve_sites, roles_of
+from probe_kit.intervene.sessions.session import ReplaySession
+from probe_kit.intervene.tokens import token_mask
 from probe_kit.runs import Run
 
 if TYPE_CHECKING:
@@ -41,17 +41,14 @@ def test_an_item_asked_in_its_twins_words_does_what_its_twin_does(
 ) -> None:
     """By hand: the same picture, state and noise, and the words of the item that asks for the other one."""
     outcomes = worded.outcomes
-    for replay_input in session.replay_inputs(outcomes.items[0]):
-        row = list(outcomes.episodes).index(replay_input.episode_id)
-        words = session.counterparts[replay_input.item_id].instruction
-        assert (
-            counterpart_instruction(session, replay_input.item_id, replay_input.layout)
-            == words
-            != replay_input.seen.instruction
-        )
-        chunk = session.act(replace(replay_input.seen, instruction=words), replay_input.seed)
+    for replay_input in session.pairs(outcomes.items[0]):
+        row = list(outcomes.episodes).index(replay_input.episode)
+        words = session.counterparts[replay_input.item].instruction
+        asked = session.with_other_instruction(replay_input)
+        assert asked.instruction == words != replay_input.clean.instruction
+        chunk = session.act(replace(replay_input.clean, instruction=words), replay_input.seed)
         assert outcomes.of("instruction_swap")[row] == pytest.approx(
-            session.lateral_displacement(chunk, replay_input.seen), abs=0
+            session.lateral_displacement(chunk, replay_input.clean), abs=0
         )
 
 
@@ -126,9 +123,9 @@ def test_what_every_block_hands_over_is_a_place_and_all_of_it_is_the_exchange(
 def test_a_memory_has_the_backbones_roles_and_no_layer_behind_its_last_block(
     session: ReplaySession, copy: Run
 ) -> None:
-    (replay_input, _) = session.replay_inputs(str(copy.episodes["item_id"][0]))
-    mask = token_mask(session.policy, replay_input.seen, "kv", "image")
-    np.testing.assert_array_equal(mask, token_mask(session.policy, replay_input.seen, "backbone", "image"))
+    (replay_input, _) = session.pairs(str(copy.episodes["item_id"][0]))
+    mask = token_mask(session.policy, replay_input.clean, "kv", "image")
+    np.testing.assert_array_equal(mask, token_mask(session.policy, replay_input.clean, "backbone", "image"))
     assert roles_of(session.policy, "kv", ("all", "image", "state")) == ["all", "image"]
     (place,) = resolve_sites("kv.01", session.policy)
     assert [str(site) for site in place.sites] == ["kv.01.keys", "kv.01.values"]

@@ -9,10 +9,9 @@ from probe_kit._terminal.console import out
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.intervene import Interchange, InterventionResult, ReplaySource, run_intervention
-from probe_kit.intervene.kinds.joint.effects import joint_keys_in_use, stored_joint_places
-from probe_kit.intervene.kinds.joint.intervention import JointPlaces
+from probe_kit.intervene.kinds.joint import JointPlaces, stored_joint_places
+from probe_kit.intervene.kinds.site_maps import stored_localised_sites, stored_site_effects
 from probe_kit.intervene.results.inventory import listed_interventions
-from probe_kit.intervene.results.site_maps import stored_localised_sites, stored_site_effects
 from probe_kit.runs import Run
 
 if TYPE_CHECKING:
@@ -54,7 +53,7 @@ def test_it_is_stored_listed_and_shown(copy: Run, result: InterventionResult) ->
         f"{place} {role}" for place in SITES for role in ROLES
     ]
     assert {row.finding for row in rows} == {"n/a"}, "two items are no evidence"
-    assert joint_keys_in_use(copy) == {result.key}
+    assert JointPlaces.keys_in_use(copy) == {result.key}
     assert result.key in {one.key for one in listed_interventions(copy) if one.state == "used"}
     assert set(result.certificate["joint"]) == {"color"}
     with out.capture() as printed:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from probe_kit.intervene.kinds.joint.minimal_set import MOST_SINGLY, find_minimal_set
+from probe_kit.intervene.patching.sets import MOST_SINGLY, find_minimal_set
 
 Cells = tuple[int, ...]
 

@@ -1,0 +1,436 @@
+"""Directions in which an answer can be written, each found without the episode that it is used on.
+
+A probe's weights are the direction in which the answer is best *read*: they are turned away from what else varies.
+Where it *lies* is the difference of the two class means, and that is the direction to write along.
+
+Pooled directions are of a mean over tokens, from the run's columns. An answer that lies in *which* tokens are
+marked leaves no mean behind: marks on the left tile for one answer and on the right tile for the other cancel. The
+differences of class means at every position do not: they lie along few directions, which are the same for every
+token. These are found in the tokens themselves.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import NoDirectionError, UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.intervene.erasers import (
+    NO_DIRECTION,
+    Eraser,
+    Method,
+    PaddedTokens,
+    fit_control,
+    fit_eraser,
+    half_differences,
+)
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.patching.patch import Cell
+from probe_kit.intervene.places import SiteGroup, names_one_place, resolve_all
+from probe_kit.intervene.sessions.session import ReplaySession
+from probe_kit.intervene.settings import items_of
+from probe_kit.intervene.tokens import token_mask
+from probe_kit.runs.run import Run
+from probe_kit.statistics.folds import Fold, grouped_folds
+
+if TYPE_CHECKING:
+    pass
+
+Vector = NDArray[np.float32]
+MEAN_DIFFERENCE, PROBE = "mean-difference", "probe"
+DIRECTIONS = (MEAN_DIFFERENCE, PROBE)
+FOLDS = 5
+_ROUNDING = 1e-6
+"""Share of a number's size below which a difference of stored float32 means is rounding."""
+
+
+class DirectionBasis(Protocol):
+    """Directions by name, each found without the episode that it is used on."""
+
+    @property
+    def control_names(self) -> tuple[str, ...]:
+        """Return the names of the random ones beside the one that was asked for."""
+
+    def basis(self, name: str, episode: str, category: str) -> Vector:
+        """Return (K, D) float32, orthonormal."""
+
+    def shift(self, name: str, episode: str, category: str, strength: float) -> Vector:
+        """Return (D,) or (T, D) float32, so many half differences of the class means, toward `left`.
+
+        (T, D): the t-th row belongs to the role's t-th token. Of a control: as far, along its own directions.
+        """
+
+
+class Directed(Protocol):
+    """An intervention along directions: interchange, steering or closed loop."""
+
+    @property
+    def categories(self) -> tuple[str, ...] | None:
+        """Of the run; None for all."""
+
+    @property
+    def direction(self) -> str:
+        """Its name, see `check_direction`."""
+
+    @property
+    def controls(self) -> int:
+        """Number of random ones."""
+
+    @property
+    def seed(self) -> int:
+        """Of controls and folds."""
+
+
+def check_direction(direction: str) -> None:
+    """Raise UsageError for a name that is no direction to patch tokens within."""
+    if direction.startswith(f"{MEAN_DIFFERENCE}:"):
+        Method.of(direction)
+    elif direction not in DIRECTIONS:
+        raise UsageError(
+            f"unknown direction {direction!r}; expected {', '.join(DIRECTIONS)}, or {MEAN_DIFFERENCE}:K for K "
+            "directions of the tokens themselves"
+        )
+
+
+def control_names(count: int) -> tuple[str, ...]:
+    """Return the names of so many random directions beside another one."""
+    return tuple(f"control-{number + 1}" for number in range(count))
+
+
+def fit_token_directions(
+    session: ReplaySession, intervention: Directed, cells: Sequence[Cell], patterns: Sequence[str]
+) -> dict[Cell, DirectionBasis]:
+    """Return the meaning of an intervention's direction in every cell: of the run's columns, or of all its tokens.
+
+    `mean-difference:K`: the K directions along which the differences of class means at all positions lie most, the
+    same for every token; from one clean inference per episode and place. patterns: the places as they were named;
+    those of a wildcard may be left out. Raises UnknownSiteError for a place of several sites or one that is not
+    stored, NoDirectionError for a named place without a direction, UsageError where there are too few episodes to
+    learn from.
+    """
+    items = items_of(session.run, intervention.categories, None)
+    direction, controls, seed = intervention.direction, intervention.controls, intervention.seed
+    passed_over = PassedOver(session, patterns)
+    if ":" not in direction:
+        categories = tuple(dict.fromkeys(session.categories_of(items)))
+        pooled: dict[Cell, DirectionBasis] = {}
+        for cell in cells:
+            with passed_over.fitting(cell):
+                pooled[cell] = fit_directions(
+                    session.run, cell.place.only_site, cell.role, direction, controls, seed, categories
+                )
+        return passed_over.left(pooled)
+    bases: dict[Cell, dict[tuple[str, str], Vector]] = {}
+    halves: dict[Cell, dict[str, NDArray[np.float64]]] = {}
+    for cell, category, features in collect_token_features(session, items, cells):
+        with passed_over.fitting(cell):
+            fits = fit_by_fold(features, cell, Method.of(direction), controls, seed, category)
+            by_name = bases.setdefault(cell, {})
+            for name, of_episode in by_episode(features, fits).items():
+                by_name |= {
+                    (name, episode): eraser.removed[0].astype(np.float32) for episode, eraser in of_episode.items()
+                }
+            halves.setdefault(cell, {}).update(half_differences_of(features, fits, direction))
+    return {
+        cell: TokenDirections(by_name, halves[cell], control_names(controls))
+        for cell, by_name in passed_over.left(bases).items()
+    }
+
+
+class PassedOver:
+    """Places without a direction: one that is named raises, one of a wildcard is left out."""
+
+    def __init__(self, session: ReplaySession, patterns: Sequence[str]) -> None:
+        self._session = session
+        self._required = resolve_all([name for name in patterns if names_one_place(name)], session.policy)
+        self._cells: set[Cell] = set()
+        self._last: NoDirectionError | None = None
+
+    @contextmanager
+    def fitting(self, cell: Cell) -> Iterator[None]:
+        """Fit directions there; NoDirectionError is raised for a named place, and recorded for others."""
+        try:
+            yield
+        except NoDirectionError as error:
+            if cell.place.name in self._required:
+                raise
+            self._cells.add(cell)
+            self._last = error
+            self._session.passed_over[str(cell)] = str(error)
+
+    def left[T](self, fitted: Mapping[Cell, T]) -> dict[Cell, T]:
+        """Return what was fitted without cells that a category passed over.
+
+        Raises the last NoDirectionError if no cell is left.
+        """
+        left = {cell: fit for cell, fit in fitted.items() if cell not in self._cells}
+        if not left and self._last is not None:
+            raise self._last
+        return left
+
+
+# -- of a mean over tokens -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PooledDirections:
+    """Unit directions of one site and role, per category and fold.
+
+    units: by name and category (F, D) float32. half_differences: by category (F,), half the distance of the class
+    means along the first of them. fold_of: by episode.
+    """
+
+    units: Mapping[tuple[str, str], Vector]
+    half_differences: Mapping[str, NDArray[np.float64]]
+    fold_of: Mapping[str, int]
+    control_names: tuple[str, ...] = ()
+
+    def basis(self, name: str, episode: str, category: str) -> Vector:
+        """Return (1, D) the direction that never saw this episode."""
+        return self.of(name, episode, category)[None]
+
+    def of(self, name: str, episode: str, category: str) -> Vector:
+        """Return (D,) the direction that never saw this episode."""
+        return np.asarray(self.units[name, category][self.fold_of[episode]])
+
+    def half_difference(self, episode: str, category: str) -> float:
+        """Return half the distance of the class means, for this episode."""
+        return float(self.half_differences[category][self.fold_of[episode]])
+
+    def shift(self, name: str, episode: str, category: str, strength: float) -> Vector:
+        """Return (D,) so many half differences of the class means, toward `left`."""
+        return np.float32(strength * self.half_difference(episode, category)) * self.of(name, episode, category)
+
+
+def view_of(role: str) -> str:
+    """Return the pooled view in which a role's tokens are averaged."""
+    return "mean" if role == "all" else f"mean:{role}"
+
+
+def fit_directions(
+    run: Run,
+    site: Site,
+    role: str,
+    direction: str,
+    controls: int,
+    seed: int,
+    categories: Sequence[str] | None = None,
+) -> PooledDirections:
+    """Directions of these categories, by default of all, from the pooled tokens of `role` at `site`.
+
+    Raises UsageError for an unknown direction, NoDirectionError for equal class means, UnknownSiteError for a site
+    or view that is not stored.
+    """
+    if direction not in DIRECTIONS:
+        raise UsageError(f"unknown direction {direction!r}; expected one of {', '.join(DIRECTIONS)}")
+    episodes = run.episodes
+    features = run.column(site, resolve_view(view_of(role), run.views(site.stream))).astype(np.float64)
+    names = control_names(controls)
+    units: dict[tuple[str, str], Vector] = {}
+    gaps: dict[str, NDArray[np.float64]] = {}
+    fold_of: dict[str, int] = {}
+    for category in categories or dict.fromkeys(episodes["category"].astype(str)):
+        rows = np.flatnonzero((episodes["category"] == category).to_numpy())
+        left = (episodes["side_correct"].to_numpy()[rows] == "left").astype(int)
+        groups = episodes["group_id"].to_numpy(dtype=str)[rows]
+        folds = grouped_folds(
+            left, groups, min(FOLDS, np.unique(groups).size), derive_seed("axes", seed, category)
+        )
+        of_fold: dict[str, list[NDArray[np.float64]]] = {name: [] for name in (direction, *names)}
+        widths = []
+        for number, fold in enumerate(folds):
+            fold_of |= {str(name): number for name in episodes["episode_id"].to_numpy()[rows[fold.test]]}
+            training, labels = features[rows[fold.train]], left[fold.train].astype(bool)
+            difference = training[labels].mean(axis=0) - training[~labels].mean(axis=0)
+            if (np.abs(difference) <= _ROUNDING * np.abs(training).max(axis=0)).all():
+                raise NoDirectionError(
+                    f"{category}, {site}, role {role}: no direction for {direction}: {NO_DIRECTION}"
+                )
+            unit = _direction(training, labels, direction)
+            widths.append(abs(float(difference @ unit)) / 2)
+            of_fold[direction].append(unit)
+            draw = np.random.default_rng(derive_seed("control", seed, category, str(site), role, number))
+            for name in names:
+                of_fold[name].append(_control(training, [unit, _unit(difference)], draw))
+        units |= {(name, category): np.array(found, np.float32) for name, found in of_fold.items()}
+        gaps[category] = np.array(widths)
+    return PooledDirections(units, gaps, fold_of, names)
+
+
+def _direction(training: NDArray[np.float64], left: NDArray[np.bool_], direction: str) -> NDArray[np.float64]:
+    """(D,) of length 1, toward `left`."""
+    if direction == MEAN_DIFFERENCE:
+        return _unit(training[left].mean(axis=0) - training[~left].mean(axis=0))
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.preprocessing import StandardScaler
+
+    scaler = StandardScaler().fit(training)
+    fitted = LogisticRegression(C=0.01, max_iter=1000).fit(scaler.transform(training), left)
+    return _unit(fitted.coef_[0] / scaler.scale_)
+
+
+def _control(
+    training: NDArray[np.float64], others: list[NDArray[np.float64]], draw: np.random.Generator
+) -> NDArray[np.float64]:
+    """(D,) of length 1, drawn from the training data's covariance and orthogonal to `others`."""
+    centred = training - training.mean(axis=0)
+    found = centred.T @ draw.normal(size=len(centred))
+    basis, _ = np.linalg.qr(np.stack(others, axis=1))
+    return _unit(found - basis @ (basis.T @ found))
+
+
+def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    length = float(np.linalg.norm(vector))
+    return vector / length if length else vector
+
+
+# -- of the tokens themselves --------------------------------------------------------------------------------
+
+Fits = Sequence[tuple[Fold, Mapping[str, Eraser]]]
+"""Every fold, and by name the eraser fitted on its training episodes."""
+_Row = tuple[Pair, NDArray[np.float64]]
+"""The pair of one episode, and (T, D) its tokens."""
+
+
+@dataclass(frozen=True)
+class TokenDirections:
+    """Of one site and role.
+
+    bases: by name and episode, (K, D) float32. half_differences: by episode (T, K), half the differences of the
+    class means at the role's positions along the directions that were asked for.
+    """
+
+    bases: Mapping[tuple[str, str], Vector]
+    half_differences: Mapping[str, NDArray[np.float64]]
+    control_names: tuple[str, ...] = ()
+
+    def basis(self, name: str, episode: str, category: str) -> Vector:
+        """(K, D) the directions that never saw this episode."""
+        del category  # an episode has one
+        return self.bases[name, episode]
+
+    def shift(self, name: str, episode: str, category: str, strength: float) -> Vector:
+        """(T, D) of all positions; a mark on either tile has its own sign at the positions of each."""
+        del category
+        return np.float32(strength * self.half_differences[episode]) @ self.bases[name, episode]
+
+
+@dataclass(frozen=True)
+class TokenFeatures:
+    """The tokens of one category in one cell, of N episodes.
+
+    episodes, groups: (N,). left: (N,) whether the correct picture lies left. tokens: at position t the role's
+    t-th token, see `erasers.PaddedTokens`.
+    """
+
+    episodes: tuple[str, ...]
+    groups: NDArray[np.str_]
+    left: NDArray[np.bool_]
+    tokens: PaddedTokens
+
+
+def collect_token_features(
+    session: ReplaySession, items: Sequence[str], cells: Sequence[Cell]
+) -> Iterator[tuple[Cell, str, TokenFeatures]]:
+    """Yield cell, category and the tokens there, from one clean inference per episode and place.
+
+    items: by id, all of their episodes. What is held at a time is of one place and category: 8 bytes per number,
+    episodes × tokens × width. Raises UnknownSiteError for a place of several sites.
+    """
+    by_place: dict[SiteGroup, list[Cell]] = {}
+    for cell in cells:
+        by_place.setdefault(cell.place, []).append(cell)
+    sites = {place: place.only_site for place in by_place}
+    of_category: dict[str, list[str]] = {}
+    for item, category in zip(items, session.categories_of(items), strict=True):
+        of_category.setdefault(category, []).append(item)
+    done = 0
+    for place, site in sites.items():
+        for category, members in of_category.items():
+            rows: dict[Cell, list[_Row]] = {cell: [] for cell in by_place[place]}
+            for item in members:
+                for pair in session.pairs(item):
+                    _infer(session, pair, site, rows)
+                done += 1
+                if session.on_fit_progress is not None:
+                    session.on_fit_progress(done, len(sites) * len(items), item)
+            for cell in list(rows):
+                yield cell, category, _pad(rows.pop(cell))
+
+
+def _infer(session: ReplaySession, pair: Pair, site: Site, rows: Mapping[Cell, list[_Row]]) -> None:
+    """Add the episode's row to those of every cell."""
+    from probe_kit.hooks import capture
+
+    with capture(session.policy, [site]) as tape:
+        session.act(pair.clean, pair.seed)
+    tokens = tape[site][0].double().cpu().numpy()
+    for cell, values in rows.items():
+        values.append((pair, tokens[token_mask(session.policy, pair.clean, site.stream, cell.role)]))
+
+
+def _pad(rows: Sequence[_Row]) -> TokenFeatures:
+    """Return sequences of different lengths as one array, their first tokens together."""
+    pairs, values = zip(*rows, strict=True)
+    longest = max(map(len, values))
+    tokens = np.zeros((len(rows), longest, values[0].shape[1]))
+    present = np.zeros((len(rows), longest), bool)
+    for row, sequence in enumerate(values):
+        tokens[row, : len(sequence)], present[row, : len(sequence)] = sequence, True
+    return TokenFeatures(
+        tuple(pair.episode for pair in pairs),
+        np.array([pair.group for pair in pairs]),
+        np.array([pair.side == "left" for pair in pairs]),
+        PaddedTokens(tokens, present),
+    )
+
+
+def fit_by_fold(
+    features: TokenFeatures, cell: Cell, method: Method, controls: int, seed: int, category: str
+) -> Fits:
+    """Return an eraser called `method` and its controls, for every fold of the groups of one category.
+
+    Raises as `fit_eraser` does, where there is nothing to learn from, and names category, site and role.
+    """
+    groups = min(FOLDS, np.unique(features.groups).size)
+    site = cell.place.only_site
+    seeds = derive_seed("erase", seed, category), derive_seed("control", seed, category, str(site), cell.role)
+    folds = grouped_folds(features.left.astype(int), features.groups, groups, seeds[0])
+    draw = np.random.default_rng(seeds[1])
+    try:
+        return [(fold, _fitted(features, fold, method, controls, draw)) for fold in folds]
+    except UsageError as error:
+        raise type(error)(f"{category}, {site}, role {cell.role}: {error}") from error
+
+
+def by_episode(features: TokenFeatures, fits: Fits) -> dict[str, dict[str, Eraser]]:
+    """Return by name and episode the eraser that never saw that episode."""
+    erasers: dict[str, dict[str, Eraser]] = {}
+    for fold, fitted in fits:
+        for name, eraser in fitted.items():
+            erasers.setdefault(name, {}).update({features.episodes[row]: eraser for row in fold.test})
+    return erasers
+
+
+def _fitted(
+    features: TokenFeatures, fold: Fold, method: Method, controls: int, draw: np.random.Generator
+) -> dict[str, Eraser]:
+    training, left = features.tokens.only(fold.train), features.left[fold.train]
+    eraser = fit_eraser(training, left, method)
+    drawn = {name: fit_control(training, left, method, eraser, draw) for name in control_names(controls)}
+    return {str(method): eraser, **drawn}
+
+
+def half_differences_of(features: TokenFeatures, fits: Fits, direction: str) -> dict[str, NDArray[np.float64]]:
+    """Return by episode (T, K) half the differences of the class means, of the folds that it is not in."""
+    by_name: dict[str, NDArray[np.float64]] = {}
+    for fold, fitted in fits:
+        halves = half_differences(features.tokens.only(fold.train), features.left[fold.train], fitted[direction])
+        by_name |= dict.fromkeys((features.episodes[row] for row in fold.test), halves)
+    return by_name

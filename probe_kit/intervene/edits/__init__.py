@@ -1,1 +1,0 @@
-"""Edits of token activations, and the directions they use."""

@@ -1,0 +1,417 @@
+"""Attention: the share of the acting stream's attention on images, tiles, instruction and state. Descriptive.
+
+An attended token need not be used, and a used one may get little attention. So this enters no verdict, and nothing
+is edited. Every inference runs twice, with and without recording, and both actions must be bit-identical.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleError, UsageError
+from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.hooks.contract.sites import first_of
+from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, effect_table
+from probe_kit.intervene.outcomes import ATTENTION, ATTENTION_FILE, RECORDED, Effect
+from probe_kit.intervene.places import ALL, TILE_ROLES, roles_of
+from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, ReplayBatch
+from probe_kit.intervene.selection import StoredResult, stored_results
+from probe_kit.intervene.tokens import TILES, role_token_mask
+from probe_kit.runs.run import Run
+from probe_kit.statistics.bootstrap import GAINS, units_seed
+from probe_kit.statistics.student import student_interval
+from probe_kit.train.data.run_reader import RunReader
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit.hooks import Policy
+    from probe_kit.hooks.capturing.attention import AttentionMass
+    from probe_kit.intervene.sessions.session import ReplaySession
+
+ROLES = ("image", *TILES, "language", "state", "special")
+"""Whose tokens are asked about, where a family has them and, of tiles, says which tokens see them."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttentionReadout(Intervention):
+    """Two inferences per episode, or with the readout `per-step` per call of it: clean, and recorded.
+
+    roles: of the backbone's tokens; empty for `ROLES`, as many of them as the family has. `all` is always
+    recorded: what is missing to 1 lies on the acting part's own tokens. Raises UsageError for a role that comes
+    twice."""
+
+    kind: ClassVar[str] = ATTENTION
+    summary: ClassVar[str] = "Shares of the acting stream's attention (descriptive)."
+    position: ClassVar[int] = 9
+    options: ClassVar[Mapping[str, str]] = {"roles": "of the backbone's tokens; default all that the family has"}
+    is_descriptive: ClassVar[bool] = True
+
+    roles: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(set(self.roles)) != len(self.roles):
+            raise UsageError(f"roles are {', '.join(self.roles)}; give each once")
+
+    @property
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
+        """Return attention; and which tokens see a tile, where that is asked by name."""
+        return ("attention", *(("tiles",) if set(self.roles) & set(TILES) else ()))
+
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Clean, and the same with its attention recorded. Raises UsageError for a role it lacks."""
+        return CleanRun(), AttentionRecorded(backbone_of(session.policy), self._roles(session.policy))
+
+    def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
+        """What the axes of the stored array are. Raises CaptureChangedActionError if noting changed an action."""
+        (recording,) = (one for one in conditions if isinstance(one, AttentionRecorded))
+        largest = float(batch.max_action_change.max(initial=0.0))
+        if largest:
+            raise CaptureChangedActionError(
+                f"with its attention recorded an action differs by {largest:.3g}; expected the same bit for bit. "
+                "The adapter's `record_attention` changes the inference, or the model is not deterministic"
+            )
+        assert batch.mass is not None
+        inferences, blocks, iterations, heads, _ = batch.mass.shape
+        return {
+            ATTENTION: {
+                "stream": recording.stream, "roles": list(recording.roles), "inferences": inferences,
+                "blocks": blocks, "iterations": iterations, "heads": heads, "max_action_change": largest,
+            }
+        }  # fmt: skip
+
+    def extra_files(self, run: Run, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, bytes]:
+        """The attention of every inference."""
+        (recording,) = (one for one in conditions if isinstance(one, AttentionRecorded))
+        assert batch.mass is not None
+        assert batch.inferences is not None
+        rows = run.episodes.iloc[batch.inferences[:, 0]]
+        columns = {
+            own: rows[name].to_numpy(dtype=str)
+            for own, name in (
+                ("episodes", "episode_id"), ("groups", "group_id"), ("categories", "category"),
+                ("sides", "side_correct"),
+            )
+        }  # fmt: skip
+        attention_records = AttentionShares(
+            recording.roles, **columns, calls=batch.inferences[:, 1], mass=batch.mass
+        )
+        return {ATTENTION_FILE: attention_records.to_bytes()}
+
+    @staticmethod
+    def effects(measurement: Measurement) -> "list[AttentionRow]":
+        """Return shares by block, iteration, head and role. Raises RunDamagedError."""
+        return AttentionShares.of(measurement).rows()
+
+    @staticmethod
+    def table(rows: "Sequence[AttentionRow]", context: TableContext) -> "ResponsiveTable":
+        """Return one line per category and block of the backbone that is read."""
+        del rows
+        attention = AttentionShares.of(context.measurement)
+        means = attention.rows(("block",))
+        roles = [role for role in dict.fromkeys(row.role for row in means) if role not in (CORRECT, OTHER)]
+        lines: list[tuple[str, tuple[dict[str, float], str]]] = []
+        for category, part in attention.by_category():
+            apart = part.correct_minus_other(context.measurement.seed_text)
+            for block in dict.fromkeys(row.block for row in means if row.category == category):
+                shares = {row.role: row.share for row in means if (row.category, row.block) == (category, block)}
+                lines.append((f"{category} · block {block:02d}", (shares, _difference(apart.get(block or 0)))))
+        parts: dict[str, Any] = {"Where the attention lies, %": {role: _share_column(role) for role in roles}}
+        if set(TILE_ROLES) <= set(roles):
+            parts["Tiles by answer"] = {"correct − other [95 %]": lambda row: row[1]}
+        title = f"What does it attend to? {context.subject}, attention"
+        return effect_table(title, _LEGEND, "category · read", lines, parts)
+
+    @staticmethod
+    def notes(rows: "Sequence[AttentionRow]", measurement: Measurement) -> list[str]:
+        """Return that it is descriptive, and what tests more."""
+        del rows, measurement
+        return [
+            "Attention is descriptive, not causal, and does not enter the verdict. To test what is read, run "
+            "--kind interchange --sites kv.*"
+        ]
+
+    @staticmethod
+    def keys_in_use(run: RunReader) -> set[str]:
+        """Return keys of the stored ones that tables and figures read. Raises RunDamagedError."""
+        return {result.stored.key for result, _ in preferred_attention(run).values()}
+
+    def _roles(self, policy: "Policy") -> tuple[str, ...]:
+        stream = backbone_of(policy)
+        has_tiles = policy.interventions.supports("tiles")
+        wanted = self.roles or tuple(role for role in ROLES if has_tiles or role not in TILES)
+        there = roles_of(policy, stream, wanted)
+        if missing := [role for role in self.roles if role not in there]:
+            raise UsageError(
+                f"no token of {stream} has the role {missing[0]!r}; there are "
+                f"{', '.join(policy.role_names[policy.tokens_of(stream)])}"
+            )
+        return tuple(dict.fromkeys((ALL, *there)))
+
+
+@dataclass(frozen=True)
+class AttentionRecorded:
+    """The clean inference with attention weights recorded. stream: whose tokens are attended to."""
+
+    stream: str
+    roles: tuple[str, ...]
+    name: str = RECORDED
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Nothing is changed."""
+        from probe_kit.hooks.capturing.attention import capture_attention
+
+        session, pair = context.session, context.pair
+        masks = [self._mask(context, role) for role in self.roles]
+        with capture_attention(session.policy) as mass:
+            chunk = session.act(pair.clean, pair.seed)
+        return ConditionResult(chunk, mass=shares_by_role(mass, masks))
+
+    def _mask(self, context: ConditionContext, role: str) -> NDArray[np.bool_] | None:
+        """None where no token plays it now: a family may have the role, and a tile be hidden by the arm."""
+        try:
+            return role_token_mask(context.session.policy, context.pair, self.stream, role, context.memo)
+        except EmptyRoleError:
+            return None
+
+
+def shares_by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | None]) -> NDArray[np.float32]:
+    """(B, I, H, R) shares by block, iteration, head and role.
+
+    NaN where a block is not read in an iteration, and of a role that no token has. Of one observation. masks: (T,)
+    each, None for no token. Raises CaptureError for blocks with different numbers of heads.
+    """
+    shapes = {found.shape[:2] for found in mass.by_head.values()}
+    if len(shapes) != 1 or next(iter(shapes))[0] != 1:
+        raise CaptureError(f"attention has rows and heads {sorted(shapes)}; expected one row, as many heads each")
+    blocks, iterations = (max(own) + 1 for own in zip(*mass.by_head, strict=True))
+    shares = np.full((blocks, iterations, next(iter(shapes))[1], len(masks)), np.nan, np.float32)
+    for role, tokens in enumerate(masks):
+        if tokens is None:
+            continue
+        for (block, iteration), share in mass.heads_on(tokens).items():
+            shares[block, iteration, :, role] = share[0]
+    return shares
+
+
+def backbone_of(policy: "Policy") -> str:
+    """Name of the stream that the acting stream reads."""
+    name = first_of("backbone", policy.streams.values())
+    assert name is not None, "every policy has a backbone"
+    return name
+
+
+Axis = Literal["block", "iteration", "head", "call"]
+_AXES: Mapping[str, int] = {"block": 1, "iteration": 2, "head": 3}
+CORRECT, OTHER, ACTION = "image.correct", "image.other", "action"
+"""Made of what is stored: the tile of the correct picture, the other one, and the acting stream itself."""
+Shares = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AttentionShares:
+    """Attention of N inferences. roles: names of R, the first one `all`.
+
+    episodes, groups, categories, sides: (N,), `sides` those of the correct picture. calls: (N,) inference of the
+    episode, counted from 0. mass: (N, B, I, H, R) float32 shares; NaN where a block is not read in an iteration
+    and of roles that no token of an inference plays, such as a tile behind the arm.
+    """
+
+    roles: tuple[str, ...]
+    episodes: NDArray[np.str_]
+    groups: NDArray[np.str_]
+    categories: NDArray[np.str_]
+    sides: NDArray[np.str_]
+    calls: NDArray[np.int64]
+    mass: NDArray[np.float32]
+
+    def to_bytes(self) -> bytes:
+        """As a `.npz`; the same numbers give the same bytes."""
+        file = BytesIO()
+        np.savez_compressed(file, allow_pickle=False, **{**vars(self), "roles": np.array(self.roles)})
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> Self:
+        """Load what `to_bytes` made."""
+        with open_arrays(content) as arrays:
+            found: dict[str, Any] = {own.name: arrays[own.name] for own in fields(cls)}
+        return cls(**{**found, "roles": tuple(map(str, found["roles"]))})
+
+    @classmethod
+    def of(cls, measurement: Measurement) -> Self:
+        """Of a stored intervention of the kind `attention`. Raises RunDamagedError if it was changed."""
+        return cls.from_bytes(measurement.read(ATTENTION_FILE))
+
+    def only(self, chosen: NDArray[np.bool_]) -> Self:
+        """Some of the inferences. chosen: (N,)."""
+        return type(self)(
+            self.roles, *(getattr(self, own.name)[chosen] for own in fields(self) if own.name != "roles")
+        )
+
+    def by_category(self) -> list[tuple[str, Self]]:
+        """Every category with its inferences, in the order of the episodes."""
+        return [(name, self.only(self.categories == name)) for name in dict.fromkeys(map(str, self.categories))]
+
+    def shares(self) -> dict[str, Shares]:
+        """By role (N, B, I, H): those that are stored, tiles also by where the answer lies, and the rest of 1."""
+        found = {role: self.mass[..., at].astype(np.float64) for at, role in enumerate(self.roles)}
+        if set(TILE_ROLES) <= found.keys():
+            left, right = (found[role] for role in TILE_ROLES)
+            is_left = (self.sides == "left")[:, None, None, None]
+            found |= {CORRECT: np.where(is_left, left, right), OTHER: np.where(is_left, right, left)}
+        return {**found, ACTION: 1 - found[ALL]} if ALL in found else found
+
+    def rows(self, by: Sequence[Axis] = ("block", "iteration", "head")) -> "list[AttentionRow]":
+        """One per category, role and place along the axes `by`; means over the others, every episode alike.
+
+        Raises UsageError for an axis that does not exist.
+        """
+        if unknown := set(by) - set(get_args(Axis)):
+            raise UsageError(f"attention has no axis {min(unknown)!r}; it has {', '.join(get_args(Axis))}")
+        found = []
+        for category, own in self.by_category():
+            calls = np.unique(own.calls).tolist() if "call" in by else [None]
+            for call in calls:
+                part = own if call is None else own.only(own.calls == call)
+                found += part._rows(category, call, by)
+        return found
+
+    def frame(self, by: Sequence[Axis] = ("block", "iteration", "head")) -> "pd.DataFrame":
+        """`rows` as a data frame, with the columns of the axes that are asked for."""
+        import pandas as pd
+
+        unused = [axis for axis in get_args(Axis) if axis not in by]
+        columns = [own.name for own in fields(AttentionRow)]
+        return pd.DataFrame([asdict(row) for row in self.rows(by)], columns=columns).drop(columns=unused)
+
+    def correct_minus_other(self, seed_text: str) -> "dict[int, tuple[float, tuple[float, float]]]":
+        """By block, the share on the correct picture's tile minus the other's, with its 95 % interval by groups.
+
+        Of one category; a mean over iterations, heads and calls. Empty without tiles.
+        """
+        shares = self.shares()
+        if CORRECT not in shares:
+            return {}
+        episodes, groups = self._episodes()
+        found = {}
+        for block in range(self.mass.shape[1]):
+            apart = (shares[CORRECT] - shares[OTHER])[:, block : block + 1]
+            if np.isnan(apart).all():
+                continue
+            every = _mean(_per_episode(apart, episodes), (1, 2, 3))
+            seen = ~np.isnan(every)
+            values, units = every[seen], groups[seen]
+            limits = student_interval(values, units, units_seed(units, seed_text), GAINS)
+            found[block] = float(values.mean()), limits
+        return found
+
+    def _rows(self, category: str, call: int | None, by: Sequence[Axis]) -> "list[AttentionRow]":
+        episodes, _ = self._episodes()
+        over = tuple(at for axis, at in _AXES.items() if axis not in by)
+        found = []
+        for role, values in self.shares().items():
+            every = _per_episode(values, episodes)
+            means = _mean(every, (0, *over))
+            for place, share in np.ndenumerate(means):
+                if not np.isnan(share):
+                    at: dict[str, Any] = dict(
+                        zip((axis for axis in _AXES if axis in by), map(int, place), strict=True)
+                    )
+                    named: dict[str, Any] = {"category": category, "role": role, "call": call}
+                    found.append(AttentionRow(**named, **at, share=float(share), n_episodes=len(every)))
+        return found
+
+    def _episodes(self) -> tuple[NDArray[np.int64], NDArray[np.str_]]:
+        """(N,) which of the E episodes an inference is of, and the (E,) groups of these."""
+        _, first, which = np.unique(self.episodes, return_index=True, return_inverse=True)
+        return which, self.groups[first]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttentionRow(Effect):
+    """How much attention lies on one role's tokens, in one category: a share, of 1 in all.
+
+    block, iteration, head, call: of which; None for the mean over all.
+    """
+
+    role: str
+    block: int | None = None
+    iteration: int | None = None
+    head: int | None = None
+    call: int | None = None
+    share: float
+    n_episodes: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, without the axes that it is a mean over."""
+        axes = get_args(Axis)
+        return {name: value for name, value in asdict(self).items() if value is not None or name not in axes}
+
+
+def stored_attention(run: RunReader) -> dict[str, AttentionShares]:
+    """By category, the one of most episodes, and of these of most roles; empty if there is none.
+
+    Raises RunDamagedError.
+    """
+    return {category: category_shares for category, (_, category_shares) in preferred_attention(run).items()}
+
+
+def preferred_attention(run: RunReader) -> dict[str, tuple[StoredResult, AttentionShares]]:
+    """`stored_attention`, and of which stored intervention each is."""
+    found: dict[str, tuple[StoredResult, AttentionShares]] = {}
+    read: dict[str, AttentionShares] = {}
+    for result in stored_results(run, ATTENTION):
+        key, before = result.stored.key, found.get(result.category)
+        if key not in read:
+            read[key] = AttentionShares.from_bytes(result.stored.bundle.read(ATTENTION_FILE))
+        category_shares = read[key].only(read[key].categories == result.category)
+        if before is None or (before[0].rank, len(before[1].roles)) <= (result.rank, len(category_shares.roles)):
+            found[result.category] = result, category_shares
+    return found
+
+
+def _per_episode(values: Shares, episodes: NDArray[np.int64]) -> Shares:
+    """(E, …) means over the inferences of every episode, of those that are not NaN."""
+    sums, counts = (np.zeros((episodes.max() + 1, *values.shape[1:])) for _ in range(2))
+    known = ~np.isnan(values)
+    np.add.at(sums, episodes, np.where(known, values, 0.0))
+    np.add.at(counts, episodes, known)
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+
+
+def _mean(values: Shares, axes: tuple[int, ...]) -> Shares:
+    """Mean over some axes of what is not NaN; NaN where nothing is."""
+    known = ~np.isnan(values)
+    counts = known.sum(axis=axes)
+    sums = np.where(known, values, 0.0).sum(axis=axes)
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+
+
+_LEGEND = (
+    "Descriptive, in no verdict: attended tokens need not be used. Percent of the acting stream's attention, "
+    "means over heads, iterations and inferences: all: on the backbone's tokens, action: on its own; image.left, "
+    "image.right: on patches that see a tile; correct − other: on the correct picture's tile less the other's, by "
+    "groups of items. By iteration and head: --format csv"
+)
+
+
+def _share_column(role: str) -> Any:
+    return lambda row: f"{100 * row[0][role]:.1f}" if role in row[0] else "–"
+
+
+def _difference(apart: tuple[float, tuple[float, float]] | None) -> str:
+    if apart is None:
+        return "–"
+    value, (low, high) = apart
+    return f"{100 * value:+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
+
+
+KIND = AttentionReadout

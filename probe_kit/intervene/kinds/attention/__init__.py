@@ -1,1 +1,0 @@
-"""Attention of the acting stream; descriptive, changes nothing."""

@@ -1,0 +1,291 @@
+"""Attribution patching: gradients order cells, exact patches check the order and anchor it. Enters no verdict."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.kinds.base import (
+    Intervention,
+    Measurement,
+    TableContext,
+    by_category,
+    category_sentences,
+    effect_table,
+    flips_seed,
+    interval_text,
+    lines_of,
+    text_of,
+)
+from probe_kit.intervene.kinds.image_swap import share_of_swap, swap_sign
+from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles, patch_of
+from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
+from probe_kit.intervene.patching.attribution import (
+    AGREEMENT,
+    AttributionEffect,
+    Ends,
+    complete_cuts,
+    describe_screen,
+    describe_void,
+    estimate_patches,
+    kind_of_place,
+    order_cells,
+)
+from probe_kit.intervene.patching.patch import Cell, sites_of_cells
+from probe_kit.intervene.patching.sets import pooled_share
+from probe_kit.intervene.patching.sweep import share_fields
+from probe_kit.intervene.places import ALL, resolve_all
+from probe_kit.intervene.replay import (
+    CleanRun,
+    Condition,
+    ConditionContext,
+    ConditionResult,
+    ReplayBatch,
+    SourceRun,
+)
+from probe_kit.intervene.settings import FIRST_CHUNK
+from probe_kit.runs.run import Run
+from probe_kit.statistics.sign_flips import max_t
+
+if TYPE_CHECKING:
+    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit.intervene.sessions.session import ReplaySession
+
+NAME = "attribution"
+SITES = (f"{KV_STREAM}.*", "backbone.*")
+EXACT, ESTIMATE = "exact", "estimate"
+"""How the names of conditions begin: `exact|kv.02|image`."""
+TOP = 20
+"""Cells of each kind and category with the largest estimates, that are patched exactly; as many are drawn."""
+_LEGEND = (
+    "estimate: share of the image swap by gradients; exact: with these tokens patched; anchor: a complete cut, "
+    f"patched exactly; a screen that misses an anchor by more than a factor of {AGREEMENT:.0f} is void and shows "
+    "no order; drawn: chosen at random from the rest; p: of the exact patch, max-T over those of the "
+    "category; a screen enters no verdict"
+)
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """No inference: the clean action, and by how much an estimate says that patching a cell moves it.
+
+    by_row: displacement by the row of the run's episodes. is_drawn: whether the cell was drawn for an exact patch.
+    """
+
+    name: str
+    by_row: Mapping[int, float] = field(repr=False)
+    is_drawn: bool = False
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Return the clean action with the estimate; nothing is played."""
+        return ConditionResult(context.clean, estimated=self.by_row[context.pair.row])
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttributionPatching(Intervention):
+    """An estimate for every cell, from one backward pass per episode, and exact patches of some of them.
+
+    sites, roles: of the cells. ends: where gradients are taken, see `Ends`. top: cells of each kind with the
+    largest estimates that are patched exactly; controls: so many more, drawn from the rest with `seed`. The
+    anchors are patched exactly too: all of `kv`, and all tokens of each layer of the backbone with a cell.
+    """
+
+    kind: ClassVar[str] = NAME
+    summary: ClassVar[str] = "Screen by gradients: which places to patch exactly?"
+    position: ClassVar[int] = 5
+    options: ClassVar[Mapping[str, str]] = {
+        "sites": "of the screened cells; default kv.*,backbone.*",
+        "roles": "of the cells' tokens; default image,language,state",
+        "controls": "cells drawn from the rest that are patched exactly as well; default 20",
+        "seed": "of the drawn cells; default 0",
+    }
+
+    sites: tuple[str, ...] = SITES
+    roles: tuple[str, ...] = ("image", "language", "state")
+    ends: Ends = "clean"
+    top: int = TOP
+    controls: int = TOP
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_sites_and_roles(self.sites, self.roles, "attribution needs")
+        if self.ends not in get_args(Ends) or self.top < 1:
+            raise UsageError(
+                f"ends is {self.ends!r} and top {self.top}; expected {' or '.join(get_args(Ends))}, and 1 or more"
+            )
+        if self.readout != FIRST_CHUNK:
+            raise UsageError("gradients are of the first inference; leave --readout out")
+
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """Return it without `kv` where the family has none and no sites are named."""
+        from probe_kit.hooks.registry import get_family
+
+        family = get_family(run.model)
+        if "sites" not in options and family is not None and not family.interventions.prompt_kv:
+            options["sites"] = SITES[1:]
+        return super().from_options(run, **options)
+
+    @property
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
+        """Return those of an interchange, and gradients."""
+        return (*super().required_capabilities, "gradients")
+
+    @property
+    def fits_first(self) -> bool:
+        """Whether the estimates come first: always."""
+        return True
+
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Return clean, images swapped, exact patches of anchors and chosen cells, and the estimates of all."""
+        places = list(resolve_all(self.sites, session.policy).values())
+        cells = cells_at(session, places, self.roles)
+        anchors = complete_cuts(session.policy, places)
+        every = [*anchors, *cells]
+        rows, shares = self._estimates(session, every)
+        top, drawn = self._chosen(cells, [values[len(anchors) :] for values in shares])
+        patched = {*anchors, *top, *drawn}
+        sites = sites_of_cells(every)
+        exact = [patch_of(cell, sites, f"{EXACT}|") for cell in every if cell in patched]
+        estimated = [
+            Estimated(
+                f"{ESTIMATE}|{cell.place.name}|{cell.role}",
+                {row: float(by_cell[at]) for row, by_cell in rows.items()},
+                cell in drawn,
+            )
+            for at, cell in enumerate(every)
+        ]
+        return [CleanRun(), SourceRun(), *exact, *estimated]
+
+    def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
+        """Return the cells that were drawn."""
+        del batch
+        drawn = [one.name for one in conditions if isinstance(one, Estimated) and one.is_drawn]
+        return {NAME: {"drawn": [f"{EXACT}{name.removeprefix(ESTIMATE)}" for name in drawn]}}
+
+    def _estimates(
+        self, session: "ReplaySession", cells: Sequence[Cell]
+    ) -> tuple[dict[int, NDArray[np.float64]], list[NDArray[np.float64]]]:
+        """Return (C,) estimates by row of the run's episodes, and by category (C,) shares of the image swap."""
+        rows: dict[int, NDArray[np.float64]] = {}
+        wholes: dict[str, list[tuple[float, int]]] = {}
+        items = self.items_in(session.run)
+        for number, item in enumerate(items):
+            for pair in session.pairs(item):
+                estimates = estimate_patches(
+                    session.policy, pair, cells, session.slope(pair), self.ends, session.act
+                )
+                clean, moved = (session.displacement(chunk, pair) for chunk in estimates[:2])
+                rows[pair.row] = estimates.by_cell
+                wholes.setdefault(pair.category, []).append((moved - clean, pair.row))
+            if session.on_fit_progress is not None:
+                session.on_fit_progress(number + 1, len(items), item)
+        shares = []
+        for part in wholes.values():
+            whole = np.array([moved for moved, _ in part])
+            by_cell = np.array([rows[row] for _, row in part])
+            shares.append(np.array([pooled_share(moved, whole) for moved in by_cell.T]))
+        return rows, shares
+
+    def _chosen(self, cells: Sequence[Cell], shares: Sequence[NDArray[np.float64]]) -> tuple[set[Cell], set[Cell]]:
+        """Return those with the largest estimates of any category, by kind, and those drawn from the rest."""
+        top: set[Cell] = set()
+        drawn: set[Cell] = set()
+        kinds = [kind_of_place(cell.place.name) for cell in cells]
+        for kind in dict.fromkeys(kinds):
+            members = [at for at, other in enumerate(kinds) if other == kind]
+            best = {at for values in shares for at in sorted(members, key=lambda at: -abs(values[at]))[: self.top]}
+            others = [at for at in members if at not in best]
+            draw = np.random.default_rng(derive_seed("attribution", self.seed, kind))
+            top |= {cells[at] for at in best}
+            drawn |= {cells[at] for at in draw.permutation(others)[: self.controls].tolist()}
+        return top, drawn
+
+    @staticmethod
+    def effects(measurement: Measurement) -> list[AttributionEffect]:
+        """Return by category the anchors, then the cells of each kind: by rank, or in their order."""
+        drawn = frozenset(measurement.certificate.get(NAME, {}).get("drawn", []))
+        return [
+            row
+            for category, part in measurement.outcomes.by_category()
+            for row in order_cells(_rows(part, category, measurement, drawn))
+        ]
+
+    @staticmethod
+    def table(rows: Sequence[AttributionEffect], context: TableContext) -> "ResponsiveTable":
+        """Return one line per category and cell."""
+        void = [
+            f"{name}: {describe_void(part)}"
+            for name, part in by_category(rows).items()
+            if part[0].finding == "void"
+        ]
+        return effect_table(
+            "; ".join([f"Which places to patch? {context.subject}, gradients", *void]),
+            _LEGEND,
+            "category · cell",
+            lines_of(rows, lambda row: row.name),
+            {"Share of the image swap": _COLUMNS},
+            lambda row: row.is_anchor,
+        )
+
+    @staticmethod
+    def sentences(rows: Sequence[AttributionEffect], context: TableContext) -> list[str]:
+        """Return one per category: whether the screen holds, and what it puts first."""
+        del context
+        return category_sentences(by_category(rows), describe_screen)
+
+
+KIND = AttributionPatching
+_COLUMNS: Mapping[str, Any] = {
+    "rank": lambda row: "–" if row.rank is None else str(row.rank),
+    "estimate [95 %]": lambda row: interval_text(row.estimate, row.estimate_ci),
+    "exact [95 %]": lambda row: interval_text(row.exact, row.exact_ci),
+    "p": lambda row: text_of(row.p_fwe, ".2g"),
+    "chosen": lambda row: (
+        "anchor" if row.is_anchor else "drawn" if row.is_drawn else "top" if row.p_fwe is not None else ""
+    ),
+}
+
+
+def _rows(
+    outcomes: ConditionOutcomes, category: str, measurement: Measurement, drawn: frozenset[str]
+) -> list[AttributionEffect]:
+    """Return the rows of one category, without rank and finding."""
+    names = [name.partition("|")[2] for name in outcomes.conditions if name.startswith(f"{ESTIMATE}|")]
+    exact = [name for name in outcomes.conditions if name.startswith(f"{EXACT}|")]
+    clean = outcomes.of(CLEAN)
+    leads = -swap_sign(outcomes) * outcomes.correct_sign
+    toward = np.array([leads * (outcomes.of(name) - clean) for name in exact])
+    seed = flips_seed(outcomes, measurement.seed_text)
+    p_fwe = dict(zip(exact, max_t(toward, outcomes.items, outcomes.groups, seed)[2], strict=True))
+    rows = []
+    for name in names:
+        place, _, role = name.partition("|")
+        shares: dict[str, Any] = {}
+        for part in (ESTIMATE, EXACT):
+            condition = f"{part}|{name}"
+            moved = outcomes.of(condition) - clean if condition in outcomes.conditions else None
+            share = None if moved is None else share_of_swap(outcomes, moved, measurement.seed_text)
+            shares |= share_fields(part, share)
+        rows.append(
+            AttributionEffect(
+                category=category,
+                place=place,
+                role=role,
+                is_anchor=role == ALL,
+                is_drawn=f"{EXACT}|{name}" in drawn,
+                n_episodes=outcomes.items.size,
+                n_groups=np.unique(outcomes.groups).size,
+                **shares,
+                p_fwe=float(p_fwe[f"{EXACT}|{name}"]) if f"{EXACT}|{name}" in p_fwe else None,
+                key=measurement.key,
+            )
+        )
+    return rows

@@ -1,0 +1,370 @@
+"""Closed loop: the episode is played again, with the edit at every inference.
+
+The first inference's action is a forecast. Here the cube lands somewhere, and is compared with the run's own
+outcomes: the same scene, the same seeds, and an identity patch that must give every one of them again.
+
+Two things are kept apart: which picture the cube was brought to, and whether it was brought to any. An edit that
+disrupts the task lowers a success rate as well as one that turns the choice, so that it enters no verdict.
+"""
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
+
+import numpy as np
+
+from probe_kit.env.scoring.rules import DEFAULT_RULE
+from probe_kit.errors import UsageError
+from probe_kit.hooks.capturing.edit_engine import EditLog, apply_patch
+from probe_kit.hooks.capturing.token_edits import Identity
+from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.kinds.base import (
+    ConditionName,
+    EffectRow,
+    Intervention,
+    Measurement,
+    TableContext,
+    capabilities_for,
+    category_sentences,
+    common_columns,
+    count_edits,
+    edits_by_category,
+    effect_table,
+    interval_text,
+    lines_of,
+    mean_of,
+    test_against_controls,
+    text_of,
+)
+from probe_kit.intervene.kinds.image_swap import SMALLEST_EFFECT_OF_INTEREST, net_interval
+from probe_kit.intervene.kinds.interchange import NONE, patch_of, patches_within
+from probe_kit.intervene.kinds.site_maps import best_patch_targets
+from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
+from probe_kit.intervene.patching.patch import Cell, sites_of_cells
+from probe_kit.intervene.places import ALL, SEPARATOR, resolve_sites
+from probe_kit.intervene.replay import (
+    Condition,
+    ConditionContext,
+    ConditionResult,
+    ReplayBatch,
+    SourceRun,
+)
+from probe_kit.intervene.settings import FIRST_CHUNK, categories_in
+from probe_kit.intervene.tokens import TILES, role_tokens
+from probe_kit.runs.run import Run
+from probe_kit.statistics.mcnemar import sign_p
+from probe_kit.statistics.significance import SIGNIFICANCE
+
+if TYPE_CHECKING:
+    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit.intervene.sessions.session import ReplaySession
+
+MIN_IN_ZONE_RATIO = 0.5
+"""Share of the clean in-zone share below which the task is called disrupted."""
+CORRECT, WRONG = "correct", "wrong"
+Finding = Literal["identity patch", "control", "task disrupted", "confirmed", "not confirmed"]
+_LEGEND = (
+    "every episode played again, same scene and seeds, with the edit at every inference; in a zone: whichever "
+    "picture; net flip rate: share of episodes that end on the wrong picture, minus that with the identity patch; "
+    "p: family-wise, of what goes beyond the controls, one-sided; confirmed: p < 0.05 and "
+    f"{SMALLEST_EFFECT_OF_INTEREST} beyond the controls; task disrupted: in a zone less than "
+    f"{MIN_IN_ZONE_RATIO:g} times as often as with the identity patch, and then in no verdict"
+)
+
+
+@dataclass(frozen=True)
+class IdentityPatch:
+    """The inference as the run made it, with every site that any condition changes written back as it was."""
+
+    sites: tuple[Site, ...]
+    name: str = CLEAN
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Infer while hooks fire and nothing moves."""
+        session, pair = context.session, context.pair
+        with ExitStack() as stack:
+            edit_logs = []
+            for stream in dict.fromkeys(site.stream for site in self.sites):
+                sites = [site for site in self.sites if site.stream == stream]
+                tokens = role_tokens(session.policy, pair, stream, ALL, context.memo)
+                edit_logs.append(stack.enter_context(apply_patch(session.policy, sites, tokens, Identity())))
+            chunk = session.act(pair.clean, pair.seed)
+        return ConditionResult(chunk, EditLog.sum(edit_logs))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedLoop(Intervention):
+    """Interchange at a few targets in closed loop: identity patch, image swap, every target and its controls.
+
+    targets: `PLACE|ROLE`, such as `backbone.02|image`; see `best_patch_targets`. direction: as of `Interchange`;
+    a target is also patched within it, and within `controls` random ones of the data's own covariance, where a
+    place is one site and the role no tile; `none` for neither. Every target is also patched in full.
+    """
+
+    kind: ClassVar[str] = "closed-loop"
+    summary: ClassVar[str] = "Interchange at every inference; whole episodes are played."
+    position: ClassVar[int] = 7
+    options: ClassVar[Mapping[str, str]] = {
+        "sites": "default the last place, of each category, that the newest interchange localised",
+        "roles": "with --sites; default all",
+        "direction": "patch within it as well: as of interchange, or none; default mean-difference:1",
+        "controls": "random directions; default 1",
+        "seed": "of controls and folds; default 0",
+    }
+
+    targets: tuple[str, ...]
+    direction: str = "mean-difference:1"
+    controls: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        from probe_kit.intervene.directions import check_direction
+
+        super().__post_init__()
+        if self.readout != FIRST_CHUNK:
+            raise UsageError("a closed loop is read where the cube ends; leave --readout out")
+        if not self.targets or any(target.count(SEPARATOR) != 1 for target in self.targets):
+            raise UsageError(f"targets are {self.targets}; expected PLACE|ROLE, such as backbone.02|image")
+        if self.direction != NONE:
+            check_direction(self.direction)
+        elif self.controls:
+            raise UsageError("controls are directions beside another one; choose --direction, or --controls 0")
+
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """Return it at the named sites and roles, else at `best_patch_targets`.
+
+        Raises UsageError for roles without sites.
+        """
+        sites, roles = options.pop("sites", None), options.pop("roles", None)
+        if roles and not sites:
+            raise UsageError("--roles of a closed loop go with --sites; leave both out for the best stored place")
+        if options.get("direction") == NONE:
+            options.setdefault("controls", 0)
+        if sites:
+            targets = tuple(str(ConditionName(site, role)) for site in sites for role in roles or (ALL,))
+        else:
+            targets = best_patch_targets(run, categories_in(run, options.get("categories")))
+        return cls(**options, targets=targets)
+
+    @property
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
+        """Return edits; and `kv`, where one of its places is."""
+        sites, roles = zip(*map(self._split, self.targets), strict=True)
+        return capabilities_for(sites, roles)
+
+    @property
+    def fits_first(self) -> bool:
+        """Whether its direction is of tokens."""
+        return ":" in self.direction
+
+    def parameters(self) -> dict[str, Any]:
+        """Return where and along what; it is read where the cube ends."""
+        return {**super().parameters(), "readout": "episode"}
+
+    def check_run(self, run: Run) -> None:
+        """Raise UsageError for outcomes by another rule than they were recorded by."""
+        super().check_run(run)
+        if run.rule != DEFAULT_RULE:
+            raise UsageError(
+                f"{run.location} is read by the rule {run.rule!r}; a closed loop repeats outcomes as they were "
+                f"recorded: open the run without another rule ({DEFAULT_RULE})"
+            )
+
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Return the identity patch, the image swap and every target. Raises UnknownSiteError, NoProbesError."""
+        from probe_kit.intervene.directions import fit_token_directions
+
+        targets = [self._split(target) for target in self.targets]
+        cells = [Cell(place, role) for name, role in targets for place in resolve_sites(name, session.policy)]
+        source_sites = sites_of_cells(cells)
+        within = [cell for cell in cells if len(cell.place.sites) == 1 and cell.role not in TILES]
+        patterns = [pattern for pattern, _ in targets]
+        bases = {} if self.direction == NONE else fit_token_directions(session, self, within, patterns)
+        conditions: list[Condition] = [IdentityPatch(source_sites), SourceRun()]
+        for cell in cells:
+            conditions.append(patch_of(cell, source_sites))
+            if cell in bases:
+                conditions += patches_within(self.direction, bases[cell], cell, source_sites)
+        return conditions
+
+    def play(self, session: "ReplaySession", item: str, conditions: Sequence[Condition]) -> ReplayBatch:
+        """Play the item's episodes, each under every condition, from its first step to its last."""
+        from probe_kit.intervene.rollout import play_episodes
+
+        return play_episodes(session, session.pairs(item), conditions)
+
+    @staticmethod
+    def _split(target: str) -> tuple[str, str]:
+        name = ConditionName.parse(target)
+        return name.place, name.role
+
+    @staticmethod
+    def effects(measurement: Measurement) -> "list[ClosedLoopEffect]":
+        """Return one row per category and condition, the identity patch first."""
+        return closed_loop_effects(measurement.outcomes, measurement.seed_text, measurement.key)
+
+    @staticmethod
+    def table(rows: "Sequence[ClosedLoopEffect]", context: TableContext) -> "ResponsiveTable":
+        """Return one line per category and condition, the identity patch first."""
+        return effect_table(
+            f"Is it so in closed loop? {context.subject}",
+            _LEGEND,
+            "category · edit",
+            lines_of(rows, lambda row: "identity patch" if row.place == CLEAN else row.name),
+            {"Where the cube ends": _ENDS, "Compared with the identity patch": _COMPARED},
+            lambda row: row.finding == "confirmed",
+        )
+
+    @staticmethod
+    def sentences(rows: "Sequence[ClosedLoopEffect]", context: TableContext) -> list[str]:
+        """Return one per category: at which places the cube turns to the other picture."""
+        del context
+        return category_sentences(edits_by_category(rows), _finding)
+
+    @staticmethod
+    def notes(rows: "Sequence[ClosedLoopEffect]", measurement: Measurement) -> list[str]:
+        """Return edits that disrupt the task."""
+        del measurement
+        return [
+            f"{row.category}, {row.name}: the cube is in a zone in {100 * row.in_zone:.0f} % of episodes; the "
+            "task is disrupted, and this enters no verdict."
+            for row in rows
+            if row.disrupted
+        ]
+
+
+KIND = ClosedLoop
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClosedLoopEffect(EffectRow):
+    """The effect of one edit on whole episodes, in one category; see `EffectRow`.
+
+    correct, wrong, in_zone: shares of episodes. wrong_in_zone: share of wrong ones among those in a zone; None if
+    there is none. net: share of episodes that end wrong minus that without the edit; net_left, net_right: by the
+    side of the wrong picture. control_net: mean of its controls that do not disrupt the task. gained, lost:
+    episodes that end wrong only with the edit, and only without; p_mcnemar: exact and two-sided, episodes of an
+    item taken as independent, so that it is no verdict. t, p, p_fwe: of net beyond the controls', one-sided, by
+    sign flips of whole groups; p_fwe against the largest t of the category; None for what enters no verdict.
+    disrupted: whether the cube is in a zone less than half as often. max_action_change: of any number of any
+    trajectory.
+    """
+
+    correct: float
+    wrong: float
+    in_zone: float
+    wrong_in_zone: float | None
+    net_left: float | None
+    net_right: float | None
+    control_net: float | None
+    gained: int
+    lost: int
+    p_mcnemar: float
+    t: float | None
+    p: float | None
+    p_fwe: float | None
+    disrupted: bool
+
+    @property
+    def finding(self) -> Finding:
+        """Return `confirmed` if, beyond its controls and chance, enough episodes turn to the other picture."""
+        if self.place == CLEAN:
+            return "identity patch"
+        if self.disrupted:
+            return "task disrupted"
+        if self.is_control:
+            return "control"
+        beyond = self.net - (self.control_net or 0.0)
+        turned = self.p_fwe is not None and self.p_fwe < SIGNIFICANCE and beyond >= SMALLEST_EFFECT_OF_INTEREST
+        return "confirmed" if turned else "not confirmed"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values and the finding."""
+        return {**super().to_json(), "finding": self.finding}
+
+
+def closed_loop_effects(outcomes: ConditionOutcomes, seed_text: str, key: str = "") -> list[ClosedLoopEffect]:
+    """Return one per category and condition, the identity patch first. seed_text: of the run, for intervals."""
+    return [
+        row for category, part in outcomes.by_category() for row in _of_category(part, category, seed_text, key)
+    ]
+
+
+def _of_category(outcomes: ConditionOutcomes, category: str, seed_text: str, key: str) -> list[ClosedLoopEffect]:
+    assert outcomes.episode_outcomes is not None
+    names = [ConditionName.parse(condition) for condition in outcomes.conditions]
+    wrong = (outcomes.episode_outcomes == WRONG).astype(float)
+    in_zone = np.isin(outcomes.episode_outcomes, (CORRECT, WRONG)).mean(axis=1)
+    disrupted = in_zone < MIN_IN_ZONE_RATIO * in_zone[0]
+    net = wrong - wrong[0]
+    left_out = set(np.flatnonzero(disrupted).tolist())
+    clean = {at for at, name in enumerate(names) if name.place == CLEAN}
+    tests = test_against_controls(net, names, outcomes, seed_text, left_out | clean, left_out)
+    rows = []
+    for at, (name, test) in enumerate(zip(names, tests, strict=True)):
+        gained, lost = int((net[at] > 0).sum()), int((net[at] < 0).sum())
+        columns: dict[str, Any] = common_columns(outcomes, at, name)
+        rows.append(
+            ClosedLoopEffect(
+                category=category,
+                **columns,
+                correct=float((outcomes.episode_outcomes[at] == CORRECT).mean()),
+                wrong=float(wrong[at].mean()),
+                in_zone=float(in_zone[at]),
+                wrong_in_zone=float(wrong[at].mean() / in_zone[at]) if in_zone[at] else None,
+                net=float(net[at].mean()),
+                net_ci=net_interval(net[at], outcomes, seed_text),
+                net_left=mean_of(net[at][outcomes.sides == "right"]),
+                net_right=mean_of(net[at][outcomes.sides == "left"]),
+                control_net=mean_of(net[test.controls]),
+                gained=gained,
+                lost=lost,
+                p_mcnemar=sign_p(gained, lost),
+                t=test.t,
+                p=test.p,
+                p_fwe=test.p_fwe,
+                disrupted=bool(disrupted[at]),
+                key=key,
+            )
+        )
+    return rows
+
+
+def _finding(rows: Sequence[ClosedLoopEffect]) -> str:
+    edits = [row for row in rows if row.place != CLEAN]
+    confirmed = [f"{row.name} {row.net:+.2f}" for row in edits if row.finding == "confirmed"]
+    disrupted = [row.name for row in edits if row.finding == "task disrupted"]
+    turned = (
+        "edits that turn the cube to the other picture beyond their controls: "
+        f"{count_edits(confirmed, len(edits))}"
+    )
+    return turned + (f"; that disrupt the task: {count_edits(disrupted, len(edits))}" if disrupted else "")
+
+
+def _edited(row: ClosedLoopEffect, text: str) -> str:
+    return "–" if row.place == CLEAN else text
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{100 * share:.1f}"
+
+
+_ENDS: Mapping[str, Any] = {
+    "correct %": lambda row: _percent(row.correct),
+    "wrong %": lambda row: _percent(row.wrong),
+    "in a zone %": lambda row: _percent(row.in_zone),
+    "wrong of these %": lambda row: _percent(row.wrong_in_zone),
+}
+_COMPARED: Mapping[str, Any] = {
+    "net flip rate [95 %]": lambda row: _edited(row, interval_text(row.net, row.net_ci, "+.2f")),
+    "left / right": lambda row: _edited(
+        row, f"{text_of(row.net_left, '+.2f')} / {text_of(row.net_right, '+.2f')}"
+    ),
+    "controls": lambda row: _edited(row, text_of(row.control_net, "+.2f")),
+    "only with : only without": lambda row: _edited(row, f"{row.gained} : {row.lost}"),
+    "p": lambda row: _edited(row, text_of(row.p_fwe, ".2g")),
+    "finding": lambda row: row.finding,
+}

@@ -1,1 +1,0 @@
-"""Closed loop: whole episodes with an edit at every inference."""

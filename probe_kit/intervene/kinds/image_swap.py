@@ -1,0 +1,380 @@
+"""Image swap: with the two images swapped, and nothing else, does the action change sides?
+
+Two inferences per episode, same state and noise. Displacements are in units of the policy's own reach.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import hypot
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.hooks.contract.interventions import InterventionKind, Readout
+from probe_kit.intervene.kinds.base import (
+    TILES_APART,
+    Intervention,
+    Measurement,
+    TableContext,
+    effect_table,
+    interval_text,
+    text_of,
+)
+from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, ConditionOutcomes, Effect
+from probe_kit.intervene.patching.sweep import SwapShare, share_of_whole
+from probe_kit.intervene.replay import CleanRun, Condition, SourceRun
+from probe_kit.intervene.selection import preferred_by_category
+from probe_kit.intervene.settings import FIRST_CHUNK
+from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
+from probe_kit.statistics.paired_signs import paired_greater_p
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.student import unbounded_student_interval
+from probe_kit.suite.categories import category_of
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
+
+if TYPE_CHECKING:
+    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit.intervene.sessions.session import ReplaySession
+
+NAME = "image-swap"
+FEWEST_TO_EITHER_SIDE = 8
+"""Clean inferences that must go to either side before a reach is taken from them."""
+SMALLEST_REACH = 0.02
+"""Metres. Two sides that are nearer to each other are no choice between tiles."""
+REACHED = 0.25
+"""Share of the reach from which a side counts as reached."""
+SMALLEST_EFFECT_OF_INTEREST = 0.25
+"""Net follow rate below which a category is not acted on; of the closed loop and the erasure too."""
+SMALLEST_SHARE_OF_INTEREST = 0.10
+"""Of the reach. A displacement below it is a trace."""
+FOLLOWS, REVERSES = 1, -1
+_LEGEND = (
+    "moved: displacement toward the correct picture in units of the policy's own reach, "
+    f"{SMALLEST_SHARE_OF_INTEREST} of which count; follow: goes to the correct picture, and to the other side "
+    "once the two are swapped; reversal: the reverse; "
+    f"net: follow − reversal, {SMALLEST_EFFECT_OF_INTEREST} of which count; p: exact, by item and by group, the "
+    "larger one"
+)
+_REACH = {
+    "actions": "reach: {:.1f} cm between the actions that go left and those that go right",
+    "tiles": "reach: {:.1f} cm, the distance between the tiles, since too few actions go to one of the sides",
+}
+
+
+@dataclass(frozen=True)
+class Reach:
+    """The lateral distance between a policy's own two choices.
+
+    metres: more than zero. source: `actions`, the clean inferences of all categories, or `tiles`, the distance
+    between the tiles, where too few inferences go to one of the sides.
+    """
+
+    metres: float
+    source: Literal["actions", "tiles"]
+
+    @classmethod
+    def of(cls, clean: NDArray[np.float64], tiles_apart: float = TILES_APART) -> "Reach":
+        """Return that of (E,) clean displacements, metres, left positive, over all categories of an intervention.
+
+        Medians: a few categories in which the policy moves weakly do not shorten it.
+        """
+        left, right = clean[clean > 0], clean[clean < 0]
+        if min(left.size, right.size) >= FEWEST_TO_EITHER_SIDE:
+            metres = float(np.median(left) - np.median(right))
+            if metres >= SMALLEST_REACH:
+                return cls(metres, "actions")
+        return cls(tiles_apart, "tiles")
+
+
+def tiles_apart(run: RunReader) -> float:
+    """Return metres between the middles of the tiles of a run's scene, or of the default one."""
+    scene: Any = getattr(run, "settings", {}).get("scene", {})
+    if "tile_left" not in scene or "tile_right" not in scene:
+        return TILES_APART
+    (left_x, left_y), (right_x, right_y) = scene["tile_left"], scene["tile_right"]
+    return hypot(left_x - right_x, left_y - right_y)
+
+
+# -- effects -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageSwapEffect(Effect):
+    """The effect of a swap on the actions, in one category.
+
+    follow_rate: share of episodes in which the action goes to the correct picture, and to the other side once the
+    two are swapped; reversal_rate: in which it does the reverse. net_follow_rate: their
+    difference, with its 95 % interval by groups. follow_p, reversal_p: exact, one-sided: an item's action moves
+    toward (away from) the correct picture more often than by chance; the larger of by items and by groups.
+    median_displacement: metres between the two actions. reach, reach_source: see `Reach`. reach_share: mean
+    displacement toward the correct picture in units of the reach, 1 for a whole change of sides, with Student's
+    95 % interval by groups. moved_share: the same whichever way the action moves. left_reached, right_reached: of
+    the episodes with the correct picture on that side, the share that reaches it (beyond a quarter of the reach
+    from the middle), minus that share with swapped images. readout: `first-chunk` or `per-step`, of all
+    displacements. key: of the stored intervention.
+    """
+
+    n_episodes: int
+    n_items: int
+    n_groups: int
+    follow_rate: float
+    reversal_rate: float
+    net_follow_rate: float
+    net_follow_rate_ci: tuple[float, float]
+    follow_p: float
+    reversal_p: float
+    median_displacement: float
+    reach: float
+    reach_source: str
+    reach_share: float
+    reach_share_ci: tuple[float, float]
+    moved_share: float
+    left_reached: float
+    right_reached: float
+    readout: str = FIRST_CHUNK
+    key: str = ""
+
+
+def image_swap_effects(
+    outcomes: ConditionOutcomes,
+    seed_text: str,
+    key: str = "",
+    readout: str = FIRST_CHUNK,
+    tiles_apart: float = TILES_APART,
+) -> list[ImageSwapEffect]:
+    """Return one per category, in the order of the episodes.
+
+    seed_text: of the run, by which intervals are drawn. readout: of the intervention. tiles_apart: metres, for
+    policies without a reach of their own.
+    """
+    reach = Reach.of(outcomes.of(CLEAN), tiles_apart)
+    return [
+        ImageSwapEffect(**swap_columns(part, category, IMAGE_SWAP, seed_text, reach), readout=readout, key=key)
+        for category, part in outcomes.by_category()
+    ]
+
+
+def swap_columns(
+    outcomes: ConditionOutcomes, category: str, swapped: str, seed_text: str, reach: Reach
+) -> dict[str, Any]:
+    """Return the columns of `ImageSwapEffect` of one category. swapped: compared with the clean condition."""
+    clean, other = (outcomes.correct_sign * outcomes.of(name) for name in (CLEAN, swapped))
+    responses = swap_responses(outcomes, swapped)
+    net = responses.astype(float)
+    displacement = clean - other
+    shares = displacement / reach.metres
+    follow_p, reversal_p = swap_p_values(outcomes, swapped)
+    return {
+        "category": category,
+        "n_episodes": net.size,
+        "n_items": np.unique(outcomes.items).size,
+        "n_groups": np.unique(outcomes.groups).size,
+        "follow_rate": float((responses == FOLLOWS).mean()),
+        "reversal_rate": float((responses == REVERSES).mean()),
+        "net_follow_rate": float(net.mean()),
+        "net_follow_rate_ci": net_interval(net, outcomes, seed_text),
+        "follow_p": follow_p,
+        "reversal_p": reversal_p,
+        "median_displacement": float(np.median(np.abs(displacement))),
+        "reach": reach.metres,
+        "reach_source": reach.source,
+        "reach_share": float(shares.mean()),
+        "reach_share_ci": unbounded_student_interval(shares, outcomes.groups),
+        "moved_share": float(np.abs(shares).mean()),
+        **{f"{side}_reached": _reached(outcomes.sides == side, clean, other, reach) for side in ("left", "right")},
+    }
+
+
+def swap_responses(outcomes: ConditionOutcomes, swapped: str = IMAGE_SWAP) -> NDArray[np.int8]:
+    """Return (E,) `FOLLOWS` for actions to the correct picture in both layouts, `REVERSES` or 0."""
+    clean, other = (np.sign(outcomes.correct_sign * outcomes.of(name)) for name in (CLEAN, swapped))
+    return np.asarray(np.where(clean * other < 0, clean, 0), np.int8)
+
+
+def swap_responses_by_episode(run: RunReader) -> dict[str, int]:
+    """Return by episode id how its action responds in the image swap that tables read; empty without a stored one.
+
+    Raises RunDamagedError.
+    """
+    stored = [result.outcomes for result in preferred_by_category(run, NAME).values()]
+    return {
+        str(name): int(response)
+        for outcomes in stored
+        for name, response in zip(outcomes.episodes, swap_responses(outcomes), strict=True)
+    }
+
+
+def swap_p_values(outcomes: ConditionOutcomes, swapped: str = IMAGE_SWAP) -> tuple[float, float]:
+    """Return p that actions move toward the correct picture, and p that they move away; of one category."""
+    displacement = outcomes.correct_sign * (outcomes.of(CLEAN) - outcomes.of(swapped))
+    toward, away = (paired_greater_p(sign * displacement, outcomes.items, outcomes.groups) for sign in (1.0, -1.0))
+    return toward, away
+
+
+def swap_sign(outcomes: ConditionOutcomes) -> float:
+    """Return 1, or −1 in a category in which swapped images lead actions away from the correct picture.
+
+    Patches that carry the effect of the swap move actions where the swap does: their p are of that direction.
+    """
+    is_reversed = IMAGE_SWAP in outcomes.conditions and swap_p_values(outcomes)[1] < SIGNIFICANCE
+    return -1.0 if is_reversed else 1.0
+
+
+def share_of_swap(outcomes: ConditionOutcomes, moved: NDArray[np.float64], seed_text: str) -> SwapShare | None:
+    """Return `moved` (E,) as a share of the swap's displacement in the same episodes of one category.
+
+    None if images were not swapped, or if that moves the action by no more than chance: a share would be a ratio
+    of noise. Groups are drawn for both sums together.
+    """
+    if IMAGE_SWAP not in outcomes.conditions or min(swap_p_values(outcomes)) >= SIGNIFICANCE:
+        return None
+    return share_of_whole(moved, outcomes.of(IMAGE_SWAP) - outcomes.of(CLEAN), outcomes.groups, seed_text)
+
+
+def _reached(
+    rows: NDArray[np.bool_], clean: NDArray[np.float64], other: NDArray[np.float64], reach: Reach
+) -> float:
+    """Return by how much more often the side of the correct picture is reached; 0 where it never lies there."""
+    if not rows.any():
+        return 0.0
+    near, far = (values[rows] > REACHED * reach.metres for values in (clean, other))
+    return float(near.mean() - far.mean())
+
+
+def net_interval(net: NDArray[np.float64], outcomes: ConditionOutcomes, seed_text: str) -> tuple[float, float]:
+    """Return the 95 % interval by groups of the mean over episodes of (E,) gains."""
+    drawn = units_seed(outcomes.groups, seed_text)
+    low, high = group_bootstrap(net[:, None], outcomes.groups, drawn, bounds=GAINS)
+    return float(low[0]), float(high[0])
+
+
+def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, ImageSwapEffect]:
+    """Return by category the effects of the image swaps that are stored for the episodes the run has now.
+
+    readout: of those alone; None for any. Of several the preferred one, see `selection`; empty if there is none.
+    Raises RunDamagedError if any stored intervention was changed.
+    """
+    preferred = preferred_by_category(run, NAME, readout)
+    apart, rows = tiles_apart(run), dict[str, dict[str, ImageSwapEffect]]()
+    for stored in {result.stored.key: result.stored for result in preferred.values()}.values():
+        read_as = str(stored.settings.get("readout", FIRST_CHUNK))
+        effects = image_swap_effects(stored.outcomes(), seed_text_of(run), stored.key, read_as, apart)
+        rows[stored.key] = {row.category: row for row in effects}
+    return {category: rows[result.stored.key][category] for category, result in preferred.items()}
+
+
+# -- the kind ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageSwap(Intervention):
+    """Two inferences per episode, same state and noise: clean, and with the two images swapped."""
+
+    kind: ClassVar[str] = NAME
+    summary: ClassVar[str] = "Swap the two images: does the action change sides?"
+    position: ClassVar[int] = 1
+    has_verdict: ClassVar[bool] = True
+
+    @property
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
+        """Return two inferences that can be compared."""
+        return ("swap",)
+
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Return clean, and with swapped images."""
+        del session
+        return CleanRun(), SourceRun()
+
+    @staticmethod
+    def effects(measurement: Measurement) -> list[ImageSwapEffect]:
+        """Return one row per category."""
+        readout, apart = measurement.readout, measurement.tiles_apart
+        return image_swap_effects(measurement.outcomes, measurement.seed_text, measurement.key, readout, apart)
+
+    @staticmethod
+    def table(rows: Sequence[ImageSwapEffect], context: TableContext) -> "ResponsiveTable":
+        """Return one line per category, with its verdict."""
+        verdicts = context.verdicts
+        reasons = [f"{name}: {verdict.explanation}" for name, verdict in verdicts.items() if verdict.explanation]
+        reaches = [_REACH[row.reach_source].format(100 * row.reach) for row in rows]
+        notes = dict.fromkeys((context.legend, *reaches, *(reasons if context.explains else ())))
+        return effect_table(
+            f"Is it used? {context.subject}, images swapped",
+            "; ".join(filter(None, (_LEGEND, *notes))),
+            "category",
+            [(row.category, row) for row in rows],
+            {
+                "Verdict": {
+                    "verdict": lambda row: verdicts[row.category].verdict if row.category in verdicts else "–"
+                },
+                "Does the action follow the images?": SWAP_COLUMNS,
+            },
+        )
+
+    @staticmethod
+    def sentences(rows: Sequence[ImageSwapEffect], context: TableContext) -> list[str]:
+        """Return one per category, with its verdict."""
+        verdicts = context.verdicts
+        return [
+            f"{begin_sentence(row)}: "
+            + (verdicts[row.category].describe(row) if row.category in verdicts else swap_rates(row, "images"))
+            for row in rows
+        ]
+
+    @staticmethod
+    def keys_in_use(run: RunReader) -> set[str]:
+        """Return keys of the image swaps that verdicts and tables read, of either readout."""
+        return {row.key for readout in get_args(Readout) for row in stored_image_swaps(run, readout).values()}
+
+
+KIND = ImageSwap
+SWAP_COLUMNS: Mapping[str, Any] = {
+    "moved [95 %]": lambda row: interval_text(row.reach_share, row.reach_share_ci, "+.2f"),
+    "follow %": lambda row: f"{100 * row.follow_rate:.1f}",
+    "reversal %": lambda row: f"{100 * row.reversal_rate:.1f}",
+    "net [95 %]": lambda row: interval_text(row.net_follow_rate, row.net_follow_rate_ci, "+.2f"),
+    "p": lambda row: text_of(row.follow_p, ".2g"),
+    "median displacement cm": lambda row: f"{100 * row.median_displacement:.2f}",
+    "n (items)": lambda row: f"{row.n_episodes} ({row.n_items})",
+}
+"""The columns that all swaps have."""
+
+
+class Swapped(Protocol):
+    """The numbers of a swap: `ImageSwapEffect`, or a part of a row that has them."""
+
+    @property
+    def follow_rate(self) -> float | None:
+        """Share of episodes."""
+
+    @property
+    def reversal_rate(self) -> float | None:
+        """Share of episodes."""
+
+    @property
+    def net_follow_rate_ci(self) -> tuple[float | None, float | None] | None:
+        """95 % interval of the difference."""
+
+    @property
+    def reach_share(self) -> float | None:
+        """Displacement in units of the reach."""
+
+
+def swap_rates(row: ImageSwapEffect, inputs: str) -> str:
+    """Return how often the action follows a swap of some inputs, as the end of a sentence."""
+    low, high = map(percent, row.net_follow_rate_ci)
+    return (
+        f"the action follows a swap of the {inputs} in {percent(row.follow_rate)} % of episodes and does the "
+        f"reverse in {percent(row.reversal_rate)} % (net {low} to {high} %)."
+    )
+
+
+def begin_sentence(row: ImageSwapEffect) -> str:
+    """Return the category and its number of items."""
+    return f"{category_of(row.category).title} ({row.n_items} item{'s' * (row.n_items != 1)})"
+
+
+def percent(value: float | None) -> str:
+    """Return a share in percent."""
+    return "–" if value is None else f"{100 * value:.0f}"

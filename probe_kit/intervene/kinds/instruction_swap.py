@@ -1,0 +1,176 @@
+"""Instruction swap: asked for the other picture before the same images, does the action change sides?
+
+Following the images shows that they are read; following the instruction shows that it is read. A policy may do one
+and not the other: it can have learnt what to look for, whatever is asked.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from probe_kit.errors import UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, effect_table
+from probe_kit.intervene.kinds.image_swap import (
+    SWAP_COLUMNS,
+    ImageSwapEffect,
+    Reach,
+    begin_sentence,
+    swap_columns,
+    swap_rates,
+)
+from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, ConditionOutcomes
+from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, SourceRun
+
+if TYPE_CHECKING:
+    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit.intervene.sessions.session import ReplaySession
+
+_CONDITIONS = {"instruction": INSTRUCTION_SWAP, "images": IMAGE_SWAP, "noise": NOISE}
+_LEGEND = (
+    "follow: goes to the correct picture, and to the other one with the counterpart's instruction and the same "
+    "images, state and noise; one step: median lateral distance between where the two actions bring the hand, and "
+    "in how many episodes any number changed; with the noise drawn anew for comparison"
+)
+
+
+@dataclass(frozen=True)
+class InputSensitivity:
+    """The changes of the first inferences of one category; one input is swapped, the others stay.
+
+    instruction, images, noise: median lateral metres between where the two actions would bring the hand.
+    instruction_changed, images_changed: share of episodes in which any number of the action changed at all; 0
+    means that the policy ignores that input.
+    """
+
+    instruction: float
+    images: float
+    noise: float
+    instruction_changed: float
+    images_changed: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class InstructionSwapEffect(ImageSwapEffect):
+    """As `ImageSwapEffect`, of the swapped instruction. sensitivity: of one step to each input."""
+
+    sensitivity: InputSensitivity
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values, the sensitivity's among them."""
+        plain = super().to_json()
+        return {**{name: value for name, value in plain.items() if name != "sensitivity"}, **plain["sensitivity"]}
+
+
+def input_sensitivity(outcomes: ConditionOutcomes) -> InputSensitivity:
+    """Return that of the episodes of one category."""
+    clean = outcomes.of(CLEAN)
+    apart = {name: float(np.median(np.abs(outcomes.of(other) - clean))) for name, other in _CONDITIONS.items()}
+    changed = {
+        f"{name}_changed": float(
+            (outcomes.max_action_change[outcomes.conditions.index(_CONDITIONS[name])] > 0).mean()
+        )
+        for name in ("instruction", "images")
+    }
+    return InputSensitivity(**apart, **changed)
+
+
+@dataclass(frozen=True)
+class InstructionSwapped:
+    """The same state, noise and pictures, asked for the other one of the two."""
+
+    name: str = INSTRUCTION_SWAP
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Infer with another instruction."""
+        observation = context.session.with_other_instruction(context.pair)
+        assert observation is not None, "items without a counterpart are skipped"
+        return ConditionResult(context.session.act(observation, context.pair.seed))
+
+
+@dataclass(frozen=True)
+class NoiseResampled:
+    """The same question with its noise drawn anew; the same action again where a policy draws none."""
+
+    name: str = NOISE
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Infer with another seed."""
+        return ConditionResult(context.session.act(context.pair.clean, derive_seed(context.pair.seed, NOISE, 0)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class InstructionSwap(Intervention):
+    """Four inferences per episode: clean, other instruction, swapped images, other noise.
+
+    A counterpart shows the same two pictures and asks for the other one; items without one are skipped and
+    counted. The last two are for comparison: the sensitivity of one step's action to images and to noise.
+    """
+
+    kind: ClassVar[str] = "instruction-swap"
+    summary: ClassVar[str] = "Ask for the other picture: does the action change sides?"
+    position: ClassVar[int] = 2
+
+    @property
+    def required_capabilities(self) -> tuple[InterventionKind, ...]:
+        """Return two inferences that can be compared."""
+        return ("swap",)
+
+    def eligible_items(self, session: "ReplaySession", items: Sequence[str]) -> list[str]:
+        """Return those of `items` with a counterpart in the run's wording. Raises UsageError if there is none."""
+        eligible = [item for item in items if session.has_other_instruction(item)]
+        if not eligible:
+            raise UsageError(
+                f"none of the {len(items)} items has a counterpart in its suite: the same two pictures, asked for "
+                "the other one. Suites of `probe-kit suite build` have them; else swap images (--kind image-swap)"
+            )
+        return eligible
+
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Return clean; asked for the other picture; the images swapped; the noise drawn anew."""
+        del session
+        return CleanRun(), InstructionSwapped(), SourceRun(), NoiseResampled()
+
+    @staticmethod
+    def effects(measurement: Measurement) -> list[InstructionSwapEffect]:
+        """Return one per category, in the order of the episodes."""
+        reach = Reach.of(measurement.outcomes.of(CLEAN), measurement.tiles_apart)
+        return [
+            InstructionSwapEffect(
+                **swap_columns(part, category, INSTRUCTION_SWAP, measurement.seed_text, reach),
+                readout=measurement.readout,
+                key=measurement.key,
+                sensitivity=input_sensitivity(part),
+            )
+            for category, part in measurement.outcomes.by_category()
+        ]
+
+    @staticmethod
+    def table(rows: Sequence[InstructionSwapEffect], context: TableContext) -> "ResponsiveTable":
+        """Return one line per category."""
+        return effect_table(
+            f"Is the instruction read? {context.subject}",
+            _LEGEND,
+            "category",
+            [(row.category, row) for row in rows],
+            {"Does the action follow the instruction?": SWAP_COLUMNS, "What one step owes to": _STEP_COLUMNS},
+        )
+
+    @staticmethod
+    def sentences(rows: Sequence[InstructionSwapEffect], context: TableContext) -> list[str]:
+        """Return one per category; a swap of the instruction enters no verdict."""
+        del context
+        return [f"{begin_sentence(row)}: {swap_rates(row, 'instruction')}" for row in rows]
+
+
+KIND = InstructionSwap
+_STEP_COLUMNS: Mapping[str, Any] = {
+    "instruction cm": lambda row: f"{100 * row.sensitivity.instruction:.2f}",
+    "images cm": lambda row: f"{100 * row.sensitivity.images:.2f}",
+    "noise cm": lambda row: f"{100 * row.sensitivity.noise:.2f}",
+    "instruction changes it %": lambda row: f"{100 * row.sensitivity.instruction_changed:.1f}",
+    "images change it %": lambda row: f"{100 * row.sensitivity.images_changed:.1f}",
+}

@@ -1,1 +1,0 @@
-"""Instruction swap: other words, or other noise, before the same scene."""

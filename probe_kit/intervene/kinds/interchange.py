@@ -1,0 +1,210 @@
+"""Interchange intervention (activation patching): tokens are patched from the same inference with swapped images.
+
+What is patched in is what this policy computes there in this state, so it is on the policy's own distribution, has
+no strength to choose, and can do no more than the image swap: with all that differs patched, the effect is 1.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.kinds.base import (
+    ConditionName,
+    Intervention,
+    Measurement,
+    TableContext,
+    category_sentences,
+    count_edits,
+    edits_by_category,
+    effect_table,
+    interval_text,
+    lines_of,
+    text_of,
+)
+from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
+from probe_kit.intervene.kinds.site_maps import PatchEffect, keys_in_use, patch_effects
+from probe_kit.intervene.outcomes import IMAGE_SWAP
+from probe_kit.intervene.patching.patch import Cell, sites_of_cells
+from probe_kit.intervene.places import ALL, SiteGroup, resolve_all, roles_of
+from probe_kit.intervene.replay import CleanRun, Condition, Patched, SourceRun
+from probe_kit.intervene.tokens import TILES
+from probe_kit.runs.run import Run
+from probe_kit.train.data.run_reader import RunReader
+
+if TYPE_CHECKING:
+    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit.intervene.directions import DirectionBasis
+    from probe_kit.intervene.sessions.session import ReplaySession
+
+
+NONE = "none"
+_LEGEND = (
+    "effect: share of what the whole image swap does, n/a where that is not beyond chance; net flip rate: share "
+    "of episodes that flip to the target side, minus those that flip away from it; p: family-wise over all edits "
+    "of the category, one-sided; relative change: how far tokens were moved, in their own norms; *: carries the "
+    "effect by construction and locates nothing; unread: nothing that acts reads this place"
+)
+
+
+# -- patches of cells ----------------------------------------------------------------------------------------
+
+
+def cells_at(session: "ReplaySession", places: Iterable[SiteGroup], roles: Sequence[str]) -> list[Cell]:
+    """Return the cells of these roles at places, as far as tokens play them."""
+    return [Cell(place, role) for place in places for role in roles_of(session.policy, place.stream, roles)]
+
+
+def patch_of(cell: Cell, source_sites: tuple[Site, ...], prefix: str = "") -> Patched:
+    """Return the patch of one cell in full. prefix: of its name."""
+    return Patched(f"{prefix}{ConditionName(cell.place.name, cell.role)}", {"": (cell,)}, source_sites)
+
+
+def patches_within(
+    direction: str, bases: "DirectionBasis", cell: Cell, source_sites: tuple[Site, ...]
+) -> list[Patched]:
+    """Return the patch along a direction, and along each of its controls."""
+    names = {
+        name: str(ConditionName(cell.place.name, cell.role, name)) for name in (direction, *bases.control_names)
+    }
+    return [Patched(name, {"": (cell,)}, source_sites, along, bases) for along, name in names.items()]
+
+
+def check_sites_and_roles(sites: Sequence[str], roles: Sequence[str], subject: str) -> None:
+    """Raise UsageError without sites, or for roles that share tokens."""
+    if not sites or not roles or ALL in roles:
+        raise UsageError(f"{subject} at least one site, and roles that share no token (not all)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interchange(Intervention):
+    """Every place is tried at every role, alone.
+
+    sites: patterns, see `resolve_sites`. roles: of the tokens that are patched; a stream is tried at those
+    that it has. direction: `none` patches tokens in full; `mean-difference` or `probe` only along that direction
+    of each place (rank 1), found in means over tokens without the episode it is used on; `mean-difference:K` along
+    K directions found in the tokens themselves, see `directions`. controls: so many times as many random
+    directions of the data's own covariance, orthogonal to it, per place and role.
+    """
+
+    kind: ClassVar[str] = "interchange"
+    summary: ClassVar[str] = "Activation patching: where does the swapped image pass?"
+    position: ClassVar[int] = 3
+    asks_where: ClassVar[bool] = True
+    options: ClassVar[Mapping[str, str]] = {
+        "sites": "where tokens are patched; default backbone.*",
+        "roles": "of the patched tokens; default all,image,language",
+        "direction": "patch within it: mean-difference or probe (mean over tokens), mean-difference:K (tokens)",
+        "controls": "random directions; default 5 with --direction",
+        "seed": "of controls and folds; default 0",
+    }
+
+    sites: tuple[str, ...] = ("backbone.*",)
+    roles: tuple[str, ...] = (ALL, "image", "language")
+    direction: str = NONE
+    controls: int = 0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        from probe_kit.intervene.directions import check_direction
+
+        super().__post_init__()
+        if not self.sites or not self.roles:
+            raise UsageError("an interchange needs at least one site and one role")
+        if set(self.roles) & set(TILES) and self.direction != NONE:
+            raise UsageError(
+                "tiles have no mean in the run from which a direction could be found; patch them in full: leave "
+                "--direction out"
+            )
+        if self.direction != NONE:
+            check_direction(self.direction)
+        elif self.controls:
+            raise UsageError("controls are directions beside another one; choose --direction, or no --controls")
+
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """Return it with five controls where a direction is given and their number is not."""
+        options.setdefault("controls", 5 if "direction" in options else 0)
+        return super().from_options(run, **options)
+
+    @property
+    def fits_first(self) -> bool:
+        """Whether its direction is of tokens."""
+        return ":" in self.direction
+
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Return clean, images swapped, and every place at every role. Raises UnknownSiteError, NoProbesError."""
+        from probe_kit.intervene.directions import fit_token_directions
+
+        cells = cells_at(session, resolve_all(self.sites, session.policy).values(), self.roles)
+        source_sites = sites_of_cells(cells)
+        conditions: list[Condition] = [CleanRun(), SourceRun()]
+        if self.direction == NONE:
+            return conditions + [patch_of(cell, source_sites) for cell in cells]
+        bases = fit_token_directions(session, self, cells, self.sites)
+        for cell, basis in bases.items():
+            conditions += patches_within(self.direction, basis, cell, source_sites)
+        return conditions
+
+    @staticmethod
+    def effects(measurement: Measurement) -> list[PatchEffect]:
+        """Return one row per category and edit."""
+        target_side = str(measurement.settings.get("target_side", IMAGE_SWAP))
+        return patch_effects(measurement.outcomes, measurement.seed_text, target_side, measurement.key)
+
+    @staticmethod
+    def table(rows: Sequence[PatchEffect], context: TableContext) -> "ResponsiveTable":
+        """Return one line per category and edit; controls are columns of what is compared with them."""
+        unread = context.measurement.certificate.get("unread", ())
+        edits = [row for row in rows if not row.is_control]
+        return effect_table(
+            f"Where is it used? {context.subject}, {context.measurement.settings['kind']}",
+            _LEGEND,
+            "category · edit",
+            lines_of(edits, lambda row: f"{row.name}{' (unread)' * (row.place in unread)}"),
+            {"What the action does": _COLUMNS},
+            lambda row: row.is_localised and not row.is_by_construction,
+        )
+
+    @staticmethod
+    def sentences(rows: Sequence[PatchEffect], context: TableContext) -> list[str]:
+        """Return one per category: which edits carry half of the swap, or move the action at all."""
+        del context
+        return category_sentences(edits_by_category(rows), _finding)
+
+    @staticmethod
+    def keys_in_use(run: RunReader) -> set[str]:
+        """Return keys of the stored ones of which any number is in a map, a direction or a steering."""
+        return keys_in_use(run)
+
+
+KIND = Interchange
+_COLUMNS: Mapping[str, Any] = {
+    "effect": lambda row: text_of(row.effect, missing="n/a") + "*" * (row.is_localised and row.is_by_construction),
+    "net flip rate [95 %]": lambda row: interval_text(row.net, row.net_ci, "+.2f"),
+    "left / right": lambda row: f"{row.net_left:+.2f} / {row.net_right:+.2f}",
+    "displacement cm": lambda row: f"{100 * row.mean_displacement:+.2f}",
+    "controls cm": lambda row: text_of(_cm(row.control_displacement), "+.2f"),
+    "p": lambda row: text_of(row.p_fwe, ".2g"),
+    "relative change": lambda row: f"{row.relative_change:.2f}",
+}
+
+
+def _cm(metres: float | None) -> float | None:
+    return None if metres is None else 100 * metres
+
+
+def _finding(rows: Sequence[PatchEffect]) -> str:
+    edits = [row for row in rows if row.coefficient != "0"]
+    if all(row.effect is None for row in edits):
+        moved = sorted((row for row in edits if row.moves_action), key=lambda row: -row.mean_displacement)
+        names = [f"{row.name} {100 * row.mean_displacement:+.1f} cm" for row in moved]
+        return (
+            f"edits that move the action at least {100 * SMALLEST_REACH:g} cm to the target side, beyond their "
+            f"controls: {count_edits(names, len(edits))}"
+        )
+    localised = sorted((row for row in edits if row.is_localised), key=lambda row: -(row.effect or 0.0))
+    names = [f"{row.name} {row.effect:.2f}" for row in localised]
+    verb = "have" if any(row.is_dose for row in edits) else "carry"
+    return f"edits that {verb} half of the image swap's effect: {count_edits(names, len(edits))}"

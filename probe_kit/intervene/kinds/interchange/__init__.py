@@ -1,1 +1,0 @@
-"""Interchange intervention (activation patching) from the run with swapped images."""

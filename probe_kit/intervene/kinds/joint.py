@@ -1,0 +1,450 @@
+"""Joint places: which cells carry the effect together, which alone, and which are needed.
+
+Sets of cells are patched in one inference, as an interchange patches a single one.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.kinds.base import (
+    Intervention,
+    Measurement,
+    TableContext,
+    by_category,
+    category_sentences,
+    effect_table,
+    flips_seed,
+    interval_text,
+)
+from probe_kit.intervene.kinds.image_swap import share_of_swap, swap_sign
+from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles
+from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes, Effect
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.patching.patch import Cell, all_but, sites_of_cells
+from probe_kit.intervene.patching.sets import (
+    CARRIES,
+    KEEP,
+    NOTHING,
+    carries_nothing,
+    choosing_half,
+    find_minimal_set,
+    finding_of_cell,
+    pooled_share,
+)
+from probe_kit.intervene.patching.sweep import SwapShare, share_fields
+from probe_kit.intervene.places import SEPARATOR, list_places, resolve_all
+from probe_kit.intervene.replay import CleanRun, Condition, Patched, ReplayBatch, SourceRun, replay
+from probe_kit.intervene.selection import StoredResult, stored_results
+from probe_kit.intervene.settings import PER_STEP
+from probe_kit.statistics.paired_signs import paired_greater_p
+from probe_kit.statistics.sign_flips import max_t, smallest_flip_p
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
+
+if TYPE_CHECKING:
+    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit.intervene.sessions.session import ReplaySession
+
+NAME = "joint"
+SITES, ROLES = ("kv.*",), ("image", "language", "state")
+"""Searched if nothing is said: all that the acting stream reads."""
+EVERY, ALONE, WITHOUT, MINIMAL, SECOND = "every-cell", "alone", "without", "minimal", "second"
+"""Conditions: all cells; one of them, and all but it; the smallest set, and one that is found without it."""
+WITHOUT_MINIMAL = f"{WITHOUT}|{MINIMAL}"
+WORTH_SEARCHING = 0.5
+"""Effect of all cells together from which a smallest set is searched."""
+_LEGEND = (
+    "alone: share of the image swap with only these cells patched; needed: what all cells lose without them; "
+    "read here: both at least 0.5; enough alone: another copy is read as well; needed, not enough: one part of "
+    "several; nothing alone: neither, which leaves a part of a set; opposes it: both below -0.1; smallest set: "
+    "searched in one half of the groups, scored in the other; p: that the action moves toward the target side, of "
+    "cells max-T over all"
+)
+_PARTS = {EVERY: "all cells of", MINIMAL: "smallest set:", SECOND: "without it:"}
+
+
+# -- the kind ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SearchedSets:
+    """The result of the search in one category; the sets may be empty.
+
+    cells: the smallest set; second: of the other cells, the smallest set that carries the effect as well.
+    choosing: the groups that were searched. effect: of `cells`, in these. tried: how many sets.
+    """
+
+    choosing: tuple[str, ...]
+    cells: tuple[Cell, ...] = ()
+    second: tuple[Cell, ...] = ()
+    effect: float = 0.0
+    tried: int = 0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values."""
+        sets = {"cells": list(map(str, self.cells)), "second": list(map(str, self.second))}
+        return {**asdict(self), **sets, "choosing": list(self.choosing)}
+
+
+@dataclass(frozen=True)
+class MinimalPatched(Patched):
+    """The smallest set of each category. searched: how it was found."""
+
+    searched: Mapping[str, SearchedSets] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointPlaces(Intervention):
+    """Every cell alone, all cells but it, all of them, and the smallest set that carries the effect.
+
+    A cell is the tokens of a role at a place. sites: patterns of places that are read in parallel, the blocks of
+    `kv`, one layer, or the heads of one block; of several layers the first decides. roles: of the cells' tokens.
+    The smallest set is searched in one half of each category's groups, drawn with `seed`, and scored in the other.
+    """
+
+    kind: ClassVar[str] = NAME
+    summary: ClassVar[str] = "Patch sets of places: each alone, all but it, smallest set."
+    position: ClassVar[int] = 4
+    asks_where: ClassVar[bool] = True
+    options: ClassVar[Mapping[str, str]] = {
+        "sites": "of cells that run in parallel: several blocks of kv, or one layer; default kv.*",
+        "roles": "of the cells' tokens; default image,language,state",
+        "seed": "of the halves of the groups; default 0",
+    }
+
+    sites: tuple[str, ...] = SITES
+    roles: tuple[str, ...] = ROLES
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_sites_and_roles(self.sites, self.roles, "joint places need")
+
+    @property
+    def fits_first(self) -> bool:
+        """Whether the smallest set is searched beforehand: always."""
+        return True
+
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Return clean, images swapped, the sets of cells. Raises UsageError for cells that are not parallel."""
+        cells = self._cells(session)
+        sites = sites_of_cells(cells)
+        pairs: dict[str, list[Pair]] = {}
+        for item in self.items_in(session.run):
+            for pair in session.pairs(item):
+                pairs.setdefault(pair.category, []).append(pair)
+        searched = {name: self._search(session, cells, part) for name, part in pairs.items()}
+        sets: dict[str, dict[str, tuple[Cell, ...]]] = {EVERY: {"": cells}}
+        for cell in cells:
+            at = f"{cell.place.name}{SEPARATOR}{cell.role}"
+            sets |= {f"{ALONE}|{at}": {"": (cell,)}, f"{WITHOUT}|{at}": {"": all_but(cells, (cell,))}}
+        without = {name: all_but(cells, one.cells) if one.cells else () for name, one in searched.items()}
+        sets |= {WITHOUT_MINIMAL: without, SECOND: {name: one.second for name, one in searched.items()}}
+        patches = [Patched(name, by_name, sites) for name, by_name in sets.items()]
+        smallest = {name: one.cells for name, one in searched.items()}
+        minimal = MinimalPatched(MINIMAL, smallest, sites, searched=searched)
+        return [CleanRun(), SourceRun(), *patches, minimal]
+
+    def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
+        """Return by category the smallest sets, and the groups in which they were searched."""
+        del batch
+        (minimal,) = (one for one in conditions if isinstance(one, MinimalPatched))
+        return {NAME: {name: one.to_json() for name, one in (minimal.searched or {}).items()}}
+
+    def _cells(self, session: "ReplaySession") -> tuple[Cell, ...]:
+        places = resolve_all(self.sites, session.policy)
+        layers = {KV_STREAM if place.stream == KV_STREAM else place.layer for place in places.values()}
+        if len(layers) > 1:
+            raise UsageError(
+                f"{', '.join(places)} come one after the other, so that the first decides for all; name blocks of "
+                "kv, such as kv.*, or one layer, such as backbone.02 or backbone.02.heads.*"
+            )
+        cells = tuple(cells_at(session, places.values(), self.roles))
+        if len(cells) < 2:
+            raise UsageError(
+                f"joint places need two cells or more; {', '.join(map(str, cells)) or 'none'} is there"
+            )
+        return cells
+
+    def _search(self, session: "ReplaySession", cells: tuple[Cell, ...], pairs: Sequence[Pair]) -> SearchedSets:
+        """Return the smallest sets of one category, searched on the choosing half of its groups."""
+        choosing = choosing_half([pair.group for pair in pairs], self.seed)
+        chosen = [pair for pair in pairs if pair.group in choosing]
+        effects = partial(self._effects, session, chosen, sites_of_cells(cells))
+        if not chosen or effects([cells])[0] < WORTH_SEARCHING:
+            return SearchedSets(choosing)
+        first = find_minimal_set(cells, effects)
+        others = all_but(cells, first.cells)
+        if not others or effects([others])[0] < KEEP * first.effect:
+            return SearchedSets(choosing, first.cells, (), first.effect, first.tried)
+        second = find_minimal_set(others, effects)
+        return SearchedSets(choosing, first.cells, second.cells, first.effect, first.tried + second.tried)
+
+    def _effects(
+        self, session: "ReplaySession", pairs: Sequence[Pair], sites: Any, sets: Sequence[tuple[Cell, ...]]
+    ) -> list[float]:
+        """Return the share of the image swap's displacement that each set carries."""
+        from probe_kit.intervene.rollout import evaluate_per_step
+
+        patches = [Patched(str(number), {"": cells}, sites) for number, cells in enumerate(sets)]
+        play = evaluate_per_step if self.readout == PER_STEP else replay
+        clean, swapped, *moved = play(session, pairs, [CleanRun(), SourceRun(), *patches]).displacement
+        return [pooled_share(values - clean, swapped - clean) for values in moved]
+
+    @staticmethod
+    def effects(measurement: Measurement) -> "list[JointEffect]":
+        """Return by category the cells, all of them, and the smallest sets."""
+        searched: Mapping[str, Any] = measurement.certificate.get(NAME, {})
+        return [
+            row
+            for category, part in measurement.outcomes.by_category()
+            for row in _Category(
+                part, category, measurement.seed_text, measurement.settings, measurement.key
+            ).rows(searched.get(category, {}))
+        ]
+
+    @staticmethod
+    def table(rows: "Sequence[JointEffect]", context: TableContext) -> "ResponsiveTable":
+        """Return one line per category and set."""
+        return effect_table(
+            f"Where is it read, alone and jointly? {context.subject}, joint places",
+            _LEGEND,
+            "category · cells",
+            [
+                (" ".join(filter(None, (f"{row.category} ·", _PARTS.get(row.part, ""), row.cells))), row)
+                for row in rows
+            ],
+            {"Share of the image swap": _COLUMNS},
+            lambda row: row.finding.startswith("read"),
+        )
+
+    @staticmethod
+    def sentences(rows: "Sequence[JointEffect]", context: TableContext) -> list[str]:
+        """Return one per category: which cells carry the answer, alone or together."""
+        del context
+        return category_sentences(by_category(rows), _finding)
+
+    @staticmethod
+    def notes(rows: "Sequence[JointEffect]", measurement: Measurement) -> list[str]:
+        """Return categories in which the half of the groups that scores a smallest set cannot confirm any."""
+        del measurement
+        counts = {row.category: row.n_groups for row in rows if row.part == MINIMAL}
+        return [
+            f"{name}: the smallest set is scored in {count} groups, in which no p can be below "
+            f"{smallest_flip_p(count):.2g}, so that none is confirmed. Play more (--items)."
+            for name, count in counts.items()
+            if smallest_flip_p(count) >= SIGNIFICANCE
+        ]
+
+    @staticmethod
+    def keys_in_use(run: RunReader) -> set[str]:
+        """Return keys of the stored searches that verdicts and tables read. Raises RunDamagedError."""
+        return {result.stored.key for result in _preferred(run).values()}
+
+
+KIND = JointPlaces
+_COLUMNS: Mapping[str, Any] = {
+    "alone [95 %]": lambda row: interval_text(row.alone, row.alone_ci),
+    "needed [95 %]": lambda row: interval_text(row.needed, row.needed_ci),
+    "p": lambda row: f"{row.p if row.p_fwe is None else row.p_fwe:.2g}",
+    "groups": lambda row: str(row.n_groups),
+    "finding": lambda row: row.finding,
+}
+
+
+def _finding(rows: "Sequence[JointEffect]") -> str:
+    places = describe_joint_places(rows) or "where the answer is read remains open"
+    return "; ".join(filter(None, (places, describe_remainder(rows))))
+
+
+# -- effects -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class JointEffect(Effect):
+    """The effect of one set of cells in one category.
+
+    cells: its cells, joined by `+`; of all cells their places and roles, `kv` if nothing of it is missing. part:
+    `cell`, `every-cell`, `minimal` or `second`. alone: share of the swap with only these cells patched; needed:
+    what all cells lose without them, of the swap; both with 95 % intervals by groups, None where the swap itself
+    is not significant. p, p_fwe: that the set alone moves the action toward the target side. Of cells by sign
+    flips of whole groups, p_fwe against all cells; of the smallest sets exact. The smallest sets are scored on the
+    groups in which they were not searched.
+    """
+
+    part: str
+    cells: str
+    n_episodes: int
+    n_groups: int
+    alone: float | None
+    alone_ci: tuple[float, float] | None
+    needed: float | None
+    needed_ci: tuple[float, float] | None
+    p: float
+    p_fwe: float | None
+    finding: str
+    key: str = ""
+
+
+def stored_joint_places(run: RunReader) -> dict[str, list[JointEffect]]:
+    """Return by category the rows of the preferred stored search: all of `kv` before a part, then the backbone.
+
+    Raises RunDamagedError.
+    """
+    return {
+        category: _Category(
+            result.outcomes, category, seed_text_of(run), result.stored.settings, result.stored.key
+        ).rows(result.stored.certificate().get(NAME, {}).get(category, {}))
+        for category, result in _preferred(run).items()
+    }
+
+
+def _preferred(run: RunReader) -> dict[str, StoredResult]:
+    """Return by category the search whose result a verdict reads."""
+    preferred: dict[str, StoredResult] = {}
+    for result in stored_results(run, NAME):
+        before = preferred.get(result.category)
+        if before is None or _breadth(result.stored.settings) >= _breadth(before.stored.settings):
+            preferred[result.category] = result
+    return preferred
+
+
+def _breadth(settings: Mapping[str, Any]) -> int:
+    """Return 2 for all of `kv`, 1 for a part of it, 0 for other places."""
+    is_kv = all(str(site).partition(".")[0] == KV_STREAM for site in settings.get("sites", SITES))
+    return is_kv + (is_kv and is_of_all_kv(settings))
+
+
+def is_of_all_kv(settings: Mapping[str, Any]) -> bool:
+    """Whether a search with these settings patched all that the acting stream reads."""
+    return set(SITES) <= set(settings.get("sites", SITES)) and set(ROLES) <= set(settings.get("roles", ROLES))
+
+
+def is_read_jointly(rows: Sequence[JointEffect]) -> bool:
+    """Whether a smallest set of several cells was confirmed."""
+    return any(row.part == MINIMAL and row.finding == "read jointly" for row in rows)
+
+
+def describe_joint_places(rows: Sequence[JointEffect]) -> str:
+    """Return where it is read, or passes in the backbone, in words for a verdict; empty where that remains open.
+
+    A smallest set is named if no cell alone comes near what all cells carry.
+    """
+    (every,) = (row for row in rows if row.part == EVERY)
+    cells = [row for row in rows if row.part == "cell"]
+    single = {row.cells: row.alone or 0.0 for row in cells if row.finding in ("read here", "enough alone")}
+    if every.finding == "past it" and not single:
+        return f"past {every.cells}"
+    verb = "read" if all(row.cells.startswith(f"{KV_STREAM}.") for row in cells) else "passes"
+    if is_read_jointly(rows) and max(single.values(), default=0.0) < KEEP * (every.alone or 0.0):
+        (minimal,) = (row for row in rows if row.part == MINIMAL)
+        alone = [f"{name} {share:.2f}" for name, share in single.items()]
+        return (
+            f"{verb} jointly at {minimal.cells} (alone: {', '.join(alone)})"
+            if alone
+            else f"no single place: {verb} jointly at {minimal.cells}"
+        )
+    return f"{verb} at {list_places(list(single))}" if single else ""
+
+
+def describe_remainder(rows: Sequence[JointEffect]) -> str:
+    """Return the part that places leave out: cells that oppose it, and a part that is past all cells."""
+    (every,) = (row for row in rows if row.part == EVERY)
+    opposing = [row.cells for row in rows if row.part == "cell" and row.finding == "opposes it"]
+    parts = [f"opposed at {list_places(opposing)}"] * bool(opposing)
+    is_past = describe_joint_places(rows).startswith("past")
+    if not is_past and every.alone_ci is not None and every.alone_ci[1] < KEEP:
+        parts.append(f"all cells of {every.cells} carry {every.alone:.2f} of it")
+    return "; ".join(parts)
+
+
+@dataclass(frozen=True)
+class _Category:
+    outcomes: ConditionOutcomes
+    category: str
+    seed_text: str
+    settings: Mapping[str, Any]
+    key: str
+
+    def rows(self, searched: Mapping[str, Any]) -> list[JointEffect]:
+        outcomes = self.outcomes
+        names = [name.partition("|")[2] for name in outcomes.conditions if name.startswith(f"{ALONE}|")]
+        toward = np.array([self._toward(f"{ALONE}|{name}") for name in names])
+        _, p, p_fwe = max_t(toward, outcomes.items, outcomes.groups, flips_seed(outcomes, self.seed_text))
+        every = self._share(outcomes, self._moved(EVERY))
+        rows = []
+        for at, name in enumerate(names):
+            alone = self._share(outcomes, self._moved(f"{ALONE}|{name}"))
+            needed = self._share(outcomes, self._moved(EVERY) - self._moved(f"{WITHOUT}|{name}"))
+            finding = finding_of_cell(alone, needed, every, float(p_fwe[at]))
+            rows.append(self._row("cell", name, outcomes, alone, needed, float(p[at]), float(p_fwe[at]), finding))
+        exact = paired_greater_p(self._toward(EVERY), outcomes.items, outcomes.groups)
+        all_cells, finding = self._all_cells(names), _finding_of_all(every)
+        rows.append(self._row(EVERY, all_cells, outcomes, every, None, exact, None, finding))
+        return rows + self._searched(searched)
+
+    def _all_cells(self, names: Sequence[str]) -> str:
+        """Return all cells together: `kv` if nothing of it is missing, else their places and roles."""
+        if is_of_all_kv(self.settings):
+            return KV_STREAM
+        places, roles = (list(dict.fromkeys(name.split(SEPARATOR)[at] for name in names)) for at in (0, 1))
+        every_block = {*SITES} <= {*self.settings.get("sites", SITES)}
+        return f"{KV_STREAM if every_block else list_places(places)} {', '.join(roles)}"
+
+    def _searched(self, searched: Mapping[str, Any]) -> list[JointEffect]:
+        """Return the smallest sets, on the groups in which they were not searched."""
+        scoring = ~np.isin(self.outcomes.groups, searched.get("choosing", []))
+        scored = self.outcomes.of_episodes(scoring)
+        rows = []
+        for part, name in ((MINIMAL, "cells"), (SECOND, "second")):
+            cells = " + ".join(searched.get(name, []))
+            if not cells:
+                continue
+            alone = self._share(scored, self._moved(part)[scoring])
+            needed = None
+            if part == MINIMAL:
+                needed = self._share(scored, (self._moved(EVERY) - self._moved(WITHOUT_MINIMAL))[scoring])
+            p = paired_greater_p(self._toward(part)[scoring], scored.items, scored.groups)
+            confirmed = alone is not None and alone.value >= CARRIES and alone.low > NOTHING and p < SIGNIFICANCE
+            word = "read jointly" if "+" in cells else "read here"
+            finding = word if confirmed else "not confirmed"
+            rows.append(self._row(part, cells, scored, alone, needed, p, None, finding))
+        return rows
+
+    def _row(
+        self, part: str, cells: str, outcomes: ConditionOutcomes, alone: SwapShare | None,
+        needed: SwapShare | None, p: float, p_fwe: float | None, finding: str,
+    ) -> JointEffect:  # fmt: skip
+        shares: dict[str, Any] = {**share_fields("alone", alone), **share_fields("needed", needed)}
+        return JointEffect(
+            category=self.category, part=part, cells=cells.replace(SEPARATOR, " "), n_episodes=outcomes.items.size,
+            n_groups=np.unique(outcomes.groups).size, **shares, p=p, p_fwe=p_fwe, finding=finding, key=self.key,
+        )  # fmt: skip
+
+    def _moved(self, condition: str) -> NDArray[np.float64]:
+        return self.outcomes.of(condition) - self.outcomes.of(CLEAN)
+
+    def _toward(self, condition: str) -> NDArray[np.float64]:
+        """Return metres toward the side that the image swap leads to."""
+        return -swap_sign(self.outcomes) * self.outcomes.correct_sign * self._moved(condition)
+
+    def _share(self, outcomes: ConditionOutcomes, moved: NDArray[np.float64]) -> SwapShare | None:
+        return share_of_swap(outcomes, moved, self.seed_text)
+
+
+def _finding_of_all(every: SwapShare | None) -> str:
+    """Return what all cells together do."""
+    if every is None:
+        return "n/a"
+    if carries_nothing(every.low, every.high):
+        return "past it"
+    if every.high < -NOTHING:
+        return "opposes it"
+    return "carries" if every.value >= CARRIES else "in part"

@@ -1,0 +1,183 @@
+"""Steering: a direction added to the tokens of one role, with matched controls of the same norm.
+
+One vector for all tokens cannot move an answer that lies in *which* tokens are marked: it marks all of them alike.
+`mean-difference:K` has a vector for each position, which takes the mark from one tile to the other.
+
+A supplement to the interchange, not a replacement. The sum may lie off the network's distribution, a coefficient
+has no natural size, and at a large one every direction disrupts the task. So coefficients count half class-mean
+differences (2 goes from one mean to the other), controls are orthogonal directions of the data's own covariance
+with the same norm, and both sides are reported.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
+
+from probe_kit.errors import UsageError
+from probe_kit.hooks.capturing.edit_engine import apply_patch
+from probe_kit.hooks.capturing.token_edits import AddVector
+from probe_kit.intervene.kinds.base import ConditionName, Intervention, Measurement
+from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
+from probe_kit.intervene.kinds.interchange import Interchange
+from probe_kit.intervene.kinds.site_maps import PatchEffect
+from probe_kit.intervene.patching.patch import Cell
+from probe_kit.intervene.places import resolve_all
+from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, SourceRun
+from probe_kit.intervene.tokens import TILES, role_tokens
+from probe_kit.runs.run import Run
+
+if TYPE_CHECKING:
+    from probe_kit.intervene.directions import DirectionBasis
+    from probe_kit.intervene.sessions.session import ReplaySession
+
+TargetSide = Literal["wrong", "correct", "left", "right"]
+LARGE_CHANGE = 2.0
+"""Token norms beyond which a steering is said to be large."""
+
+
+@dataclass(frozen=True)
+class Steered:
+    """The tokens of one cell, moved along a direction."""
+
+    cell: Cell
+    direction: str
+    coefficient: float
+    target_side: TargetSide
+    axes: "DirectionBasis"
+
+    @property
+    def name(self) -> str:
+        """Return place, role, direction and coefficient, see `ConditionName`."""
+        return str(ConditionName(self.cell.place.name, self.cell.role, self.direction, f"{self.coefficient:g}"))
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Infer with these tokens moved."""
+        pair, session, place = context.pair, context.session, self.cell.place
+        left = pair.side == "left"
+        side = {"left": 1.0, "right": -1.0, "correct": 1.0 if left else -1.0, "wrong": -1.0 if left else 1.0}
+        strength = self.coefficient * side[self.target_side]
+        shift = self.axes.shift(self.direction, pair.episode, pair.category, strength)
+        tokens = role_tokens(session.policy, pair, place.stream, self.cell.role, context.memo)
+        with apply_patch(session.policy, place.sites, tokens, AddVector(shift)) as edit_log:
+            chunk = session.act(pair.clean, pair.seed)
+        return ConditionResult(chunk, edit_log)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steering(Intervention):
+    """Every place and coefficient, toward one side, and the same for the controls; 0 is always played as well.
+
+    sites: patterns of places. role: whose tokens are moved. direction: `mean-difference` or `probe`, one vector
+    found in the mean of these tokens and added to each; or `mean-difference:K`, at each position the difference of
+    the class means there, within the K directions that positions share.
+    coefficients: in half class-mean differences along the direction. target_side: `wrong` and `correct` are those
+    of the clean images. controls: so many orthogonal directions. Raises UsageError for a coefficient or side that
+    does not exist.
+    """
+
+    kind: ClassVar[str] = "steer"
+    summary: ClassVar[str] = "Add a direction to tokens, with controls of the same norm."
+    position: ClassVar[int] = 6
+    asks_where: ClassVar[bool] = True
+    options: ClassVar[Mapping[str, str]] = {
+        "sites": "where tokens are moved; required",
+        "roles": "the one whose tokens are moved; required",
+        "direction": "mean-difference (default), probe or mean-difference:K",
+        "controls": "random directions; default 5",
+        "coefficients": "in half class-mean differences; default 1,2,4",
+        "target_side": "wrong (default), correct, left or right",
+        "seed": "of controls and folds; default 0",
+    }
+
+    sites: tuple[str, ...]
+    role: str
+    direction: str = "mean-difference"
+    coefficients: tuple[float, ...] = (1.0, 2.0, 4.0)
+    target_side: TargetSide = "wrong"
+    controls: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        from probe_kit.intervene.directions import check_direction
+
+        super().__post_init__()
+        if self.role in TILES:
+            raise UsageError(
+                f"{self.role} has no mean in the run from which a direction could be found; steer `image`, or "
+                "patch the tile (--kind interchange)"
+            )
+        check_direction(self.direction)
+        if self.target_side not in get_args(TargetSide):
+            raise UsageError(
+                f"target_side is {self.target_side!r}; expected one of {', '.join(get_args(TargetSide))}"
+            )
+        if not self.coefficients or not all(0 < coefficient <= 1000 for coefficient in self.coefficients):
+            raise UsageError(f"coefficients are {self.coefficients}; expected positive numbers, such as 1, 2, 4")
+        if len(set(self.coefficients)) != len(self.coefficients):
+            raise UsageError(f"coefficients are {self.coefficients}; give each once")
+
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """Return it as the command builds it. Raises UsageError without sites or with other than one role."""
+        roles = options.pop("roles", ())
+        if "sites" not in options or len(roles) != 1:
+            raise UsageError(
+                "--kind steer needs --sites and one of --roles, such as --sites backbone.02 --roles image"
+            )
+        return super().from_options(run, role=roles[0], **options)
+
+    @property
+    def fits_first(self) -> bool:
+        """Whether its direction is of tokens."""
+        return ":" in self.direction
+
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Return clean, images swapped, then every place at every coefficient, with its controls.
+
+        The swap is the unit of the effect: a steering is a share of what it does.
+
+        Raises UnknownSiteError, and NoDirectionError for a named place without a direction.
+        """
+        from probe_kit.intervene.directions import fit_token_directions
+
+        cells = [Cell(place, self.role) for place in resolve_all(self.sites, session.policy).values()]
+        conditions: list[Condition] = [CleanRun(), SourceRun()]
+        for cell, axes in fit_token_directions(session, self, cells, self.sites).items():
+            conditions.append(Steered(cell, self.direction, 0.0, self.target_side, axes))
+            conditions += [
+                Steered(cell, name, coefficient, self.target_side, axes)
+                for coefficient in self.coefficients
+                for name in (self.direction, *axes.control_names)
+            ]
+        return conditions
+
+    @staticmethod
+    def notes(rows: Sequence[PatchEffect], measurement: Measurement) -> list[str]:
+        """Return notes about too large a change, and about a vector that cannot move the answer."""
+        del measurement
+        steered = {row.name: row.relative_change for row in rows if row.coefficient}
+        large = [
+            f"{name} moves tokens by {ratio:.1f} times their own norm; what that does is little evidence."
+            for name, ratio in steered.items()
+            if ratio > LARGE_CHANGE
+        ]
+        return large + [
+            f"{category}: one vector that is added to every token moves no action. An answer that lies in which "
+            "tokens are marked has no such vector; --direction mean-difference:1 has a vector for each position."
+            for category in _unmoved_by_one_vector(rows)
+        ]
+
+    effects = staticmethod(Interchange.effects)
+    table = staticmethod(Interchange.table)
+    sentences = staticmethod(Interchange.sentences)
+    keys_in_use = staticmethod(Interchange.keys_in_use)
+
+
+KIND = Steering
+
+
+def _unmoved_by_one_vector(rows: Sequence[PatchEffect]) -> list[str]:
+    """Return categories in which a direction of the tokens' mean moves no action by a smallest reach."""
+    pooled = [row for row in rows if row.is_dose and not row.is_control and ":" not in row.direction]
+    moved = {row.category for row in pooled if abs(row.mean_displacement) >= SMALLEST_REACH}
+    return [name for name in dict.fromkeys(row.category for row in pooled) if name not in moved]

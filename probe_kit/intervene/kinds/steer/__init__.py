@@ -1,1 +1,0 @@
-"""Steering: add a direction to the tokens of a site."""

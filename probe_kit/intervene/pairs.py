@@ -1,0 +1,54 @@
+"""Pairs of inferences: a clean one, and the one from which activations are patched into it."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Union
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.suite.items import Side
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Prompt
+
+Given = Union[Observation, "Prompt"]
+"""An observation of a policy, or a question to a model that answers."""
+Chunk = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two inferences with the same seed.
+
+    clean: what is patched into. source: what activations are patched from; it must have as many tokens. toward:
+    +1 or −1, the direction of the metric in which the source should move the output. group: the unit that is
+    resampled and flipped, such as a couple of items; item: the unit that is averaged before; both may be empty
+    for pairs that are independent of each other.
+
+    Pairs of a run have more. row, episode, category: of the run. side: of the correct picture; None without sides.
+    tiles: (H, W) where each tile is seen in the clean picture. stored: (n, D) actions of the clean inference that
+    the run has, None where it does not say. step: which inference of the episode it is.
+    """
+
+    clean: Given
+    source: Given
+    seed: int = 0
+    toward: int = 1
+    group: str = ""
+    item: str = ""
+    row: int = -1
+    episode: str = ""
+    category: str = ""
+    side: Side | None = None
+    tiles: Mapping[Side, NDArray[np.bool_]] = field(default=MappingProxyType({}), repr=False)
+    stored: Chunk | None = field(default=None, repr=False)
+    step: int = 0
+
+
+def groups_and_items(pairs: Sequence[Pair]) -> tuple[list[str], list[str]]:
+    """The group and the item of every pair; a pair without one is alone in its own."""
+    groups = [pair.group or f"pair {at}" for at, pair in enumerate(pairs)]
+    return groups, [pair.item or f"{groups[at]}, pair {at}" for at, pair in enumerate(pairs)]

@@ -1,0 +1,283 @@
+"""Places: sites that are changed together, and the tokens at which they are."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from probe_kit.errors import UnknownSiteError, UsageError
+from probe_kit.hooks.capturing.token_edits import OfOneHead, TokenEdit
+from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.sites import HEADS, KV, KV_STREAM, Site
+from probe_kit.hooks.contract.views import plays
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Model, Policy, Stream
+
+
+TILE_ROLES = ("image.left", "image.right")
+"""Roles of the patches that see one of the two pictures; see `tiles`."""
+ALL = "all"
+"""The role of every token but padding."""
+RESIDUAL = "residual"
+SEPARATOR = "|"
+"""Between the parts of a condition's name, such as `backbone.02|image`."""
+SHORTEST_RANGE = 3
+"""Consecutive layers that are named by their first and last."""
+_POSITIONS = re.compile(r"(?P<first>\d+)(-(?P<last>\d+))?")
+_PATTERN = re.compile(
+    r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\*|\d+)(\.(?P<quantity>[a-z_]+)(\.(?P<head>\*|\d+))?)?"
+    r"(@(?P<first>\d+)(-(?P<last>\d+))?)?"
+)
+
+
+@dataclass(frozen=True)
+class PlaceName:
+    """The parts of a place's name: `backbone.02`, `kv.01.values`, `backbone.02.heads.3`, `expert.03@0-4`.
+
+    quantity: empty where it is not named: the residual stream, of `kv` keys and values. head: of the quantity
+    `heads`. iterations: first and last one; None for all.
+    """
+
+    stream: str
+    layer: int
+    quantity: str = ""
+    head: int | None = None
+    iterations: tuple[int, int] | None = None
+
+    @classmethod
+    def parse(cls, name: str) -> "PlaceName":
+        """Take the name of one place apart. Raises UnknownSiteError for another form."""
+        match = _PATTERN.fullmatch(name)
+        if match is None or "*" in name:
+            raise UnknownSiteError(f"{name!r} is not the name of a place, such as backbone.02 or expert.03@0-4")
+        first, last = match["first"], match["last"]
+        return cls(
+            match["stream"],
+            int(match["layer"]),
+            match["quantity"] or "",
+            None if match["head"] is None else int(match["head"]),
+            None if first is None else (int(first), int(last or first)),
+        )
+
+    def __str__(self) -> str:
+        parts = [self.stream, f"{self.layer:02d}", self.quantity, "" if self.head is None else str(self.head)]
+        name = ".".join(filter(None, parts))
+        if self.iterations is None:
+            return name
+        first, last = self.iterations
+        return f"{name}@{first}" if first == last else f"{name}@{first}-{last}"
+
+    @property
+    def is_whole_layer(self) -> bool:
+        """Whether it is the stream itself in one layer, over all iterations."""
+        return self.quantity in ("", RESIDUAL) and self.iterations is None
+
+    @property
+    def depth(self) -> tuple[object, ...]:
+        """For sorting places of one stream: shallow before deep, a layer before its parts."""
+        return self.layer, self.iterations or (0, 0), self.quantity, -1 if self.head is None else self.head
+
+
+def list_places(names: Sequence[str]) -> str:
+    """Places, each with its role if it has one, in words: `backbone.01 to backbone.07 language, kv.02 image`.
+
+    Three or more of one kind in consecutive layers become one range.
+    """
+    ranges: list[list[tuple[PlaceName, str]]] = []
+    for name in names:
+        place, _, role = name.partition(" ")
+        parsed = PlaceName.parse(place)
+        before = ranges[-1][-1] if ranges else None
+        if before is not None and (replace(before[0], layer=before[0].layer + 1), before[1]) == (parsed, role):
+            ranges[-1].append((parsed, role))
+        else:
+            ranges.append([(parsed, role)])
+    return ", ".join(
+        f"{own[0][0]} to {' '.join(filter(None, map(str, own[-1])))}"
+        if len(own) >= SHORTEST_RANGE
+        else ", ".join(" ".join(filter(None, map(str, one))) for one in own)
+        for own in ranges
+    )
+
+
+@dataclass(frozen=True)
+class SiteGroup:
+    """One quantity of a layer of a stream, over some of its iterations; of `kv` keys and values together.
+
+    head: which of the `heads` heads is meant, of sites of that quantity; None for all of them.
+    """
+
+    name: str
+    sites: tuple[Site, ...]
+    head: int | None = None
+    heads: int = 0
+
+    @property
+    def only_site(self) -> Site:
+        """Its one site, where a direction can be found. Raises UnknownSiteError if it has several, or no mean."""
+        if self.stream == KV_STREAM or self.sites[0].quantity != RESIDUAL:
+            what = "keys and values" if self.stream == KV_STREAM else f"of the quantity {self.sites[0].quantity}"
+            raise UnknownSiteError(
+                f"{self.name} is {what}, of which a run stores no means, so that no direction is found; "
+                "name a place of a residual stream, such as backbone.02"
+            )
+        if len(self.sites) != 1:
+            raise UnknownSiteError(
+                f"{self.name} is {len(self.sites)} sites, each with directions of its own; name one, such as "
+                f"{self.name.partition('@')[0]}@0"
+            )
+        return self.sites[0]
+
+    @property
+    def stream(self) -> str:
+        """Of all its sites."""
+        return self.sites[0].stream
+
+    @property
+    def layer(self) -> tuple[str, int, str]:
+        """Stream, layer and quantity: heads of one block are parallel, layers come one after the other."""
+        return self.stream, self.sites[0].layer, self.sites[0].quantity
+
+    def limit(self, change: TokenEdit) -> TokenEdit:
+        """The change within this place: of one head, if it is one."""
+        return change if self.head is None else OfOneHead(change, self.head, self.heads)
+
+
+def resolve_sites(pattern: str, policy: "Model") -> list[SiteGroup]:
+    """The places that a pattern names.
+
+    `backbone.*` every layer, each a place; `backbone.02` one; `expert.03@0-4` a layer over iterations 0 to 4,
+    changed at each of them; `expert.03` over all; `kv.02` what block 2 hands over to the acting stream, keys and
+    values together. A quantity may follow the layer: `kv.02.values`, `backbone.02.mlp`, `backbone.02.heads` for
+    all heads of a block, `backbone.02.heads.3` for one, `backbone.*.heads.*` for each. Raises UnknownSiteError,
+    and UnsupportedInterventionError for `kv` of a family that has none.
+    """
+    match, streams = _PATTERN.fullmatch(pattern), policy.every_stream()
+    if match is not None and match["stream"] == KV_STREAM:
+        _check_kv(policy)
+    if match is None or match["stream"] not in streams:
+        raise UnknownSiteError(
+            f"{pattern!r} names no place; expected STREAM.LAYER such as backbone.*, backbone.02, expert.03@0-4 or "
+            f"backbone.02.heads.3, of the streams {', '.join(streams)}"
+        )
+    stream, quantity, head = streams[match["stream"]], match["quantity"] or "", match["head"]
+    if head is not None and quantity != HEADS:
+        raise UnknownSiteError(
+            f"{pattern!r} names a head of the quantity {quantity}; expected {HEADS}, such as backbone.02.heads.3"
+        )
+    every = range(stream.layers - (stream is policy.prompt_kv or quantity not in ("", RESIDUAL)))
+    layers = every if match["layer"] == "*" else [int(match["layer"])]
+    heads = [None] if head is None else range(stream.heads) if head == "*" else [int(head)]
+    first, last = match["first"], match["last"]
+    iterations = None if first is None else (int(first), int(last or first))
+    return [
+        _place(stream, PlaceName(stream.name, layer, quantity, one, iterations))
+        for layer in layers
+        for one in heads
+    ]
+
+
+def resolve_all(patterns: Sequence[str], policy: "Model") -> dict[str, SiteGroup]:
+    """The places of several patterns by name, each once. Raises as `resolve_sites` does."""
+    return {place.name: place for pattern in patterns for place in resolve_sites(pattern, policy)}
+
+
+def parse_pattern(pattern: str) -> dict[str, str | None] | None:
+    """Stream, layer, quantity, head, first and last iteration of a pattern; None for what names no place."""
+    match = _PATTERN.fullmatch(pattern)
+    return None if match is None else match.groupdict()
+
+
+def names_one_place(pattern: str) -> bool:
+    """Whether a pattern has no wildcard, so that its place was meant by name."""
+    return "*" not in pattern
+
+
+def _check_kv(model: "Model") -> None:
+    """Raise UnsupportedInterventionError for a policy without keys and values of the prompt."""
+    interventions = getattr(model, "interventions", None)
+    if interventions is not None:
+        interventions.check("kv", model.card.family)
+
+
+def _place(stream: "Stream", name: PlaceName) -> SiteGroup:
+    quantities = (name.quantity,) if name.quantity else KV if stream.name == KV_STREAM else (RESIDUAL,)
+    low, high = name.iterations or (0, 0)
+    sites = tuple(
+        site
+        for quantity in quantities
+        for site in stream.sites(quantity)
+        if site.layer == name.layer and (name.iterations is None or low <= (site.iteration or 0) <= high)
+    )
+    expected = 1 if stream.iterations is None else high - low + 1 if name.iterations else stream.iterations
+    expected *= len(quantities)
+    if len(sites) != expected or (stream.iterations is None and name.iterations is not None):
+        there = f"{stream.layers} layers" + (f" and {stream.iterations} iterations" if stream.iterations else "")
+        raise UnknownSiteError(f"{name} is no place; the stream {stream.name} has {there}, counted from 0")
+    if name.head is not None and name.head >= stream.heads:
+        raise UnknownSiteError(f"{name} is no place; a block of {stream.name} has {stream.heads} heads, from 0 on")
+    return SiteGroup(str(name), sites, name.head, stream.heads if name.quantity == HEADS else 0)
+
+
+def positions_of(role: str) -> tuple[int, int] | None:
+    """Return first and last position of a role that is spelled as such, like `7` or `7-11`; None for another."""
+    match = _POSITIONS.fullmatch(role)
+    return None if match is None else (int(match["first"]), int(match["last"] or match["first"]))
+
+
+def roles_of(policy: "Policy", stream: str, wanted: Sequence[str]) -> list[str]:
+    """Those of the wanted roles that tokens of a stream play, `all` included, tiles where it has a picture."""
+    named = policy.role_names.get(policy.tokens_of(stream), ())
+    tiles = TILE_ROLES if any(plays(name, "image") for name in named) else ()
+    return [role for role in wanted if role == ALL or role in tiles or any(plays(name, role) for name in named)]
+
+
+def check_roles_have_tokens(
+    policy: "Policy", streams: Sequence[str], wanted: Sequence[str], usual: Sequence[str]
+) -> None:
+    """Raise UsageError for a wanted role that no token of these streams plays.
+
+    usual: the roles that are tried if nothing is said, of which one that is there will do.
+    """
+    there = {role for stream in streams for role in roles_of(policy, stream, wanted)}
+    missing = [role for role in wanted if role not in there]
+    if not missing or (there and tuple(wanted) == tuple(usual)):
+        return
+    named = [name for stream in streams for name in policy.role_names.get(policy.tokens_of(stream), ())]
+    raise UsageError(
+        f"no token of {', '.join(streams)} has the role {missing[0]!r}; expected one of "
+        f"{', '.join(dict.fromkeys((ALL, *named)))}"
+    )
+
+
+FINAL_NORM = "final_norm"
+
+
+def unread_places(
+    patterns: Iterable[str], streams: "Mapping[str, Stream]", interventions: Interventions
+) -> tuple[str, ...]:
+    """Places of these patterns at the end of an unread stream: an edit there changes no action.
+
+    streams: of the run or the policy, by name. interventions: declared by the family.
+    """
+    places = []
+    for pattern in patterns:
+        parts = parse_pattern(pattern)
+        if parts is None or parts["stream"] not in interventions.unread or parts["stream"] not in streams:
+            continue
+        last, quantity = streams[parts["stream"]].layers - 1, parts["quantity"] or ""
+        reaches_end = parts["layer"] == "*" or int(parts["layer"] or 0) == last
+        if quantity in ("", RESIDUAL) and reaches_end:
+            places.append(str(PlaceName(parts["stream"], last, quantity)))
+        elif quantity == FINAL_NORM:
+            places.append(pattern)
+    return tuple(dict.fromkeys(places))
+
+
+def unread_note(places: Iterable[str]) -> str:
+    """The sentence about unread places."""
+    return (
+        f"unread: {', '.join(places)}. Nothing that acts reads the end of this stream, so that an edit there "
+        "changes no action whatever probes read in it: a control, no place to steer at"
+    )

@@ -1,0 +1,195 @@
+"""Conditions: the ways in which one inference is made again, and the numbers of each. Loads no model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS, EditLog
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP
+from probe_kit.intervene.pairs import Chunk, Pair
+from probe_kit.intervene.patching.patch import Cell, patched
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import ActivationCache
+    from probe_kit.intervene.directions import DirectionBasis
+    from probe_kit.intervene.sessions.session import ReplaySession
+
+
+@dataclass
+class ConditionContext:
+    """One pair, with what its conditions share.
+
+    memo: results of one condition that another needs as well, by name. clean: (chunk, D) of the first condition,
+    empty before that was played.
+    """
+
+    session: "ReplaySession"
+    pair: Pair
+    memo: dict[Any, Any] = field(default_factory=dict)
+    clean: Chunk = field(default_factory=lambda: np.zeros((0, 7), np.float32))
+
+    def source(self, sites: Sequence[Site]) -> "ActivationCache":
+        """Return the activations of all these sites in the source's inference; made once."""
+        from probe_kit.hooks import capture
+
+        if "source" not in self.memo:
+            with capture(self.session.policy, sites) as tape:
+                self.session.act(self.pair.source, self.pair.seed)
+            self.memo["source"] = tape
+        source: ActivationCache = self.memo["source"]
+        return source
+
+
+@dataclass(frozen=True)
+class ConditionResult:
+    """The actions (chunk, D) of one inference, and the log of its edits, if any.
+
+    mass: (B, I, H, R) the attention shares of it, if recorded; see `AttentionShares`. estimated: displacement that
+    an estimate adds to the chunk's, without an inference that makes it.
+    """
+
+    chunk: Chunk
+    edit_log: EditLog | None = None
+    mass: NDArray[np.float32] | None = None
+    estimated: float = 0.0
+
+
+class Condition(Protocol):
+    """One way of making an inference again."""
+
+    @property
+    def name(self) -> str:
+        """Return the name that tells it from the others of its intervention."""
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Make the inference."""
+
+
+@dataclass(frozen=True)
+class CleanRun:
+    """The inference as the run made it."""
+
+    name: str = CLEAN
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Infer with nothing changed."""
+        return ConditionResult(context.session.act(context.pair.clean, context.pair.seed))
+
+
+@dataclass(frozen=True)
+class SourceRun:
+    """The source's inference with the same seed: in the scene, the two pictures in each other's place."""
+
+    name: str = IMAGE_SWAP
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Infer with the source's inputs."""
+        return ConditionResult(context.session.act(context.pair.source, context.pair.seed))
+
+
+@dataclass(frozen=True)
+class Patched:
+    """The clean inference with activations of cells from the source's.
+
+    cells: by category, and for all other categories under the empty name. source_sites: all sites at which the
+    source's inference is captured, once for all conditions. direction: the name of one of `bases`, empty to patch
+    tokens in full.
+    """
+
+    name: str
+    cells: dict[str, tuple[Cell, ...]] = field(repr=False)
+    source_sites: tuple[Site, ...] = field(repr=False)
+    direction: str = ""
+    bases: "DirectionBasis | None" = field(default=None, repr=False)
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Infer once, however many cells."""
+        session, pair = context.session, context.pair
+        cells = self.cells.get(pair.category, self.cells.get("", ()))
+        if not cells:
+            return ConditionResult(session.act(pair.clean, pair.seed))
+        along = None if self.bases is None else self.bases.basis(self.direction, pair.episode, pair.category)
+        source = context.source(self.source_sites)
+        with patched(session.policy, pair, cells, source, along, memo=context.memo) as edit_log:
+            chunk = session.act(pair.clean, pair.seed)
+        return ConditionResult(chunk, edit_log)
+
+
+AttentionRecord = tuple[int, int, NDArray[np.float32]]
+"""The attention of one inference: row in the run's episodes, call, (B, I, H, R) shares."""
+_BY_CONDITION = ("displacement", "max_action_change", "edit_log", "episode_outcomes")
+
+
+@dataclass(frozen=True)
+class ReplayBatch:
+    """The numbers of K conditions in E episodes.
+
+    rows: (E,) in the run's episodes. displacement: (K, E) see `ReplaySession.displacement`. max_action_change:
+    (K, E) the largest difference of any action from the clean one's. edit_log: (K, E, 5) see `LOG_FIELDS`.
+    replay_error: (E,) of the clean inference from the stored one; NaN where the run does not say.
+    episode_outcomes: (K, E) where the cube ended, correct, wrong or oob, for episodes that were played to their
+    end; then `displacement` is the cube's, and `max_action_change` and `replay_error` are of the trajectory; None
+    where nothing was executed. mass: (N, B, I, H, R) the attention of N inferences, inferences: (N, 2) their rows
+    and calls; None where attention was not recorded.
+    """
+
+    rows: NDArray[np.int64]
+    displacement: NDArray[np.float64]
+    max_action_change: NDArray[np.float64]
+    edit_log: NDArray[np.float64]
+    replay_error: NDArray[np.float64]
+    episode_outcomes: NDArray[np.str_] | None = None
+    mass: NDArray[np.float32] | None = None
+    inferences: NDArray[np.int64] | None = None
+
+    def with_mass(self, attention_records: "Sequence[AttentionRecord]") -> "ReplayBatch":
+        """Return the same with the attention of its inferences, if any was recorded."""
+        if not attention_records:
+            return self
+        rows, calls, masses = zip(*attention_records, strict=True)
+        return replace(self, mass=np.stack(masses), inferences=np.stack([rows, calls], axis=1).astype(np.int64))
+
+    @classmethod
+    def empty(cls, pairs: Sequence[Pair], conditions: Sequence[Condition]) -> "ReplayBatch":
+        """Return room for the numbers of these conditions in these pairs."""
+        shape = len(conditions), len(pairs)
+        log = np.zeros((*shape, len(LOG_FIELDS)))
+        rows = np.array([pair.row for pair in pairs], np.int64)
+        return cls(rows, np.empty(shape), np.zeros(shape), log, np.empty(len(pairs)))
+
+    @property
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return those that are there, by name."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    @classmethod
+    def joined(cls, parts: Sequence["ReplayBatch"]) -> "ReplayBatch":
+        """Return one after the other."""
+        return cls(
+            **{
+                name: np.concatenate([getattr(part, name) for part in parts], axis=int(name in _BY_CONDITION))
+                for name in parts[0].arrays
+            }
+        )
+
+
+def replay(session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence[Condition]) -> ReplayBatch:
+    """Play every condition on every pair; the first one is the clean one."""
+    batch = ReplayBatch.empty(pairs, conditions)
+    attention_records: list[AttentionRecord] = []
+    for column, pair in enumerate(pairs):
+        context = ConditionContext(session, pair)
+        clean = context.clean = conditions[0].play(context).chunk
+        batch.replay_error[column] = session.replay_error(pair, clean)
+        for number, condition in enumerate(conditions):
+            played = condition.play(context) if number else ConditionResult(clean)
+            batch.displacement[number, column] = session.displacement(played.chunk, pair) + played.estimated
+            batch.max_action_change[number, column] = float(np.abs(played.chunk - clean).max())
+            if played.edit_log is not None:
+                batch.edit_log[number, column] = played.edit_log.row()
+            attention_records += [] if played.mass is None else [(pair.row, pair.step, played.mass)]
+    return batch.with_mass(attention_records)

@@ -1,1 +1,0 @@
-"""Replaying stored inferences and episodes of a run under conditions."""

@@ -1,0 +1,286 @@
+"""Where stored interventions found that the answer passes and is read, for verdicts. Needs no model."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import starmap
+from typing import TYPE_CHECKING, Literal
+
+from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.hooks.registry import get_family
+from probe_kit.intervene.directions import MEAN_DIFFERENCE
+from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps
+from probe_kit.intervene.kinds.joint import (
+    EVERY,
+    JointEffect,
+    describe_joint_places,
+    describe_remainder,
+    is_read_jointly,
+    stored_joint_places,
+)
+from probe_kit.intervene.kinds.site_maps import (
+    BACKBONE,
+    PatchEffect,
+    best_cell,
+    is_backbone_layer,
+    is_upstream,
+    stored_carrying_directions,
+    stored_localised_sites,
+    stored_site_effects,
+    stored_subspace_effects,
+)
+from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
+from probe_kit.intervene.patching.sets import NOTHING, carries_nothing
+from probe_kit.intervene.places import ALL, list_places, unread_places
+from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_behaviour, control_for
+from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
+from probe_kit.suite.categories import category_of
+from probe_kit.train.data.run_reader import RunReader
+
+if TYPE_CHECKING:
+    from probe_kit.train.results.probe_results import ProbeResults
+
+
+def stored_places(run: RunReader) -> dict[str, Places]:
+    """By category, of interchanges and joint places; without categories that were not searched.
+
+    Raises RunDamagedError.
+    """
+    located, carried = stored_localised_sites(run), stored_carrying_directions(run)
+    searched = {name: rows for name, rows in stored_joint_places(run).items() if _says_where(rows)}
+    jointly = {name: describe_joint_places(rows) for name, rows in searched.items()}
+    rest = {name: describe_remainder(rows) for name, rows in searched.items()}
+    return {
+        name: Places(located.get(name), carried.get(name, ()), jointly.get(name, ""), rest.get(name, ""))
+        for name in dict.fromkeys((*located, *carried, *jointly))
+    }
+
+
+def _says_where(rows: Sequence[JointEffect]) -> bool:
+    """Whether a search belongs into a verdict: one of a part that carries nothing does not rule out the others."""
+    (every,) = (row for row in rows if row.part == EVERY)
+    return every.finding != "past it" or every.cells == KV_STREAM
+
+
+def stored_other_readouts(run: RunReader, found: Mapping[str, ImageSwapEffect]) -> dict[str, UseVerdict]:
+    """By category, the behaviour by the other readout; without categories in which that is not stored.
+
+    found: what is shown, by category. The positive control is of the other readout too. Raises RunDamagedError.
+    """
+    stored = {readout: stored_image_swaps(run, readout) for readout in (FIRST_CHUNK, PER_STEP)}
+    others: dict[str, UseVerdict] = {}
+    for category, own in found.items():
+        same = stored[PER_STEP if own.readout == FIRST_CHUNK else FIRST_CHUNK]
+        if category in same:
+            others[category] = classify_behaviour(same[category], control_for(category, same))
+    return others
+
+
+TieAtSite = Literal["read", "unread", "another code", "in part", "not tested"]
+"""read: a subspace that probes find carries the effect. unread: the whole site carries nothing, and is no part
+of several that are read together. another code: the site carries it, every such subspace nothing. in part:
+between, or against the effect. not tested: no interchange there."""
+OPEN = "whether the readable copy is the one used remains open"
+UNPROBED = "probes find no copy beyond chance, but a linear direction carries it"
+"""Where the items are too few for the probes. The direction is fitted without the tested episode's groups."""
+Sites = Mapping[tuple[str, str], TieAtSite]
+"""By place and role."""
+
+
+def tie_at_site(
+    whole: PatchEffect | None, along: Sequence[PatchEffect], layer: Sequence[PatchEffect] = ()
+) -> TieAtSite:
+    """The tie at one place and role. whole: its tokens patched in full. along: within subspaces, no controls.
+
+    Weights of a probe point away from what else varies, and may carry nothing of a copy that is read. That it is
+    another code is said only where a direction of the class means carries nothing either.
+
+    layer: the same place at every role. A role that carries nothing alone can be one of several parts that decide
+    together. It is unread if all tokens of the layer carry nothing either, or another role carries the effect.
+    """
+    if any(map(_is_read_along, along)):
+        return "read"
+    if whole is None or whole.effect_ci is None:
+        return "not tested"
+    if carries_nothing(*whole.effect_ci):
+        return "unread" if whole.role == ALL else _without_others(whole, layer)
+    tested = [row.effect_ci for row in along if row.effect_ci is not None]
+    if not tested:
+        return "not tested"
+    if not all(starmap(carries_nothing, tested)):
+        return "in part"
+    if not any(row.direction.startswith(MEAN_DIFFERENCE) for row in along):
+        return "not tested"
+    carries = whole.effect is not None and whole.effect >= LOCALISATION_SHARE
+    return "another code" if carries else "in part"
+
+
+def _without_others(whole: PatchEffect, layer: Sequence[PatchEffect]) -> TieAtSite:
+    """The tie of a role that carries nothing alone."""
+    if any(row.is_localised and row.role not in (ALL, whole.role) for row in layer):
+        return "unread"
+    every = next((row for row in layer if row.role == ALL and row.effect_ci is not None), None)
+    if every is None or every.effect_ci is None:
+        return "not tested"
+    return "unread" if carries_nothing(*every.effect_ci) else "in part"
+
+
+def describe_tie(sites: Sites, is_joint: bool = False) -> str:
+    """The tie of all sites together, in words; empty if that was not tested at enough of them.
+
+    is_joint: whether joint places found that the answer is read at several places together. What carries nothing
+    alone can then be one of them.
+    """
+    at = {tie: [f"{place} {role}" for (place, role), own in sites.items() if own == tie] for tie in sites.values()}
+    if "read" in at:
+        return f"the readable copy is read ({list_places(at['read'])})"
+    if not sites or "not tested" in at:
+        return ""
+    if "in part" in at or (is_joint and "unread" in at):
+        return OPEN
+    if "another code" in at:
+        return f"the readable copy is not the one used: another code in the same place ({at['another code'][0]})"
+    return "the readable copy is not the one used: the answer passes elsewhere"
+
+
+def stored_ties(run: RunReader, results: "ProbeResults | None", view: str | None = None) -> dict[str, str]:
+    """By category `describe_tie` of the sites at which probes of a view are significant.
+
+    So are sites at which a direction of the same means carries the effect: it is read out of other episodes. The
+    first layer counts only where a direction was patched, because its tokens carry the effect by construction.
+
+    view: None for the first that was probed. Empty without probes, and for views that are no mean over a role.
+    """
+    role = None if results is None else role_of_view(view or results.settings.views[0])
+    if results is None or role is None:
+        return {}
+    scores = results.scores
+    own = scores[(scores["stream"] == BACKBONE) & (scores["view"] == (view or results.settings.views[0]))]
+    whole, along = stored_site_effects(run), stored_subspace_effects(run)
+    jointly = stored_joint_places(run)
+    found = {}
+    for category, rows in own.groupby("category", sort=False):
+        name = str(category)
+        patched, within = whole.get(name, ()), along.get(name, ())
+        significant = [f"{BACKBONE}.{int(layer):02d}" for layer in rows.loc[rows["signal"], "layer"]]
+        pooled = [row.place for row in within if row.role == role and _is_pooled_carrier(row)]
+        if pooled and not significant:
+            found[name] = f"{UNPROBED} ({list_places([f'{place} {role}' for place in pooled])})"
+            continue
+        places = sorted({*significant, *pooled})
+        sites = {
+            (place, role): tie_at_site(
+                next(iter(_at(patched, place, role)), None),
+                [row for row in _at(within, place, role) if not row.is_control],
+                [row for row in patched if row.place == place],
+            )
+            for place in places
+        }
+        inside = {at: tie for at, tie in sites.items() if tie != "not tested" or not is_upstream(at[0])}
+        found[name] = describe_tie(inside, is_read_jointly(jointly.get(name, ())))
+    return found
+
+
+def _is_pooled_carrier(row: PatchEffect) -> bool:
+    """Whether a direction of the mean over a role's tokens carries the effect, beyond its controls."""
+    return _is_read_along(row) and ":" not in row.direction and is_backbone_layer(row)
+
+
+def _is_read_along(row: PatchEffect) -> bool:
+    return row.is_localised and row.control_displacement is not None and _low(row) > NOTHING
+
+
+def role_of_view(view: str) -> str | None:
+    """The role whose tokens a view averages, all of them for `mean`; None for another view."""
+    kind, _, role = view.partition(":")
+    return (role or ALL) if kind == "mean" else None
+
+
+def _at(rows: Iterable[PatchEffect], place: str, role: str) -> list[PatchEffect]:
+    return [row for row in rows if (row.place, row.role) == (place, role)]
+
+
+def _low(row: PatchEffect) -> float:
+    return -1.0 if row.effect_ci is None else row.effect_ci[0]
+
+
+ALONG = f"{MEAN_DIFFERENCE}:1"
+"""Direction that moves an answer in every token alike, and one that lies in which tokens are marked."""
+_NOT_PATCHED = "was not patched"
+_TIES: dict[TieAtSite, str] = {
+    "read": "is read",
+    "unread": "is unread",
+    "another code": "holds another code than the one that is used",
+    "in part": "carries a part of the effect",
+    "not tested": _NOT_PATCHED,
+}
+
+
+def which_layer(
+    run: RunReader, results: "ProbeResults | None", places: Mapping[str, Places], categories: Sequence[str]
+) -> dict[str, str]:
+    """By category: where the answer passes, where it is read, and whether the probes' best site is read.
+
+    results: the newest probes, None without any. places: as `stored_places` gives them. Of stored interchanges and
+    joint places; what was not tested is named with the command that tests it.
+    """
+    maps, along = stored_site_effects(run), stored_subspace_effects(run)
+    found = {}
+    for name in categories:
+        rows, own = maps.get(name, []), places.get(name)
+        cell = best_cell(rows)
+        parts = [
+            _passes(rows, () if own is None or own.located is None else own.located),
+            _read(run, "" if own is None else str(own)),
+            _best_site(run, results, name, rows, along.get(name, [])),
+        ]
+        if cell is not None and is_backbone_layer(cell):
+            parts.append(f"steer at {cell.place} {cell.role} (--direction {ALONG})")
+        found[name] = f"Which layer, {category_of(name).title}: {'; '.join(filter(None, parts))}."
+    return found
+
+
+def _passes(rows: Sequence[PatchEffect], located: Sequence[str]) -> str:
+    if not any(row.role == ALL and is_backbone_layer(row) for row in rows):
+        return "where the answer passes was not tested (--kind interchange)"
+    passes = [place for place in located if place.partition(".")[0] == BACKBONE]
+    return f"passes at {list_places(passes)}" if passes else "no layer of the backbone carries half of it"
+
+
+def _read(run: RunReader, places: str) -> str:
+    family = get_family(run.model)
+    if family is None or not family.interventions.supports("kv"):
+        return ""
+    read = [part for part in places.split("; ") if part.startswith("read ") or KV_STREAM in part]
+    return "; ".join(read) or "where it is read is open (--kind joint tests it)"
+
+
+def _best_site(
+    run: RunReader,
+    results: "ProbeResults | None",
+    category: str,
+    rows: Sequence[PatchEffect],
+    along: Sequence[PatchEffect],
+) -> str:
+    if results is None:
+        return "no probes (probe-kit train)"
+    view, scores = results.settings.views[0], results.scores
+    own = scores[(scores["stream"] == BACKBONE) & (scores["view"] == view) & (scores["category"] == category)]
+    if own.empty:
+        return ""
+    best = own.loc[own["accuracy"].idxmax()]
+    place = f"{BACKBONE}.{int(best['layer']):02d}"
+    signal = "" if best["signal"] else " (no signal)"
+    return f"the probes' best site {place}{signal} {_in_words(run, place, view, rows, along)}"
+
+
+def _in_words(
+    run: RunReader, place: str, view: str, rows: Sequence[PatchEffect], along: Sequence[PatchEffect]
+) -> str:
+    family, role = get_family(run.model), role_of_view(view)
+    if family is not None and unread_places([place], run.streams, family.interventions):
+        return "is unread: nothing that acts reads the end of the backbone"
+    whole = next((row for row in rows if (row.place, row.role) == (place, role)), None)
+    inside = [row for row in along if (row.place, row.role) == (place, role) and not row.is_control]
+    tie = tie_at_site(whole, inside, [row for row in rows if row.place == place])
+    if tie == "not tested" and whole is not None and whole.is_localised:
+        return "carries the effect; --direction mean-difference tests what probes read there"
+    return _TIES[tie]

@@ -1,0 +1,443 @@
+"""The verdict: does the action use the answer, and where inside does it pass? Loads no model.
+
+`classify_use` alone makes a verdict. Three questions have answers of their own: the behaviour (of the image swap),
+the place (of interchanges) and the tie (is what probes read the thing that is used?).
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from math import inf
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.kinds.image_swap import (
+    SMALLEST_EFFECT_OF_INTEREST,
+    SMALLEST_SHARE_OF_INTEREST,
+    ImageSwapEffect,
+    Swapped,
+    percent,
+)
+from probe_kit.intervene.places import list_places
+from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
+from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.suite.items import Side
+
+if TYPE_CHECKING:
+    from probe_kit.train.results.probe_results import ProbeResults
+
+
+Behaviour = Literal[
+    "used",
+    "partly used, one-sided",
+    "partly used, graded",
+    "moves with it, does not decide",
+    "not used",
+    "inconclusive",
+]
+USES: tuple[Behaviour, ...] = ("used", "partly used, one-sided", "partly used, graded")
+"""Those in which the answer decides something."""
+DECIDES = 0.50
+"""Net follow rate, and share of the reach, from which the answer decides; of the episodes of one side as well."""
+FEW = 0.10
+"""Net follow rate from which single decisions count."""
+TRACE = 0.01
+"""Of the reach. A displacement below it is not worth a sentence."""
+NO_COPY, NOT_TESTED = "no readable copy found", "whether the readable copy is the one used was not tested"
+NOT_LOCATED = "no place that was tried carries half of it"
+_READOUTS: Mapping[str, str] = MappingProxyType(
+    {FIRST_CHUNK: "in the first chunk", PER_STEP: "over the whole episode"}
+)
+UNTESTED = "whether the answer is used was not tested"
+"""What is said without an image swap."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class UseVerdict:
+    """Whether the action uses the answer, where it passes, and whether what probes read is what is used.
+
+    behaviour: of the image swap. reason: the numbers it rests on, or why there is none. reversed: the same, away
+    from the correct picture. side: of a behaviour that is one-sided. place: where interchanges found that the
+    answer passes or is read; empty if none was stored. tie: between the readable copy and the behaviour; empty
+    without probes. readout: `first-chunk` or `per-step`, of all of these. lacks_control: whether *not used* is
+    missing nothing but another category of the run that is used. other: the behaviour by the other readout; None
+    if that is not stored.
+    """
+
+    behaviour: Behaviour
+    reason: str
+    reversed: bool = False
+    side: Side | None = None
+    place: str = ""
+    tie: str = ""
+    readout: str = FIRST_CHUNK
+    lacks_control: bool = False
+    other: "UseVerdict | None" = None
+
+    @property
+    def is_used(self) -> bool:
+        """Whether it decides something, wholly or in part, toward the correct picture or away from it.
+
+        By either readout: what is used in the first chunk is used, and so is what is used later.
+        """
+        return any(one.behaviour in USES for one in self.by_readout)
+
+    @property
+    def by_readout(self) -> "tuple[UseVerdict, ...]":
+        """This one, and the one of the other readout if that is stored; the first chunk comes first."""
+        found = (self,) if self.other is None else (self, self.other)
+        return tuple(sorted(found, key=lambda one: one.readout != FIRST_CHUNK))
+
+    @property
+    def verdict(self) -> str:
+        """The behaviour, its direction and its side; of both readouts where they differ."""
+        first, *second = self.by_readout
+        if not second or first.own_verdict == second[0].own_verdict:
+            return first.own_verdict
+        return f"first chunk {first.own_verdict}; episode {second[0].own_verdict}"
+
+    @property
+    def own_verdict(self) -> str:
+        """The same of its own readout alone."""
+        return f"{'against: ' * self.reversed}{self.behaviour}{f' ({self.side})' if self.side else ''}"
+
+    @property
+    def is_of_first_chunk(self) -> bool:
+        """Whether nothing is known of later chunks."""
+        return self.readout == FIRST_CHUNK and self.other is None
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether the intervals of every stored readout exclude a use that would matter."""
+        return all(one.behaviour == "not used" or one.lacks_control for one in self.by_readout)
+
+    @property
+    def explanation(self) -> str:
+        """Reason, place and tie."""
+        first, *second = self.by_readout
+        reasons = [first.reason, *(f"over the whole episode: {one.reason}" for one in second)]
+        return "; ".join(filter(None, (*reasons, self.place, self.tie)))
+
+    @property
+    def sentence(self) -> str:
+        """Behaviour by every stored readout, place and tie; with the reason where it is not used."""
+        first, *second = self.by_readout
+        if second and first.own_verdict == second[0].own_verdict:
+            both = " and ".join(_READOUTS[one.readout] for one in (first, *second))
+            said = [
+                first.clause("the answer", both),
+                *(f"episode: {one.reason}" for one in second if one.needs_reason),
+            ]
+        else:
+            said = [first.clause("the answer"), *(one.clause("it") for one in second)]
+        found = "; ".join(filter(None, (*said, self.place, self.tie)))
+        return f"{found[0].upper()}{found[1:]}."
+
+    @property
+    def needs_reason(self) -> bool:
+        """Whether a reader asks for its numbers: of what is not used by its own readout."""
+        return self.behaviour not in USES
+
+    def describe(self, swap: Swapped) -> str:
+        """Return what an image swap showed, in sentences."""
+        return f"{describe_swap(swap, self)}. {self.sentence}"
+
+    def clause(self, answer: str, readout: str = "") -> str:
+        """The behaviour by its own readout, with the reason where it is not used.
+
+        answer: how the answer is called. readout: in words; empty for its own.
+        """
+        when = readout or _READOUTS[self.readout]
+        against = ", against the correct picture" * self.reversed
+        side = f" ({self.side})" if self.side else ""
+        words = {
+            "inconclusive": f"whether {answer} is used {when} remains open",
+            "moves with it, does not decide": f"{answer} moves the action {when}{against}, does not decide",
+        }.get(self.behaviour, f"{answer} is {self.behaviour}{side} {when}{against}")
+        return f"{words}: {self.reason}" if self.needs_reason else words
+
+
+def describe_readouts(uses: Iterable[UseVerdict | None]) -> str:
+    """Of which readouts verdicts are, for a legend; empty without a verdict."""
+    stored = {one.readout for use in uses if use is not None for one in use.by_readout}
+    if not stored:
+        return ""
+    if len(stored) == 2:
+        return "verdicts are of the first chunk and of the whole episode, and the sentence says of which"
+    if PER_STEP in stored:
+        return "verdicts are of the whole episode"
+    return "verdicts are of the first chunk; --readout per-step gives those of the whole episode"
+
+
+# -- behaviour -------------------------------------------------------------------------------------------------
+
+
+class _Seen(NamedTuple):
+    """The numbers of an effect toward the correct picture, or of its mirror. ends: of the intervals."""
+
+    p: float
+    follow: float
+    follow_ends: tuple[float, float]
+    share: float
+    share_ends: tuple[float, float]
+    reached: Mapping[Side, float]
+
+    @classmethod
+    def of(cls, found: ImageSwapEffect, mirrored: bool) -> "_Seen":
+        reached: dict[Side, float] = {"left": found.left_reached, "right": found.right_reached}
+        toward = cls(
+            found.follow_p, found.net_follow_rate, found.net_follow_rate_ci, found.reach_share,
+            found.reach_share_ci, reached,
+        )  # fmt: skip
+        if not mirrored:
+            return toward
+        low, high = found.net_follow_rate_ci
+        least, most = found.reach_share_ci
+        return cls(
+            found.reversal_p, -toward.follow, (-high, -low), -toward.share, (-most, -least),
+            {side: -value for side, value in reached.items()},
+        )  # fmt: skip
+
+    @property
+    def only_side(self) -> Side | None:
+        """The side that is reached where the answer lies there, if the other one is not."""
+        left, right = self.reached["left"], self.reached["right"]
+        if max(left, right) < DECIDES or min(left, right) >= SMALLEST_EFFECT_OF_INTEREST:
+            return None
+        return "left" if left > right else "right"
+
+    def behaviour(self) -> Behaviour | None:
+        """What it shows; None if that is nothing."""
+        is_moved = self.share_ends[0] > SMALLEST_SHARE_OF_INTEREST
+        decides = self.follow_ends[0] > 0
+        is_beyond_half = decides or self.share_ends[0] > DECIDES
+        if self.p >= SIGNIFICANCE:
+            return None
+        if is_beyond_half and self.follow >= DECIDES and self.share >= DECIDES:
+            return "used"
+        if is_moved and self.only_side is not None:
+            return "partly used, one-sided"
+        if decides and self.follow >= FEW and self.share_ends[0] > 0:
+            return "partly used, graded"
+        if not is_moved:
+            return None
+        is_bounded = self.follow_ends[1] < SMALLEST_EFFECT_OF_INTEREST
+        return "moves with it, does not decide" if is_bounded else "partly used, graded"
+
+
+def classify_behaviour(found: ImageSwapEffect, control: str | None) -> UseVerdict:
+    """The verdict of the image swap alone.
+
+    control: another category of the run that is used, which shows that use would have been seen; None if there is
+    none, and then nothing is *not used*.
+    """
+    for mirrored in (False, True):
+        seen = _Seen.of(found, mirrored)
+        behaviour = seen.behaviour()
+        if behaviour is not None:
+            side = seen.only_side if behaviour == "partly used, one-sided" else None
+            return UseVerdict(
+                behaviour=behaviour, reason=_measured(found), reversed=mirrored, side=side, readout=found.readout
+            )
+    if not is_bounded(found):
+        return UseVerdict(behaviour="inconclusive", reason=_open(found), readout=found.readout)
+    bound = (
+        f"within {SMALLEST_SHARE_OF_INTEREST} of its reach and {SMALLEST_EFFECT_OF_INTEREST} of the episodes "
+        f"({_measured(found)})"
+    )
+    if control is None:
+        reason = f"{bound}, and no other category of the run is used, so that use is not known to show"
+        return UseVerdict(behaviour="inconclusive", reason=reason, readout=found.readout, lacks_control=True)
+    reason = f"{_trace(found)}{bound}; positive control: {control}"
+    return UseVerdict(behaviour="not used", reason=reason, readout=found.readout)
+
+
+def is_bounded(found: ImageSwapEffect) -> bool:
+    """Whether both intervals exclude, on both sides, what would matter."""
+    (low, high), (least, most) = found.net_follow_rate_ci, found.reach_share_ci
+    flips, share = SMALLEST_EFFECT_OF_INTEREST, SMALLEST_SHARE_OF_INTEREST
+    return -flips < low and high < flips and -share < least and most < share
+
+
+@cache
+def groups_for_not_used() -> int:
+    """The fewest groups of items with which *not used* can be found at all, in episodes that never follow."""
+    for count in range(2, 1000):
+        low, high = group_bootstrap(np.zeros((count, 1)), np.arange(count), 0, bounds=GAINS)
+        if max(-low[0], high[0]) < SMALLEST_EFFECT_OF_INTEREST:
+            return count
+    raise AssertionError("no number of groups bounds the net follow rate")
+
+
+def _measured(found: ImageSwapEffect) -> str:
+    """Displacement and net follow rate with their intervals."""
+    return (
+        f"moved by {found.reach_share:.2f} {_ends(found.reach_share_ci)} of its reach, net follow rate "
+        f"{found.net_follow_rate:.2f} {_ends(found.net_follow_rate_ci)}"
+    )
+
+
+def _open(found: ImageSwapEffect) -> str:
+    """Why it is inconclusive."""
+    is_other = (
+        found.moved_share >= SMALLEST_EFFECT_OF_INTEREST
+        and abs(found.reach_share) < found.moved_share / 2
+        and min(found.follow_p, found.reversal_p) >= SIGNIFICANCE
+    )
+    if is_other:
+        return (
+            f"the images move it by {found.moved_share:.2f} of its reach, the answer by {found.reach_share:.2f} "
+            f"{_ends(found.reach_share_ci)}: it depends on something else in the images, or on the answer in "
+            "opposite directions, or the items are too few"
+        )
+    needed = groups_for_not_used()
+    too_few = f"; “not used” needs {needed} groups of items, there are {found.n_groups}"
+    return f"{_measured(found)}{too_few * (found.n_groups < needed)}"
+
+
+def _trace(found: ImageSwapEffect) -> str:
+    if min(found.follow_p, found.reversal_p) >= SIGNIFICANCE or abs(found.reach_share) <= TRACE:
+        return ""
+    return f"but for a trace of {100 * found.reach_share * found.reach:.1f} cm: "
+
+
+def _ends(limits: tuple[float, float]) -> str:
+    return "[no interval]" if inf in limits else f"[{limits[0]:.2f}, {limits[1]:.2f}]"
+
+
+# -- with what else is stored ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Places:
+    """What was found inside the network, in one category.
+
+    located: places that carry half of the effect, see `localised_sites`; None if an interchange did not search for
+    them. carried: places and the directions along which half of it passes there. jointly: what joint places found,
+    in words; they tell the tokens apart where an interchange has those of a block together, and sets of places.
+    remainder: what of it these places leave out, in words.
+    """
+
+    located: tuple[str, ...] | None = None
+    carried: tuple[str, ...] = ()
+    jointly: str = ""
+    remainder: str = ""
+
+    def __str__(self) -> str:
+        read = [place for place in self.located or () if place.partition(".")[0] == KV_STREAM]
+        names_tokens = any(" " in place for place in read)
+        is_finer = "read jointly" in self.jointly or (not names_tokens and "read" in self.jointly)
+        located = [place for place in self.located or () if not (is_finer and place in read)]
+        jointly = self.jointly if is_finer or not read else ""
+        found = "; ".join(filter(None, (describe_sites(located, self.carried), jointly, self.remainder)))
+        return found or NOT_LOCATED * (self.located is not None)
+
+
+def classify_use(
+    encoded: bool | None,
+    found: ImageSwapEffect,
+    control: str | None,
+    places: Places | None = None,
+    tie: str = "",
+    other: UseVerdict | None = None,
+) -> UseVerdict:
+    """The verdict of the image swap, with what probes and interventions inside the network say of it.
+
+    encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
+    without probes. control: see `classify_behaviour`. places: None if nothing was tried inside. tie: see
+    `results.ties.describe_tie`; empty if it was not tested. other: the behaviour by the other readout, see
+    `results.readouts`; None if that is not stored.
+    """
+    own = replace(classify_behaviour(found, control), other=other)
+    if all(one.behaviour in ("not used", "inconclusive") for one in own.by_readout):
+        return own
+    said = "" if encoded is None else tie or (NOT_TESTED if encoded else NO_COPY)
+    return replace(own, place=str(places or ""), tie=said)
+
+
+def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
+    """Where the answer passes, of keys and values that the acting stream reads where it is read, and along what.
+
+    A patch in the backbone shows that something downstream depends on that place; one in `kv`, which only the
+    acting stream reads, that it is read there.
+    """
+    read = [place for place in located if place.partition(".")[0] == KV_STREAM]
+    passes = [place for place in located if place not in read]
+    parts = [f"passes at {list_places(passes)}"] * bool(passes) + [f"read at {list_places(read)}"] * bool(read)
+    along: dict[str, list[str]] = {}
+    for one in carried:
+        direction, _, place = one.partition(" at ")
+        along.setdefault(direction, []).append(place)
+    directions = [f"{direction} at {list_places(places)}" for direction, places in along.items()]
+    parts += [f"carried by {'; '.join(directions)}"] * bool(carried)
+    return "; ".join(parts)
+
+
+def control_for(category: str, found: Mapping[str, ImageSwapEffect]) -> str | None:
+    """Another category of the run that is used, the one in which most episodes follow; None if there is none."""
+    others = [one for one in found.values() if one.category != category and classify_behaviour(one, None).is_used]
+    return max(others, key=lambda one: abs(one.net_follow_rate)).category if others else None
+
+
+def classify_all(
+    found: Mapping[str, ImageSwapEffect],
+    encoded: Mapping[str, bool | None],
+    places: Mapping[str, Places] = MappingProxyType({}),
+    ties: Mapping[str, str] = MappingProxyType({}),
+    others: Mapping[str, UseVerdict] = MappingProxyType({}),
+) -> dict[str, UseVerdict]:
+    """Of every category that was intervened on.
+
+    encoded, places, ties, others: by category; one that is not there was not probed, not looked for inside, or
+    measured by one readout alone.
+    """
+    return {
+        name: classify_use(
+            encoded.get(name),
+            one,
+            control_for(name, found),
+            places.get(name),
+            ties.get(name, ""),
+            others.get(name),
+        )
+        for name, one in found.items()
+    }
+
+
+def encoded_in(results: "ProbeResults | None", view: str | None = None) -> dict[str, bool | None]:
+    """By category, whether the backbone's best site beats chance and every control that was run.
+
+    As `retention` has it. view: None for the first that was probed. Empty without probes.
+    """
+    if results is None:
+        return {}
+    scores = results.scores
+    own = scores[(scores["stream"] == "backbone") & (scores["view"] == (view or results.settings.views[0]))]
+    best = own.loc[own.groupby("category", sort=False)["accuracy"].idxmax()]
+    return {str(row["category"]): bool(row["signal"]) for _, row in best.iterrows()}
+
+
+def describe_swap(swap: Swapped, use: UseVerdict) -> str:
+    """What a swap of the pictures does to the action, with the numbers that the verdict's sentence lacks.
+
+    Numbers and words are of the verdict's own readout.
+    """
+    use = replace(use, other=None)
+    low, high = (percent(limit) for limit in swap.net_follow_rate_ci or (None, None))
+    followed, net = f"in {percent(swap.follow_rate)} % of episodes", f"net of reversals {low} to {high} %"
+    moved = "" if swap.reach_share is None else f", moved by {swap.reach_share:.2f} of its reach"
+    if use.behaviour == "used" and not use.reversed:
+        return f"the action follows a swap of the pictures {followed} ({net})"
+    if use.behaviour == "used":
+        against = f"in {percent(swap.reversal_rate)} % of episodes"
+        return f"the action goes against the pictures, swapped or not, {against}"
+    if use.is_bounded:
+        return f"the action does not follow a swap of the pictures ({followed})"
+    if use.behaviour == "inconclusive":
+        return f"whether the action follows a swap of the pictures is open ({followed})"
+    numbers = f"{followed}, {net}{moved}" if use.is_used else followed
+    return f"the action follows a swap of the pictures in part ({numbers})"

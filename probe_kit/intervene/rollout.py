@@ -1,0 +1,190 @@
+"""Playing episodes again, step by step: with an edit at every inference, or along the unedited episode.
+
+Per-step readout is teacher-forced. Where one inference is one action in greedy bins, the first one says little of
+where the hand will go. There every condition is evaluated at every state of the unedited episode, and the lateral
+displacements of its actions are summed.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from math import nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import CaptureChangedActionError, NoTrajectoryError
+from probe_kit.extract.rollout.executed_actions import executed_actions
+from probe_kit.extract.rollout.stage import Answer, Ending
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.capturing.edit_engine import EditLog
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.protocol import PLAIN
+from probe_kit.intervene.pairs import Chunk, Pair
+from probe_kit.intervene.replay import AttentionRecord, Condition, ConditionContext, ReplayBatch
+from probe_kit.intervene.sessions.scene import SceneSession
+from probe_kit.intervene.sessions.session import ReplaySession
+
+
+@dataclass(frozen=True)
+class RolloutResult:
+    """One episode to its end. outcome: correct, wrong or oob. frames: (T + 1, C) as in `env.trajectory`."""
+
+    outcome: str
+    cube: tuple[float, float]
+    frames: NDArray[np.float32]
+    edit_log: EditLog
+
+
+def play_episodes(session: ReplaySession, pairs: Sequence[Pair], conditions: Sequence[Condition]) -> ReplayBatch:
+    """Play every episode under every condition; the first one changes nothing and repeats the run.
+
+    `max_action_change` is the largest difference of any number of the trajectory from the first condition's,
+    `replay_error` that of the first condition's from the stored one's. Raises CaptureChangedActionError if an
+    outcome is not the stored one.
+    """
+    scene = _scene_of(session)
+    outcomes = np.zeros((len(conditions), len(pairs)), "U7")
+    batch = replace(ReplayBatch.empty(pairs, conditions), episode_outcomes=outcomes)
+    for column, pair in enumerate(pairs):
+        clean = roll_out(scene, pair, conditions[0], swapping=False)
+        batch.replay_error[column] = apart_from_stored(scene, pair, clean)
+        for number, condition in enumerate(conditions):
+            played = roll_out(scene, pair, condition) if number else clean
+            batch.displacement[number, column] = scene.lateral_offset(np.array(played.cube))
+            batch.max_action_change[number, column] = _largest(played.frames, clean.frames)
+            batch.edit_log[number, column] = played.edit_log.row()
+            outcomes[number, column] = played.outcome
+    return batch
+
+
+def roll_out(session: SceneSession, pair: Pair, condition: Condition, swapping: bool = True) -> RolloutResult:
+    """Play one episode under a condition that is in force at every inference.
+
+    swapping: whether the condition looks at swapped images; they are then drawn at every inference.
+    """
+    edit_logs: list[EditLog] = []
+
+    def act(here: Pair, past: Sequence[Chunk]) -> Chunk:
+        del past
+        played = condition.play(ConditionContext(session, here))
+        edit_logs.extend([] if played.edit_log is None else [played.edit_log])
+        return played.chunk
+
+    return replace(_step_through(session, pair, act, swapping), edit_log=EditLog.sum(edit_logs))
+
+
+def evaluate_per_step(
+    session: ReplaySession, pairs: Sequence[Pair], conditions: Sequence[Condition]
+) -> ReplayBatch:
+    """Evaluate every condition along every episode; the first one, which edits nothing, is executed.
+
+    `displacement` is where the hand began plus what the actions of all calls would add laterally, in metres from
+    the middle, left positive. Raises CaptureChangedActionError if an outcome is not the stored one.
+    """
+    scene = _scene_of(session)
+    batch = ReplayBatch.empty(pairs, conditions)
+    attention_records: list[AttentionRecord] = []
+    for column, pair in enumerate(pairs):
+        _evaluate(scene, pair, conditions, batch, column, attention_records)
+    return batch.with_mass(attention_records)
+
+
+def _evaluate(
+    session: SceneSession,
+    pair: Pair,
+    conditions: Sequence[Condition],
+    batch: ReplayBatch,
+    column: int,
+    attention_records: list[AttentionRecord],
+) -> None:
+    """Fill one column of a batch."""
+    edit_logs: list[list[EditLog]] = [[] for _ in conditions]
+    start = _offset(session, pair.clean)
+    batch.displacement[:, column] = start
+
+    def act(here: Pair, past: Sequence[Chunk]) -> Chunk:
+        context = ConditionContext(session, here)
+        clean = conditions[0].play(context)
+        for number, condition in enumerate(conditions):
+            played = condition.play(context) if number else clean
+            actions = executed(session, [*past, played.chunk])
+            batch.displacement[number, column] += session.displacement(actions, here) - _offset(
+                session, here.clean
+            )
+            change = float(np.abs(played.chunk - clean.chunk).max())
+            batch.max_action_change[number, column] = max(batch.max_action_change[number, column], change)
+            edit_logs[number] += [] if played.edit_log is None else [played.edit_log]
+            attention_records.extend([] if played.mass is None else [(here.row, here.step, played.mass)])
+        return clean.chunk
+
+    batch.replay_error[column] = apart_from_stored(session, pair, _step_through(session, pair, act, True))
+    batch.edit_log[:, column] = [EditLog.sum(logs).row() for logs in edit_logs]
+
+
+def _step_through(
+    session: SceneSession, pair: Pair, act: Callable[[Pair, Sequence[Chunk]], Chunk], swapping: bool
+) -> RolloutResult:
+    """Play one episode with the chunks that `act` gives for every inference's pair and the chunks before."""
+    stage, planned = session.stage, session.planned(pair)
+    answer: Answer = stage.begin(planned, False)
+    past: list[Chunk] = []
+    for call in count():
+        assert isinstance(answer, Observation)
+        other = stage.look_swapped().observation if swapping else answer
+        seed = derive_seed(planned.policy_seed, "inference", call)
+        here = replace(pair, clean=answer, source=other, seed=seed, tiles=stage.tile_masks(), step=call)
+        past.append(act(here, past))
+        answer = stage.advance(executed(session, past))
+        if isinstance(answer, Ending):
+            break
+    assert isinstance(answer, Ending)
+    assert answer.trajectory is not None
+    outcome = answer.outcome
+    cube = float(outcome["cube_x"]), float(outcome["cube_y"])
+    return RolloutResult(str(outcome["outcome"]), cube, answer.trajectory, EditLog())
+
+
+def _scene_of(session: ReplaySession) -> SceneSession:
+    assert isinstance(session, SceneSession), "only the scene is played again; other runs are refused before"
+    return session
+
+
+def _offset(session: SceneSession, observation: object) -> float:
+    assert isinstance(observation, Observation)
+    return session.lateral_offset(observation.state[:2].astype(np.float64))
+
+
+def executed(session: SceneSession, past: Sequence[Chunk]) -> Chunk:
+    """Return the executed actions: the head of the newest chunk, or one averaged over all chunks."""
+    settings, exponent = session.run.settings, session.policy.card.ensemble
+    return executed_actions(past, int(settings["execute"]), exponent, settings.get("rotation", PLAIN))
+
+
+def apart_from_stored(session: SceneSession, pair: Pair, clean: RolloutResult) -> float:
+    """Return by how much the episode differs from the stored one; NaN where the run keeps no trajectory.
+
+    Raises CaptureChangedActionError for another outcome.
+    """
+    stored = str(session.run.episodes.iloc[pair.row]["outcome"])
+    if stored != clean.outcome:
+        raise CaptureChangedActionError(
+            f"{pair.episode}, played again with nothing changed, ended {clean.outcome}; the run has "
+            f"{stored}. A closed loop is compared with the run's own outcomes, so that all must repeat: extract "
+            "with --batch 1 on this machine (larger batches and other devices round otherwise), then intervene on "
+            "that run"
+        )
+    try:
+        frames = session.run.trajectory(pair.row).frames
+    except NoTrajectoryError:
+        return nan
+    return _largest(clean.frames, frames)
+
+
+def _largest(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+    """Return the largest difference over the frames that both have; 0 only if they are the same bit for bit."""
+    if np.array_equal(one, other, equal_nan=True):
+        return 0.0
+    both = min(len(one), len(other))
+    apart = np.abs(one[:both].astype(np.float64) - other[:both])
+    return max(float(np.nanmax(apart)), float(np.finfo(np.float32).tiny))

@@ -1,0 +1,144 @@
+"""`probe-kit run list`: the runs below a folder, a line each."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from probe_kit._terminal.console import out, print_json
+from probe_kit._terminal.options import AsJson, Partial, RunFolder
+from probe_kit._terminal.plain_text import terminal_safe
+from probe_kit.errors import UsageError
+
+if TYPE_CHECKING:
+    from probe_kit.runs import Run
+
+
+_COLUMNS = ("run", "model", "suite", "episodes", "correct %", "probes", "interventions")
+
+
+def list_runs(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A folder that holds runs, at any depth.")],
+    as_json: AsJson = False,
+) -> None:
+    """List the runs below a folder: model, suite, episodes, and how many probes and interventions each has.
+
+    `probe-kit view FOLDER` opens them all. A run that cannot be read is named with the reason.
+    """
+    from probe_kit.errors import ProbeKitError
+    from probe_kit.runs import open_run
+    from probe_kit.runs.run_folders import find_runs
+
+    lines: list[dict[str, Any]] = []
+    for path in find_runs(folder):
+        name = "." if path == folder else str(path.relative_to(folder))
+        try:
+            lines.append({"run": name, **_facts(open_run(path, allow_partial=True))})
+        except ProbeKitError as error:
+            lines.append({"run": name, "error": f"{type(error).__name__}: {error}"})
+    if as_json:
+        print_json(lines)
+        return
+    _print(lines)
+
+
+def _facts(run: "Run") -> dict[str, Any]:
+    from probe_kit.intervene.results.inventory import listed_interventions
+    from probe_kit.train.results.inventory import inventory
+
+    outcomes = run.episodes.get("outcome")
+    judged = outcomes is not None and len(outcomes) > 0 and set(outcomes) <= {"correct", "wrong", "oob"}
+    return {
+        "model": run.label,
+        "suite": run.suite,
+        "episodes": len(run.episodes),
+        "correct": float((outcomes == "correct").mean()) if judged and outcomes is not None else None,
+        "probes": len(inventory(run).probes),
+        "interventions": len(listed_interventions(run)),
+    }
+
+
+def _print(lines: list[dict[str, Any]]) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False)
+    for column in _COLUMNS:
+        table.add_column(column, overflow="fold", justify="left" if column in _COLUMNS[:3] else "right")
+    for line in lines:
+        if "error" in line:
+            continue
+        correct = "–" if line["correct"] is None else f"{100 * line['correct']:.0f}"
+        cells = (
+            line["run"],
+            line["model"],
+            line["suite"],
+            line["episodes"],
+            correct,
+            line["probes"],
+            line["interventions"],
+        )
+        table.add_row(*(Text(terminal_safe(str(cell))) for cell in cells))
+    out.print(table)
+    for line in lines:
+        if "error" in line:
+            out.print(Text(terminal_safe(f"{line['run']} cannot be read: {line['error']}"), style="yellow"))
+
+
+def show(
+    run: RunFolder,
+    label: Annotated[
+        str | None,
+        typer.Option(
+            "--label",
+            metavar="TEXT",
+            help="First give the run this label, as tables and figures name it. Numbers, hashes and probes stay "
+            "as they are.",
+        ),
+    ] = None,
+    action_errors: Annotated[
+        bool,
+        typer.Option(
+            "--action-errors",
+            help="Of a run on recordings: compare the actions that the model predicted with the recorded ones.",
+        ),
+    ] = False,
+    partial: Partial = False,
+    as_json: AsJson = False,
+) -> None:
+    """List the episodes, streams, probes and interventions of a run; the last two by key.
+
+    With --action-errors, errors are in standard deviations of the recorded actions at the shown frames: the mean
+    recorded action has an error of 1. `--json` prints every episode too; `probe-kit labels RUN` writes the
+    error of every frame. An unfinished run needs --partial for it.
+    """
+    from probe_kit.extract.source_commands.action_error_table import show_action_errors
+    from probe_kit.intervene.results.inventory import listed_interventions, unfinished_interventions
+    from probe_kit.runs import label_run, open_run
+    from probe_kit.train.commands import facts_table
+    from probe_kit.train.results.inventory import inventory
+
+    if partial and not action_errors:
+        raise UsageError("--partial is for --action-errors; `run show` lists unfinished runs too. Leave it out")
+    if label is not None:
+        label_run(run, label)
+    if action_errors:
+        show_action_errors(run, partial, as_json)
+        return
+    opened = open_run(run, allow_partial=True)
+    found, interventions = inventory(opened), listed_interventions(opened)
+    unfinished = unfinished_interventions(opened.location)
+    if as_json:
+        listed = [asdict(one) for one in interventions]
+        print_json({**asdict(found), "interventions": listed, "unfinished_interventions": unfinished})
+        return
+    further = {f"intervention {one.key}": one.words for one in interventions}
+    further |= {
+        f"unfinished {key}": f"an intervention, {items} items so far; the same `probe-kit intervene` continues it"
+        for key, items in unfinished.items()
+    }
+    out.print(facts_table(found, further))
+    if not found.probes:
+        step = f"`probe-kit train {found.run}` fits them" if found.streams else "a policy without streams has none"
+        out.print(f"no probes: {step}", soft_wrap=True)

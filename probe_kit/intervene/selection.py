@@ -1,0 +1,123 @@
+"""Which of a run's stored interventions is preferred: by what each is about, never by when it was made.
+
+Another map, role, direction, coefficient, or a try on fewer episodes replaces nothing. Conditions that were played
+on the same episodes are pooled, whichever intervention they came with. Reads what is stored; needs no model.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from probe_kit.intervene.outcomes import (
+    CLEAN,
+    IMAGE_SWAP,
+    UNCHANGED,
+    ConditionOutcomes,
+    StoredIntervention,
+    stored_interventions,
+)
+from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
+from probe_kit.train.data.run_reader import RunReader
+
+Rank = tuple[bool, int, bool]
+
+
+@dataclass(frozen=True)
+class StoredResult:
+    """What one stored intervention says of one category. answers: of its episodes alone.
+
+    own_readout: whether it was read as its family says it should be. misread: whether it was not, and the family
+    is one whose first inference says little (`per-step`).
+    """
+
+    stored: StoredIntervention
+    category: str
+    outcomes: ConditionOutcomes
+    own_readout: bool
+    wrong_readout: bool
+
+    @classmethod
+    def all_of(cls, stored: StoredIntervention) -> "list[StoredResult]":
+        """One per category. Raises RunDamagedError if it was changed."""
+        readout = stored.settings.get("readout", FIRST_CHUNK)
+        family = stored.certificate().get("supported", {}).get("readout", FIRST_CHUNK)
+        return [
+            cls(stored, category, outcomes, readout == family, family == PER_STEP != readout)
+            for category, outcomes in stored.outcomes().by_category()
+        ]
+
+    @property
+    def readout(self) -> str:
+        """`first-chunk` or `per-step`."""
+        return str(self.stored.settings.get("readout", FIRST_CHUNK))
+
+    @property
+    def rank(self) -> Rank:
+        """The larger, the more it says: rightly read, then of more episodes."""
+        return not self.wrong_readout, self.outcomes.episodes.size, self.own_readout
+
+    @property
+    def made(self) -> tuple[str, str]:
+        """When; decides between what says as much."""
+        return self.stored.created, self.stored.key
+
+
+def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
+    """By category as the run has them; of each what says most last, and of what says as much the newest.
+
+    Raises RunDamagedError.
+    """
+    order = {name: at for at, name in enumerate(dict.fromkeys(run.episodes["category"].astype(str)))}
+    every = [own for stored in stored_interventions(run, kind) for own in StoredResult.all_of(stored)]
+    return sorted(every, key=lambda own: (order.get(own.category, len(order)), own.category, own.rank, own.made))
+
+
+def preferred_by_category(run: RunReader, kind: str, readout: str | None = None) -> dict[str, StoredResult]:
+    """By category, of all that is stored of a kind the one that says most. Raises RunDamagedError.
+
+    readout: of those alone; None for any.
+    """
+    found = stored_results(run, kind)
+    return {own.category: own for own in found if readout in (None, own.readout)}
+
+
+@dataclass(frozen=True)
+class PooledConditions:
+    """Conditions that several interventions played on the same episodes of one category.
+
+    like: one of them. sources: by condition, of whom it is; without those in which nothing was changed.
+    """
+
+    like: StoredResult
+    sources: dict[str, StoredResult]
+
+    def outcomes(self, conditions: Sequence[str]) -> ConditionOutcomes:
+        """Some of the conditions, in the order that is asked for, behind what was unchanged."""
+        base = self.like.outcomes
+        unchanged = [name for name in (CLEAN, IMAGE_SWAP) if name in base.conditions]
+        every = [(base, name) for name in unchanged] + [(self.sources[own].outcomes, own) for own in conditions]
+        rows = [(own, own.conditions.index(name)) for own, name in every]
+        return replace(
+            base,
+            conditions=tuple(name for _, name in every),
+            displacement=np.stack([own.displacement[row] for own, row in rows]),
+            max_action_change=np.stack([own.max_action_change[row] for own, row in rows]),
+            edit_log=np.stack([own.edit_log[row] for own, row in rows]),
+        )
+
+
+def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()) -> list[PooledConditions]:
+    """What was played on the same episodes, with the same actions where nothing was changed, together.
+
+    results: as `stored_results` orders them. setting: names of settings in which they must agree as well.
+    """
+    found: dict[tuple[object, ...], PooledConditions] = {}
+    for own in results:
+        outcomes = own.outcomes
+        agreed = tuple(str(own.stored.settings.get(name)) for name in ("readout", *setting))
+        unchanged = [outcomes.of(name).tobytes() for name in (CLEAN, IMAGE_SWAP) if name in outcomes.conditions]
+        same = (own.category, *agreed, tuple(outcomes.episodes.tolist()), *unchanged)
+        sources = found.setdefault(same, PooledConditions(own, {})).sources
+        sources.update({name: own for name in outcomes.conditions if name not in UNCHANGED})
+    return list(found.values())

@@ -1,0 +1,1 @@
+"""Sessions: a run's model and observations, set up again."""

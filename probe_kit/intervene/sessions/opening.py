@@ -1,0 +1,46 @@
+"""Opening the session of a run, and the pairs of one category."""
+
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.sessions.scene import SceneSession
+from probe_kit.intervene.sessions.session import (
+    LoadPolicy,
+    ReplaySession,
+    ReplaySource,
+    check_policy,
+    load_policy_of,
+)
+from probe_kit.intervene.settings import items_of
+from probe_kit.runs.run import Run
+
+
+def open_session(run: Run, source: ReplaySource, load: LoadPolicy | None = None) -> ReplaySession:
+    """Load the run's policy and set up its observations.
+
+    load: how the policy is found, if not by its name. Raises SettingsMismatchError if it is another one,
+    SuiteError for another suite, SuiteNotFoundError for one that is neither given nor can be drawn again,
+    SceneError for a scene that needs a file which is not given.
+    """
+    session = SceneSession.of(run, source, lambda: (load or load_policy_of)(run, source))
+    try:
+        check_policy(run, session.policy)
+    except BaseException:
+        session.close()
+        raise
+    return session
+
+
+def find_pairs(session: ReplaySession, category: str, items: int | None = None) -> list[Pair]:
+    """Return the inferences of a category's episodes in a run, each paired with its source's.
+
+    In the scene these are first inferences, and those before swapped images; the metric that fits is
+    `session.lateral_displacement`: metres, left positive. items: how many items, both layouts of each; None for
+    all. Every clean inference is repeated and compared with the action that the run executed. Raises
+    UnknownCategoryError for a category that the run does not have, OtherFramesError and CaptureChangedActionError
+    for pictures or actions that are not those of the run.
+    """
+    pairs = []
+    for item in items_of(session.run, (category,), items):
+        for pair in session.pairs(item):
+            session.replay_error(pair, session.act(pair.clean, pair.seed))
+            pairs.append(pair)
+    return pairs

@@ -1,0 +1,98 @@
+"""The settings of an intervention, and the key under which its results are stored. Needs no model."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Protocol
+
+from probe_kit.errors import UnknownCategoryError, UsageError
+from probe_kit.hashing import sha256_json
+from probe_kit.hooks.contract.interventions import Readout
+from probe_kit.runs.run import Run
+from probe_kit.runs.scene_only import check_scene_run
+
+FORMAT = 2  # raise when stored numbers would be others
+FIRST_CHUNK: Readout = "first-chunk"
+PER_STEP: Readout = "per-step"
+
+
+class Asked(Protocol):
+    """The settings of an intervention, of whichever kind; see `kinds.base.Intervention`."""
+
+    kind: ClassVar[str]
+
+    @property
+    def categories(self) -> tuple[str, ...] | None:
+        """Of the run; None for all."""
+
+    @property
+    def items(self) -> int | None:
+        """So many of each category, the first ones; None for all."""
+
+    @property
+    def readout(self) -> Readout:
+        """The part of the policy's answer that is read."""
+
+    def parameters(self) -> dict[str, Any]:
+        """All else that decides its numbers, as plain JSON."""
+
+
+def categories_in(run: Run, categories: Sequence[str] | None) -> tuple[str, ...]:
+    """Return some categories, by default all of a run. Raises UnknownCategoryError for one that it lacks."""
+    known = list(dict.fromkeys(run.episodes["category"].astype(str)))
+    for category in categories or ():
+        if category not in known:
+            raise UnknownCategoryError(f"{run.location} has no category {category!r}; it has: {', '.join(known)}")
+    return tuple(categories or known)
+
+
+def items_of(run: Run, categories: Sequence[str] | None, items: int | None) -> list[str]:
+    """Return the items that are replayed, category by category. Raises UsageError if there is none."""
+    if items is not None and items < 1:
+        raise UsageError(f"items is {items}; expected at least 1")
+    episodes, chosen = run.episodes, list[str]()
+    for category in categories_in(run, categories):
+        names = episodes.loc[episodes["category"] == category, "item_id"].astype(str)
+        chosen += list(dict.fromkeys(names))[:items]
+    if not chosen:
+        raise UsageError(f"{run.location} has no episode yet; extract some first")
+    return chosen
+
+
+def settings_of(intervention: Asked, run: Run) -> dict[str, Any]:
+    """Return everything that decides the numbers, as plain JSON; its hash is the key."""
+    return {
+        "format": FORMAT,
+        "kind": intervention.kind,
+        "run_settings": run.settings_sha256,
+        "stamp": run.stamp,
+        "weights": run.weights_sha256,
+        "wording": run.wording,
+        "categories": list(categories_in(run, intervention.categories)),
+        "items": intervention.items,
+        "readout": intervention.readout,
+        **intervention.parameters(),
+    }
+
+
+def key_of(settings: Mapping[str, Any]) -> str:
+    """First 12 hex digits of the settings' sha256: the name of the results' folder."""
+    return sha256_json(settings)[:12]
+
+
+def check_run_fits(run: Run) -> None:
+    """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
+    check_scene_run(run, "an intervention")
+    settings = run.settings
+    why = None
+    if "ask" in settings:
+        why = f"{run.model} was asked and did not act; intervene on a run of `probe-kit extract`"
+    elif run.weights_sha256 is None or not run.streams:
+        why = f"{run.model} is scripted: it has no network in which anything could be changed"
+    elif run.capture_only:
+        why = (
+            f"{run.model} only captured activations (--no-act): no action was stored with which the effect of a "
+            "change could be compared. Extract a run without --no-act, of a checkpoint whose actions move this arm"
+        )
+    elif settings.get("edits"):
+        why = "its streams were edited already, and the stored run does not hold the vectors"
+    if why is not None:
+        raise UsageError(f"{run.location}: {why}")

@@ -1,1 +1,0 @@
-"""Stored interventions: settings, answers, selection."""

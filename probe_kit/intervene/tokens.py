@@ -1,0 +1,134 @@
+"""Which tokens play a role in one inference; tiles are roles of a pair's picture.
+
+Halves of the picture are not tiles: the camera looks from aside. The renderer says where a tile is seen. The
+policy itself says which patches see it, by its own crop and resize: the embeddings that change when just those
+pixels do, before any patch looks at another.
+"""
+
+from collections.abc import Mapping, MutableMapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import EmptyRoleError, UsageError
+from probe_kit.hooks.capturing.token_edits import TokenSelection
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.intervene.pairs import Given, Pair
+from probe_kit.intervene.places import ALL, TILE_ROLES, positions_of
+from probe_kit.suite.items import Side
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Model, Policy, Roles
+
+TILES: Mapping[str, Side] = dict(zip(TILE_ROLES, ("left", "right"), strict=True))
+"""Roles by tile, and the tile."""
+ENOUGH = 0.1
+"""Share of the largest change of any patch by which a patch of the tile changes; less is the filter's blur."""
+ANSWERS_NOTHING = "{} answers no questions: give it an observation"
+
+
+def roles_of_tokens(model: "Model", given: Given) -> "dict[str, Roles]":
+    """Return by stream the roles of its tokens in one inference, those of `kv` among them."""
+    from probe_kit.hooks import AnswerModel
+
+    if isinstance(given, Observation):
+        rows = model.token_roles([given])
+    elif isinstance(model, AnswerModel):
+        rows = model.asked_roles([given])
+    else:
+        raise UsageError(ANSWERS_NOTHING.format(model.card.family))
+    return {name: roles[0] for name, roles in rows.items()}
+
+
+def mask_of(roles: "Roles", stream: str, role: str) -> NDArray[np.bool_]:
+    """Return (T,) the tokens that play `role`, or are at positions such as `7-11`; EmptyRoleError if none does."""
+    if (positions := positions_of(role)) is not None:
+        first, last = positions
+        if not first <= last < len(roles):
+            raise EmptyRoleError(f"{stream} has no positions {role}; it has 0 to {len(roles) - 1}")
+        return (first <= np.arange(len(roles))) & (np.arange(len(roles)) <= last)
+    mask = roles.valid if role == ALL else roles.mask(role)
+    if not mask.any():
+        names = ", ".join(dict.fromkeys(span.role for span in roles.spans))
+        raise EmptyRoleError(f"no token of {stream} has the role {role!r}; there are {names}")
+    return np.asarray(mask, bool)
+
+
+def token_mask(model: "Model", given: Given, stream: str, role: str) -> NDArray[np.bool_]:
+    """Return (T,) the tokens of a stream that play `role`. Raises EmptyRoleError if none does."""
+    return mask_of(roles_of_tokens(model, given)[stream], stream, role)
+
+
+def role_token_mask(
+    model: "Model", pair: Pair, stream: str, role: str, memo: MutableMapping[Any, Any]
+) -> NDArray[np.bool_]:
+    """Return (T,) the tokens of a stream that play `role` in a pair's clean inference, tiles among the roles.
+
+    memo: of this pair. A family's own role of that name, a camera called left, comes before the tile. Raises
+    EmptyRoleError if no token plays it, UnsupportedInterventionError for a family that does not say which token
+    sees what.
+    """
+    declared = model.role_names.get(model.tokens_of(stream), ())
+    if role not in TILES or role in declared or not pair.tiles:
+        if (stream, role) not in memo:
+            if "roles" not in memo:
+                memo["roles"] = roles_of_tokens(model, pair.clean)
+            memo[stream, role] = mask_of(memo["roles"][stream], stream, role)
+        return np.asarray(memo[stream, role])
+    policy: Policy = model  # type: ignore[assignment]  # only observations have tiles
+    assert isinstance(pair.clean, Observation)
+    policy.interventions.check("tiles", policy.card.family)
+    images = token_mask(policy, pair.clean, stream, f"image.{policy.card.cameras[0]}")
+    if role not in memo:
+        if "patches" not in memo:
+            memo["patches"] = patch_embeddings(policy, pair.clean)
+        memo[role] = tokens_overlapping(policy, pair.clean, pair.tiles[TILES[role]], memo["patches"])
+    mask = np.zeros_like(images)
+    mask[np.flatnonzero(images)[memo[role]]] = True
+    if not mask.any():
+        raise EmptyRoleError(f"no patch of {pair.episode} sees the {TILES[role]} tile")
+    return mask
+
+
+def role_tokens(
+    model: "Model", pair: Pair, stream: str, role: str, memo: MutableMapping[Any, Any]
+) -> TokenSelection:
+    """Return where the tokens of `role_token_mask` are; computed once per pair."""
+    name = stream, role, "tokens"
+    if name not in memo:
+        memo[name] = TokenSelection.of(role_token_mask(model, pair, stream, role, memo), model.card.device)
+    tokens: TokenSelection = memo[name]
+    return tokens
+
+
+def tokens_overlapping(
+    policy: "Policy", seen: Observation, pixels: NDArray[np.bool_], before: NDArray[np.float32] | None = None
+) -> NDArray[np.bool_]:
+    """Return (tokens of the picture,) which of them come of patches that see any of some pixels (H, W).
+
+    before: what `patch_embeddings` gives of `seen`, if it is known.
+    """
+    if not pixels.any():
+        return np.zeros(int(policy.patch_order().max()) + 1, bool)
+    # Every pixel changes by at least half of what it can.
+    turned = np.where(pixels[..., None], np.where(seen.image < 128, 255, 0), seen.image).astype(np.uint8)
+    before = patch_embeddings(policy, seen) if before is None else before
+    after = patch_embeddings(policy, replace(seen, image=turned))
+    moved = np.linalg.norm(after - before, axis=-1)
+    order = policy.patch_order()
+    overlapping = np.zeros(int(order.max()) + 1, bool)
+    overlapping[order[(moved > ENOUGH * moved.max()) & (order >= 0)]] = True
+    return overlapping
+
+
+def patch_embeddings(policy: "Policy", seen: Observation) -> NDArray[np.float32]:
+    """Return (V, D) the first camera's patches as they enter the first block of the vision tower."""
+    from probe_kit.hooks import capture
+
+    site = policy.every_stream()["vision"].sites()[0]
+    with capture(policy, [site]) as tape:
+        policy.act([seen], [0])
+    embeddings: NDArray[np.float32] = tape[site][0].float().cpu().numpy()
+    return embeddings

@@ -1,1 +1,0 @@
-"""A kind of intervention of its own, as a contributor would add it: the images with less contrast."""
