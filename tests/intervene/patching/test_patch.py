@@ -140,7 +140,7 @@ def test_cells_are_named_in_order_and_once(pi0_tiny: Pi0) -> None:
     ("pattern", "error", "said"),
     [
         ("backbone.02|state", UsageError, "no token of backbone has the role 'state'; expected one of all, image"),
-        ("backbone.02|image.left", UsageError, "no token of backbone has the role 'image.left'"),
+        ("backbone.02|image.top", UsageError, "no token of backbone has the role 'image.top'"),
         ("backbone.99|image", UnknownSiteError, r"backbone\.99 is no place"),
         ("", UnknownSiteError, "names no place"),
     ],
