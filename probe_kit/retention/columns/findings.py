@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Sequence
 
 from probe_kit._tables.numbers import whole
-from probe_kit.intervene.kinds.image_swap.verdict import USES, UseVerdict
+from probe_kit.intervene.results.verdict import USES, UseVerdict
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.sentences import is_probed, knows
 from probe_kit.retention.columns.text import is_vlm

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from probe_kit.intervene.kinds.image_swap.verdict import UseVerdict
+from probe_kit.intervene.results.verdict import UseVerdict
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.findings import MOST_NUMBERS, MOST_WORDS, count_words, finding, next_step
 from probe_kit.retention.rows.parts import ActionPart, BackbonePart, SwapEffect
