@@ -13,13 +13,15 @@ PAGE = "commands.md"
 _PLACE = re.compile(r"^<!-- options of: (?P<path>[a-z -]+) -->$", re.MULTILINE)
 
 _KINDS = "<!-- kinds of intervention -->"
+_OF_FILE = re.compile(r"<!-- of the file alone -->\n.*?<!-- end of it -->\n+", re.DOTALL)
+"""What a reader of the file needs to know, and the built page does not say."""
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Called by mkdocs for every page. Raises KeyError for a command that does not exist."""
     if page.file.src_uri != PAGE:
         return markdown
-    markdown = markdown.replace(_KINDS, kinds_markdown())
+    markdown = _OF_FILE.sub("", markdown).replace(_KINDS, kinds_markdown())
     return _PLACE.sub(lambda place: command_markdown(place["path"]), markdown)
 
 

@@ -19,6 +19,7 @@ from typing import Any, Literal
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
+from probe_kit._system.counting import counted
 from probe_kit._system.installing import install_command
 from probe_kit.errors import SceneError
 
@@ -76,7 +77,7 @@ def _python() -> Finding:
 def _processor() -> Finding:
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     advice = "" if count > 1 else "Two cores halve the time of the demo: simulation and inference overlap"
-    return Finding("processor", "ok" if count > 1 else "note", f"{count} core{'s' * (count > 1)} usable", advice)
+    return Finding("processor", "ok" if count > 1 else "note", f"{counted(count, 'core')} usable", advice)
 
 
 def _memory() -> Finding:

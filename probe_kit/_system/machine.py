@@ -5,6 +5,7 @@ import re
 import sys
 from pathlib import Path
 
+from probe_kit._system.counting import counted
 from probe_kit.errors import UsageError
 
 _DEVICE = re.compile(r"(?P<kind>[a-z]+)(:(?P<index>\d+))?")
@@ -41,7 +42,7 @@ def what_is_here() -> str:
 
 def _devices() -> list[str]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return [f"cpu ({cores} core{'s' * (cores > 1)})", *(_of_torch() if "torch" in sys.modules else _of_system())]
+    return [f"cpu ({counted(cores, 'core')})", *(_of_torch() if "torch" in sys.modules else _of_system())]
 
 
 def _of_torch() -> list[str]:
@@ -60,7 +61,7 @@ def _of_system() -> list[str]:
         for card in sorted(_NVIDIA.glob("*/information"))
         if (found := re.search(r"^Model:(.*)$", card.read_text(errors="replace", encoding="utf-8"), re.MULTILINE))
     ]
-    return [f"{len(models)} GPU{'s' * (len(models) > 1)} ({', '.join(dict.fromkeys(models))})"] if models else []
+    return [f"{counted(len(models), 'GPU')} ({', '.join(dict.fromkeys(models))})"] if models else []
 
 
 def _surely_without_gpu() -> bool:

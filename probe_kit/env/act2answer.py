@@ -8,6 +8,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from probe_kit._system.counting import counted
 from probe_kit.env.question import Question
 from probe_kit.env.robot.controller import check_action
 from probe_kit.env.scene import Scene
@@ -125,7 +126,9 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
         """
         trial = self.trial
         if trial.over:
-            raise EpisodeOverError(f"the episode ended after {trial.steps} steps; call `reset` to start another.")
+            raise EpisodeOverError(
+                f"the episode ended after {counted(trial.steps, 'step')}; call `reset` to start another."
+            )
         trial.advance(check_action(action))
         self._frame = None
         info = self._info()

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, out, print_json, progress, say
 from probe_kit._terminal.field_options import command_with
@@ -160,7 +161,7 @@ def _rows_of_plan(extraction: "Extraction") -> dict[str, str]:
         "suite": plan.suite.identity,
         "categories": ", ".join(plan.suite.categories),
         "scene": _describe_scene(extraction.settings.scene),
-        "episodes": f"{len(plan.episodes)} ({len(plan.suite.items)} items in both layouts)",
+        "episodes": f"{len(plan.episodes)} ({counted(len(plan.suite.items), 'item')} in both layouts)",
         **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
     }
 
@@ -275,7 +276,7 @@ def _print_outcomes(run: "Run") -> None:
 
     counts = run.episodes["outcome"].value_counts()
     text = ", ".join(f"{name} {count}" for name, count in counts.items())
-    say(f"{len(run.episodes)} episodes: {text}")
+    say(f"{counted(len(run.episodes), 'episode')}: {text}")
     if ONCE in run.episodes and (lost := int((run.episodes[ONCE] & ~run.episodes[AT_END]).sum())):
         say(f"{lost} of them had success before their end only; see the columns {ONCE} and {AT_END}")
     can_probe = bool(run.streams) and (run.inputs is not None or _has_groups_for_probes(run))

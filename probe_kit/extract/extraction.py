@@ -7,6 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import EpisodesFailedError, UsageError
 from probe_kit.extract.needs import space_needed
@@ -114,8 +115,8 @@ class Extraction(Prepared):
 
 def _failure(writer: RunWriter[RowPlan], given_up: list[Failed], done: int) -> EpisodesFailedError:
     error = EpisodesFailedError(
-        f"{len(given_up)} episodes failed twice and were given up; {done} others were finished and are kept. The "
-        "same command tries them again; --partial reads the run without them"
+        f"{counted(len(given_up), 'episode')} failed twice and were given up; {done} others were finished and are "
+        "kept. The same command tries them again; --partial reads the run without them"
     )
     for failed in given_up:
         where = f" (traceback in {writer.location}/{failure_key(failed.number)})" if failed.traceback else ""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal.console import out, print_json
 from probe_kit._terminal.options import AsJson, Partial, RunFolder
 from probe_kit._terminal.plain_text import terminal_safe
@@ -135,7 +136,8 @@ def show(
         return
     further = {f"intervention {one.key}": one.words for one in interventions}
     further |= {
-        f"unfinished {key}": f"an intervention, {items} items so far; the same `probe-kit intervene` continues it"
+        f"unfinished {key}": f"an intervention, {counted(items, 'item')} so far; "
+        "the same `probe-kit intervene` continues it"
         for key, items in unfinished.items()
     }
     out.print(facts_table(found, further))

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal.console import err, out, print_json_text, print_text, say
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = F
     for path in save_figures(drawn, folder):
         say(f"figure: {path}")
     if left_out := len(exhibits) - len(drawn):
-        say(f"{left_out} further figure{'s' * (left_out > 1)}: add --details all")
+        say(f"{counted(left_out, 'further figure')}: add --details all")
 
 
 def say_report(written: Path) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import number, percent, points, with_limits
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
@@ -59,7 +60,10 @@ def read_steps(text: str, runs: Sequence[RunReader]) -> dict[str, int]:
             raise UsageError(f"--x {text!r}; expected `step`, or a training step per run such as 1000,2000")
         steps = [int(part) for part in parts]
     if len(steps) != len(runs):
-        raise UsageError(f"--x gives {len(steps)} steps for {len(runs)} runs; give one per run, in their order")
+        raise UsageError(
+            f"--x gives {counted(len(steps), 'step')} for {counted(len(runs), 'run')}; give one per run, in "
+            "their order"
+        )
     if len(runs) < 2 or len(set(steps)) < len(steps):
         raise UsageError(
             f"--x needs several runs of different training steps; these are of {', '.join(map(str, steps))}"

@@ -41,6 +41,8 @@ PROBE_DIRECTIONS = "directions.npz"
 INTERVENTIONS = "interventions"
 TRAJECTORY, TRAJECTORY_AXES = "trajectory", 3
 """The array of what happened in episodes, beside those of streams; an episode that did not act has no object."""
+TRUTHS = "truth"
+"""Among the names of inputs: columns that are truth values."""
 INPUTS = "inputs"
 """The group of arrays that hold what a run on recordings showed: state, actions, small pictures."""
 ILLUSTRATIONS = (FRAMES, VIDEOS)

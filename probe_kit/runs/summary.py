@@ -5,6 +5,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal.notebook import facts_html
 from probe_kit.hooks.contract.summary import streams_text
 from probe_kit.runs.layout import CAPTURE_ONLY
@@ -105,9 +106,7 @@ def what_to_open(address: str) -> str:
     if "://" not in address:
         if inside := runs_in(folder):
             more = f" and {len(inside) - MOST} more" if len(inside) > MOST else ""
-            return (
-                f"It holds {len(inside)} run{'s' * (len(inside) > 1)}: {', '.join(map(str, inside[:MOST]))}{more}"
-            )
+            return f"It holds {counted(len(inside), 'run')}: {', '.join(map(str, inside[:MOST]))}{more}"
         beside = {path.name: path for path in runs_in(folder.parent, deep=False)}
         if near := get_close_matches(folder.name, beside, n=1):
             return f"Did you mean {beside[near[0]]}?"

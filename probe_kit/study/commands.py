@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal.console import counter, err, marked, out, print_json, print_text, progress, say
 from probe_kit._terminal.options import AsJson, EnvWorkers, Partial, RayAddress, check_no_others, speed_option
 from probe_kit.errors import ProbeKitError, UsageError
@@ -249,7 +250,10 @@ def table(
         print_text("\n\n".join(text.rstrip("\n") for text in texts))
     if not name and style not in ("json", "csv"):
         tests = sum(own.n_tests for own in made.values())
-        say(f"{len(made)} tables with {tests} tests; each is corrected within its own comparison.")
+        say(
+            f"{counted(len(made), 'table')} with {counted(tests, 'test')}; "
+            "each is corrected within its own comparison."
+        )
     if len(made) < (1 if name else len(study.study.tables)) or any(own.is_partial for own in made.values()):
         raise typer.Exit(UNFINISHED)
 
@@ -367,7 +371,7 @@ def pack(
     asked = dict(zip(EXTRAS, (pictures, trajectories, directions), strict=True))
     with err.status("packing"):
         made = pack_study(load_study(file), out_file, partial, [name for name in EXTRAS if asked[name]])
-    out.print(f"{out_file}: {len(made.runs)} runs, without {', '.join(made.left_out)}", soft_wrap=True)
+    out.print(f"{out_file}: {counted(len(made.runs), 'run')}, without {', '.join(made.left_out)}", soft_wrap=True)
     for name, reason in made.missing.items():
         out.print(f"not packed: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
 

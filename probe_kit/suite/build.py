@@ -99,8 +99,8 @@ def _options(
     for count in counts.values():
         if count < 2 or count % 2:
             raise UsageError(
-                f"items_per_category is {count}; expected a positive even number, because every pair of "
-                "pictures is asked for both ways."
+                f"{count} items per category are asked for; expected a positive even number, because every pair "
+                "of pictures is asked for both ways."
             )
     different = set(counts.values())
     return {

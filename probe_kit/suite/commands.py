@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from probe_kit._system.bounded_json import load_json, parse_json
+from probe_kit._system.counting import counted
 from probe_kit._terminal.console import counter, err, marked, out, print_json, progress
 from probe_kit._terminal.options import AsJson, Categories, Seed, choices, one_of
 from probe_kit._terminal.plain_text import terminal_safe
@@ -39,7 +40,10 @@ def build(
     with progress() as bar:
         drawing = counter(bar, "drawing items")
         suite = build_suite(folder, categories, n, seed, progress=drawing)
-    out.print(f"{suite.identity}: {len(suite.items)} items, {2 * len(suite.items)} episodes in {folder}")
+    out.print(
+        f"{suite.identity}: {counted(len(suite.items), 'item')}, "
+        f"{counted(2 * len(suite.items), 'episode')} in {folder}"
+    )
 
 
 @app.command("from-csv")
@@ -82,7 +86,9 @@ def from_csv(
     terms = Terms(license_name, attribution, contains_real_face=real_faces)
     suite = suite_from_csv(table, out_folder, name=name, category=category, terms=terms)
     count, groups = len(suite.items), len({item.group_id for item in suite.items})
-    out.print(f"{suite.identity}: {count} items in {groups} groups in {out_folder}", soft_wrap=True)
+    out.print(
+        f"{suite.identity}: {counted(count, 'item')} in {counted(groups, 'group')} in {out_folder}", soft_wrap=True
+    )
     err.print(f"next: probe-kit suite validate {out_folder} --baselines", soft_wrap=True)
     err.print(
         f"then: probe-kit extract --model pi0-tiny --suite {out_folder} --out runs/{out_folder.name}-questions",

@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from probe_kit._system.counting import counted
 from probe_kit.errors import UsageError
 from probe_kit.hashing import canonical_json, sha256_text
 from probe_kit.suite.categories import CATEGORIES, check_categories, in_order
@@ -68,7 +69,7 @@ class Suite:
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{category} {count}" for category, count in count_by_category(self.items).items())
-        return f"<Suite {self.identity}: {len(self.items)} items ({counts}) in {self.folder}>"
+        return f"<Suite {self.identity}: {counted(len(self.items), 'item')} ({counts}) in {self.folder}>"
 
     @cached_property
     def content_sha256(self) -> str:
@@ -148,14 +149,14 @@ class Suite:
             return items
         if not 0 < count <= len(items):
             raise UsageError(
-                f"items_per_category is {count}, but {category!r} has {len(items)} items; "
+                f"{count} items per category are asked for, and {category!r} has {counted(len(items), 'item')}; "
                 f"give a number from 1 to {len(items)}."
             )
         kept, dropped = items[:count], items[count:]
         separated = {item.pair_id for item in kept} & {item.pair_id for item in dropped}
         if separated:
             raise UsageError(
-                f"items_per_category is {count}, which would keep one of the role-exchanged twins "
+                f"{count} items per category would keep one of the role-exchanged twins "
                 f"{min(separated)!r} of {category!r} and drop the other. Give an even number."
             )
         return kept

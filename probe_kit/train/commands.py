@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rich.text import Text
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, progress, say, split
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
@@ -153,7 +154,8 @@ def facts_table(found: "Inventory", further: Mapping[str, str]) -> "Table":
         **found.streams,
         **{f"probes {probes.key}": _probes_in_words(probes, found) for probes in found.probes},
         **{
-            f"unfinished {key}": f"a sweep of {sites} sites so far; the same `probe-kit train` continues it"
+            f"unfinished {key}": f"a sweep of {counted(sites, 'site')} so far; "
+            "the same `probe-kit train` continues it"
             for key, sites in found.unfinished.items()
         },
         **further,

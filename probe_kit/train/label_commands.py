@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, progress, say
 from probe_kit.errors import UsageError
@@ -45,7 +46,7 @@ def labels(
         draft.write_text(csv_of_frame(frame), encoding="utf-8", newline="\n")
         draft.rename(out_file)
     out.print(
-        f"{out_file}: {len(frame)} lines, columns {', '.join(map(str, frame))}",
+        f"{out_file}: {counted(len(frame), 'line')}, columns {', '.join(map(str, frame))}",
         markup=False,
         highlight=False,
         soft_wrap=True,

@@ -184,7 +184,7 @@ def test_stepping_before_reset_or_after_the_end_is_an_error(make_env):
         env.step(STAY)
     env.reset(seed=0)
     env.advance(STAY)
-    with pytest.raises(EpisodeOverError, match="ended after 1 steps"):
+    with pytest.raises(EpisodeOverError, match="ended after 1 step"):
         env.step(STAY)
     env.reset()
     env.advance(STAY)

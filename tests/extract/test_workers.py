@@ -96,7 +96,7 @@ def test_an_episode_that_fails_twice_is_named_and_all_others_are_kept(
         return [chunk * factor for chunk, factor in zip(chunks, bad, strict=True)]
 
     monkeypatch.setattr(PolicyController, "act", act_badly)
-    with pytest.raises(EpisodesFailedError, match="1 episodes failed twice") as caught:
+    with pytest.raises(EpisodesFailedError, match="1 episode failed twice") as caught:
         extract_run(settings(suite, env_workers=0), tmp_path / "run")
     assert poison.episode.episode_id in caught.value.__notes__[0]
     assert caught.value.exit_code == 1

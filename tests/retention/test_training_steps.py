@@ -47,7 +47,7 @@ def test_steps_by_hand_are_one_per_run_and_different(probed_run: Callable[..., A
     runs = [probed_run({"color": SIGNAL}, name) for name in ("a", "b")]
     assert list(read_steps("2000,500", runs).values()) == [2000, 500]
     for text, why in (
-        ("500", "1 steps for 2 runs"),
+        ("500", "1 step for 2 runs"),
         ("500,500", "different training steps"),
         ("soon", "expected"),
     ):

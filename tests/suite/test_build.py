@@ -47,7 +47,9 @@ def test_categories_are_built_in_one_order_however_they_are_named(small_suite: S
 
 @pytest.mark.parametrize("count", [-2, 0, 7])
 def test_a_number_of_items_without_twins_is_refused(tmp_path: Path, count: int) -> None:
-    with pytest.raises(UsageError, match=f"is {count}; expected a positive even number"):
+    with pytest.raises(
+        UsageError, match=f"{count} items per category are asked for; expected a positive even number"
+    ):
         build_suite(tmp_path / "suite", items_per_category=count)
     assert list(tmp_path.iterdir()) == []
 
@@ -71,7 +73,7 @@ def test_equal_numbers_of_items_are_one_number(small_suite: Suite, tmp_path: Pat
 def test_numbers_of_items_of_other_categories_are_refused(tmp_path: Path, counts: dict[str, int]) -> None:
     with pytest.raises(UsageError, match="expected one for each of color, shape"):
         build_suite(tmp_path / "suite", ["color", "shape"], counts)
-    with pytest.raises(UsageError, match="is 3; expected a positive even number"):
+    with pytest.raises(UsageError, match="3 items per category are asked for; expected a positive even number"):
         build_suite(tmp_path / "suite", ["color", "shape"], {"color": 2, "shape": 3})
     assert list(tmp_path.iterdir()) == []
 

@@ -13,7 +13,7 @@ from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
 from probe_kit.extract.recordings.lerobot_meta import IMAGE
 from probe_kit.extract.sources.recording import ACTION, IMAGES, STATE, LeRobotSource, Pairs
 from probe_kit.hashing import derive_seed
-from probe_kit.runs.layout import OTHER_ACTIONS, RECORDED_EPISODES
+from probe_kit.runs.layout import OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
 
 CATEGORY = "all"
 """Of every row: recordings have no categories."""
@@ -233,6 +233,7 @@ class Recording:
         own, folder = self.source, self.folder
         state, action = folder.width(STATE), folder.width(ACTION)
         columns = folder.columns
+        truths = [name for name in columns if folder.features[name]["dtype"] == "bool"]
         shapes: dict[str, list[int]] = {"columns": [len(columns)], "prediction": list(prediction)}
         shapes |= {} if state is None else {"state": [state]}
         shapes |= {} if action is None else {"action": [prediction[0], action]}
@@ -249,9 +250,12 @@ class Recording:
             "inputs": dict(sorted(shapes.items())),
             "columns": columns,
             "names": {
-                name: folder.names(feature)
-                for name, feature, width in (("state", STATE, state), ("action", ACTION, action))
-                if width is not None
+                **{
+                    name: folder.names(feature)
+                    for name, feature, width in (("state", STATE, state), ("action", ACTION, action))
+                    if width is not None
+                },
+                **({TRUTHS: truths} if truths else {}),
             },
         }
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.counting import counted
 from probe_kit.hooks.contract.interventions import InterventionKind, Readout
 from probe_kit.intervene.kinds.base import (
     TILES_APART,
@@ -372,7 +373,7 @@ def swap_rates(row: ImageSwapEffect, inputs: str) -> str:
 
 def begin_sentence(row: ImageSwapEffect) -> str:
     """Return the category and its number of items."""
-    return f"{category_of(row.category).title} ({row.n_items} item{'s' * (row.n_items != 1)})"
+    return f"{category_of(row.category).title} ({counted(row.n_items, 'item')})"
 
 
 def percent(value: float | None) -> str:

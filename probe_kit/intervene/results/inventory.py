@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from probe_kit._system.counting import counted
 from probe_kit.intervene.kinds import kind_names, kind_of
 from probe_kit.intervene.outcomes import StoredIntervention, read_interventions, stored_interventions
 from probe_kit.intervene.results.results import effects_of
@@ -43,7 +44,7 @@ class ListedIntervention:
         """In a line."""
         own = [f"{name} {_plain(value)}" for name, value in self.parameters.items() if value not in (None, [])]
         parts = [self.kind, f"of {', '.join(self.categories)}"]
-        parts += [f"{self.items} items each"] * (self.items is not None)
+        parts += [] if self.items is None else [f"{counted(self.items, 'item')} each"]
         parts += [f"wording {self.wording}"] * bool(self.wording)
         if self.state == "other":
             own.append("another one stands in its place in tables")

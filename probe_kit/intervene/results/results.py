@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from probe_kit._system.counting import counted
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.kinds import kind_of
@@ -117,7 +118,7 @@ class InterventionResult:
     def _few_groups(self) -> list[str]:
         counts = {category: np.unique(own.groups).size for category, own in self.outcomes.by_category()}
         return [
-            f"{category}: with {count} group{'s' * (count != 1)} of items no p can be below "
+            f"{category}: with {counted(count, 'group')} of items no p can be below "
             f"{smallest_flip_p(count):.2g}, so that nothing is beyond chance. Play more (--items)."
             for category, count in counts.items()
             if smallest_flip_p(count) >= SIGNIFICANCE

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Literal, cast
 
+from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import Limits, whole
 from probe_kit.intervene.results.verdict import UNTESTED, UseVerdict, describe_swap
 from probe_kit.retention.behaviour.success_rate import Regime
@@ -129,7 +130,7 @@ def describe_category(row: RetentionRow, asked: RetentionRow | None = None) -> s
     parts = [] if answered is None or answered.success.sr is None else [_answered(answered)]
     parts += _streams(row)
     parts += [] if is_vlm(row) else [_acted(row)]
-    return f"({items} item{'s' * (items != 1)}): {'; '.join(parts)}. {conclusion(row)}"
+    return f"({counted(items, 'item')}): {'; '.join(parts)}. {conclusion(row)}"
 
 
 # -- what follows --------------------------------------------------------------------------------------------

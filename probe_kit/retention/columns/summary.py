@@ -23,7 +23,7 @@ from probe_kit.retention.rows.row import MEAN, RetentionRow
 MARK = "✓"
 """After a share: the stream exceeds chance and a control, or the regime of the behaviour is knowledge."""
 _LEGENDS = {
-    "VLM %": "VLM: share of its answers that are right",
+    "VLM %": "VLM: share of its answers that are right; its name ends on the prompt and the size of the picture",
     "backbone %": "Backbone: accuracy of probes in the backbone, at sites that other questions chose",
     "action %": "Action: the same at the action's sites",
     "success %": "Success: the cube ends on the correct picture",

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
+from probe_kit._system.counting import counted
 from probe_kit._tables.table import Cell, Heading, Row, Table
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, radius_columns
@@ -244,7 +245,7 @@ def _controls(rows: Sequence[RetentionRow]) -> str:
     untrained = f"; untrained: {name}" if name else ""
     fewest = min(row.success.n_items for row in rows if row.category != MEAN)
     share = f"{100 * detectable(fewest):.1f}"
-    findable = f"with {fewest} items a leak of {share} % is found in 4 of 5 suites"
+    findable = f"with {counted(fewest, 'item')} a leak of {share} % is found in 4 of 5 suites"
     return (
         f"held-out accuracy % without the model, {findable}; selectivity: accuracy above random labels{untrained}"
     )

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from math import nan
 from typing import TYPE_CHECKING, Any
 
+from probe_kit._system.counting import counted
 from probe_kit._system.csv_text import csv_of_frame
 from probe_kit._system.markdown_text import markdown_safe
 from probe_kit._tables.numbers import number, with_limits
@@ -288,7 +289,7 @@ def _sentence(row: LabelRow, several: bool) -> str:
     reached = f"not shown to exceed {', '.join(missed)}" if missed else f"signal there (p < {SIGNIFICANCE})"
     return (
         f"{where}: {limits} of the backbone's score above chance is left in the {action}; {reached}. "
-        f"{found.n_groups} groups, {found.n_samples} samples."
+        f"{counted(found.n_groups, 'group')}, {counted(found.n_samples, 'sample')}."
     )
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import percent
 from probe_kit.retention.columns.modes import RATE, modes_of
 from probe_kit.retention.columns.sentences import chance_only
@@ -131,7 +132,7 @@ def read_row(row: RetentionRow) -> list[str]:
 
 
 def _ties_words(ties: int | None) -> str:
-    return f" and at {ties} other site{'s' * (ties > 1)} as well" if ties else ""
+    return f" and at {counted(ties, 'other site')} as well" if ties else ""
 
 
 def _clear_words(p: float | None, exceeds: Exceeds) -> str:

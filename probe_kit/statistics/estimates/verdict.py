@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from probe_kit._system.counting import counted
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.statistics.estimates.balanced import GroupSums, Matrix
 from probe_kit.statistics.estimates.shares import effective_episodes, group_shares, share_interval
@@ -28,7 +29,9 @@ def at_most(sites: GroupSums) -> float:
     limit of the best site's accuracy, whatever the number of sites. Raises TooFewGroupsError for one group.
     """
     if sites.n_groups < 2:
-        raise TooFewGroupsError(f"{sites.n_groups} independent groups of items set no limit; expected two or more")
+        raise TooFewGroupsError(
+            f"{counted(sites.n_groups, 'independent group')} of items set no limit; expected two or more"
+        )
     shares, variances = group_shares(sites.sums, sites.sizes)
     _, high = share_interval(
         shares, variances, sites.n_groups, sites.n_episodes, sites.n_groups - 1, tail=SIGNIFICANCE

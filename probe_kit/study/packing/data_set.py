@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.bounded_files import read_regular, read_regular_text
+from probe_kit._system.counting import counted
 from probe_kit._system.drafts import draft_of, full_disk_in_words, move_draft
 from probe_kit._system.markdown_text import markdown_safe
 from probe_kit._system.optional_dependencies import require
@@ -129,7 +130,8 @@ def _card(study: LoadedStudy, pack: Pack, table: "pd.DataFrame", licence: str | 
 def _words(study: LoadedStudy, pack: Pack, episodes: int) -> Iterator[str]:
     yield f"# {markdown_safe(study.study.name)}"
     yield ""
-    yield f"A study made with probe_kit {pack.version}: {len(pack.runs)} runs, {episodes:,} episodes."
+    size = f"{counted(len(pack.runs), 'run')}, {counted(episodes, 'episode')}"
+    yield f"A study made with probe_kit {pack.version}: {size}."
     yield markdown_safe(f"Suite: {pack.suite.identity}. Left out: {', '.join(pack.left_out)}.")
     yield ""
     yield f"* `{EPISODES}`: a row per episode of every run"

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal.console import marked, out
 
 if TYPE_CHECKING:
@@ -29,13 +30,13 @@ def print_plan(plan: "StudyPlan") -> None:
 
 def _totals(plan: "StudyPlan") -> list[str]:
     totals, suite = plan.totals(), plan.study.suite
-    unprobed = f"; probes of {totals['unprobed']} runs" if totals["unprobed"] else ""
+    unprobed = f"; probes of {counted(totals['unprobed'], 'run')}" if totals["unprobed"] else ""
     return [
         f"suite: {suite.identity}; items from {suite.source}",
-        f"{totals['runs']} runs, {totals['episodes']:,} episodes ({totals['acted']:,} acted, "
+        f"{counted(totals['runs'], 'run')}, {counted(totals['episodes'], 'episode')} ({totals['acted']:,} acted, "
         f"{totals['captured']:,} captured without acting, {totals['asked']:,} asked), at most "
-        f"{totals['inferences']:,} inferences of policies (given by shape: no model was loaded)",
-        f"missing: {totals['missing']:,} episodes{unprobed}",
+        f"{counted(totals['inferences'], 'inference')} of policies (given by shape: no model was loaded)",
+        f"missing: {counted(totals['missing'], 'episode')}{unprobed}",
     ]
 
 

@@ -149,7 +149,7 @@ def _row(record: Mapping[str, str | None], line: int, opened: TextTable, categor
     cells = {column: cell or "" for column, cell in record.items()}
     empty = [column for column in COLUMNS if not cells[column]]
     if empty:
-        columns = f"column{'s' * (len(empty) > 1)} {' and '.join(empty)}"
+        columns = f"{'column' if len(empty) == 1 else 'columns'} {' and '.join(empty)}"
         raise UsageError(f"{where}, {columns}: it is empty; every question needs {', '.join(COLUMNS)}")
     for column, cell in cells.items():
         if problem := problem_of(cell):

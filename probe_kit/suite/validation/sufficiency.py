@@ -6,6 +6,7 @@ A plan says it before any work; what refuses later goes by the same numbers, see
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from probe_kit._system.counting import counted
 from probe_kit.statistics.label_permutations import ENUMERATED_BELOW
 from probe_kit.statistics.significance import SIGNIFICANCE, chance_margin, items_for_width
 from probe_kit.statistics.sufficiency import (
@@ -57,7 +58,7 @@ class Smallest:
     @property
     def words(self) -> str:
         """In a few words."""
-        return f"{self.category}: {self.items} items in {self.groups} independent group{'s' * (self.groups != 1)}"
+        return f"{self.category}: {counted(self.items, 'item')} in {counted(self.groups, 'independent group')}"
 
     def items_for(self, groups: int) -> int | None:
         """The fewest items that `--items` can select with so many groups; None if the whole suite lacks them."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from probe_kit._system.counting import counted
 from probe_kit.statistics.folds import OUTER_FOLDS
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, category_of
 from probe_kit.suite.counterparts import counterparts_of
@@ -109,7 +110,9 @@ def enough_items(suite: Suite) -> Iterator[Finding]:
         if requested is not None and count != requested:
             yield warning("W04", category_of(category).title, f"{count} of {requested} requested")
         elif count < FEWEST_ITEMS:
-            yield warning("W04", category_of(category).title, f"{count} items; fewer than {FEWEST_ITEMS}")
+            yield warning(
+                "W04", category_of(category).title, f"{counted(count, 'item')}; fewer than {FEWEST_ITEMS}"
+            )
 
 
 def enough_groups(suite: Suite) -> Iterator[Finding]:
@@ -119,7 +122,7 @@ def enough_groups(suite: Suite) -> Iterator[Finding]:
         groups[item.category].add(item.group_id)
     for category, members in groups.items():
         if len(members) < OUTER_FOLDS:
-            message = f"{len(members)} independent groups; probes need at least {OUTER_FOLDS}"
+            message = f"{counted(len(members), 'independent group')}; probes need at least {OUTER_FOLDS}"
             yield warning("W09", category_of(category).title, message)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.counting import counted
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.rows import TokenBlock
@@ -27,7 +28,7 @@ def restrict_to_call(run: RunReader, call: int) -> RunReader:
     captured = captured_calls(run)
     if not 0 < call < captured:
         raise UsageError(
-            f"{run.location} has {captured} captured inference{'s' * (captured > 1)} per episode, counted from 0; "
+            f"{run.location} has {counted(captured, 'captured inference')} per episode, counted from 0; "
             f"there is no {call}. Extract with --captured-calls {call + 1} or more"
         )
     return _AtCall(run, call)

@@ -138,9 +138,17 @@ def _of_source(run: RunReader, name: str) -> BuiltinColumn:
     found = list(_inferences(run))
     rows = _rows(run, [episode for episode, _ in found])
     calls = [call for _, call in found]
-    cells = tuple(_finite(float(value)) for value in columns[wanted][rows, calls])
+    cells = _cells(run, wanted, columns[wanted][rows, calls])
     episodes, inferences = zip(*found, strict=True)
     return BuiltinColumn(None, episodes, inferences, cells)
+
+
+def _cells(run: RunReader, name: str, values: NDArray[np.float64]) -> tuple[Cell, ...]:
+    """The values (n,) of a column of a run's own source: numbers, or truth values where the source says so."""
+    cells = [_finite(float(value)) for value in values]
+    if name not in run.inputs.truths:  # type: ignore[attr-defined]  # only runs have inputs
+        return tuple(cells)
+    return tuple(bool(cell) if cell in (0, 1) else cell for cell in cells)
 
 
 def prefix_of(run: RunReader) -> str:
@@ -207,7 +215,10 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
         table["control_step"] = run.control_steps[rows, list(inferences)].tolist()  # type: ignore[attr-defined]
     if getattr(run, "inputs", None) is not None:
         table["instruction"] = run.episodes["instruction"].iloc[rows].tolist()
-        sim = {prefix_of(run) + name: own[rows, list(inferences)] for name, own in recorded_columns(run).items()}
+        sim = {
+            prefix_of(run) + name: list(_cells(run, name, own[rows, list(inferences)]))
+            for name, own in recorded_columns(run).items()
+        }
         sim |= {name: [cells[row] for row in rows] for name, cells in outcome_column(run).items()}
     for name in ("group_id", "category"):
         table[name] = run.episodes[name].iloc[rows].tolist()

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -57,7 +58,9 @@ def label_sentences(results: LabelResults) -> list[str]:
     groups = int(results.scores["groups"].iloc[0])
     for view in own.views:
         parts = "; ".join(_in_stream(results, row) for row in _best(results) if row["view"] == view)
-        of = f"{groups} groups, {results.labels.size} samples" + (f", view {view}" if len(own.views) > 1 else "")
+        of = f"{counted(groups, 'group')}, {counted(results.labels.size, 'sample')}" + (
+            f", view {view}" if len(own.views) > 1 else ""
+        )
         found.append(f"{own.target} ({of}) is {parts}.")
     return found
 

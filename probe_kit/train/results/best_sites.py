@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.suite.categories import category_of
@@ -59,7 +60,9 @@ def best_sites_sentences(results: ProbeResults) -> list[str]:
         name, count = category_of(category).title, own[0]["n"]
         parts = "; ".join(map(_in_stream, own))
         pictures = _from_pictures(results, category)
-        found.append(f"{name} ({count} episodes): {_TARGETS[results.settings.target]} is {parts}.{pictures}")
+        found.append(
+            f"{name} ({counted(count, 'episode')}): {_TARGETS[results.settings.target]} is {parts}.{pictures}"
+        )
     return found
 
 

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from probe_kit._system.counting import counted
 from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -45,10 +46,11 @@ def transfer_table(results: TransferResults, splits: bool = True) -> ResponsiveT
 def transfer_sentences(results: TransferResults) -> list[str]:
     """What was left out, then one per view: in which streams the label transfers."""
     found = [f"left out: {count} {reason}" for reason, count in results.left_out.items()]
-    on = f"fitted on {results.trained_on['groups']} groups, {results.trained_on['samples']} samples"
+    groups, samples = results.trained_on["groups"], results.trained_on["samples"]
+    on = f"fitted on {counted(groups, 'group')}, {counted(samples, 'sample')}"
     for view in results.curves:
         rows = [row for row in _best(results) if row["view"] == view]
-        of = f"{on}; scored on {rows[0]['groups']} groups, {rows[0]['n']} samples"
+        of = f"{on}; scored on {counted(rows[0]['groups'], 'group')}, {counted(rows[0]['n'], 'sample')}"
         of += f", view {view}" if len(results.curves) > 1 else ""
         found.append(f"{results.target} ({of}) {'; '.join(map(_verdict, rows))}.")
     return found

@@ -65,6 +65,8 @@ def test_facts_are_labels_and_a_run_without_sides_refuses_them(played: Run, tmp_
     assert len(set(results.groups)) == 6
     assert np.isfinite(results.scores["score"]).all()
     assert Labels.of_run(played, "env.block").task == "continuous"
+    for own in (Labels.of_run(played, "env.left"), Labels.read(file, "env.left")):
+        assert (own.task, own.coded.classes) == ("binary", ("False", "True")), "a fact that is true or false"
     with pytest.raises(UsageError, match=r"plays an environment of your own .* a retention table is not possible"):
         retention_table([played])
     with pytest.raises(UsageError, match=r"no column env\.absent; there are: env\.block"):

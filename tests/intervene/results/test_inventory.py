@@ -63,7 +63,7 @@ def test_what_is_of_other_episodes_or_unfinished_is_said(run: Run) -> None:
     assert f"intervention {first.key}" in text
     assert "other episodes" in text
     assert "unfinished 0123456789ab" in text
-    assert "1 items so far" in text
+    assert "1 item so far" in text
 
 
 @pytest.mark.parametrize("stored_format", [1, FORMAT + 1, None])

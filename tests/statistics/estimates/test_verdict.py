@@ -82,7 +82,7 @@ def test_a_site_that_is_always_right_may_be_all() -> None:
 
 
 def test_one_group_sets_no_limit() -> None:
-    with pytest.raises(TooFewGroupsError, match="1 independent groups"):
+    with pytest.raises(TooFewGroupsError, match="1 independent group"):
         at_most(GroupSums(np.ones((2, 1)), np.ones(1)))
 
 

@@ -224,7 +224,7 @@ def test_the_command_makes_the_suite_and_says_what_to_do_next(pictures: Path) ->
     arguments = ["from-csv", str(table), "--out", str(pictures / "suite"), "--license", "CC0-1.0"]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
-    assert "1 items in 1 groups" in result.output
+    assert "1 item in 1 group" in result.output
     assert "suite validate" in result.output
 
 

@@ -27,7 +27,7 @@ from probe_kit.extract.sources.environment import EnvSource
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.layout import TRUTHS, StoredStream
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -70,14 +70,16 @@ class OpenedEnvironment:
 class FittedEnvironment:
     """An environment and a policy that was found to play it.
 
-    example: what it shows first. facts: names, in stored order. chunk: actions that the policy predicts at a time.
-    unusual: (D,) share of the first states whose number lies outside the checkpoint's statistics.
+    example: what it shows first. facts: names, in stored order. truths: those that are truth values. chunk:
+    actions that the policy predicts at a time. unusual: (D,) share of the first states whose number lies outside
+    the checkpoint's statistics.
     """
 
     opened: OpenedEnvironment
     policy: "Policy"
     example: Observation
     facts: tuple[str, ...]
+    truths: tuple[str, ...]
     chunk: int
     unusual: NDArray[np.float64]
 
@@ -127,7 +129,9 @@ def fit_environment(opened: OpenedEnvironment, policy: "Policy") -> FittedEnviro
         unusual = unusual_shares(policy, np.stack([begin.observation.state for begin in states]))
     finally:
         environment.close()
-    return FittedEnvironment(opened, policy, first.observation, tuple(sorted(facts)), chunks.shape[1], unusual)
+    names = tuple(sorted(facts))
+    truths = tuple(name for name in names if isinstance(facts[name], bool | np.bool_))
+    return FittedEnvironment(opened, policy, first.observation, names, truths, chunks.shape[1], unusual)
 
 
 def _given_cameras(policy: "Policy", seen: Observation, name: str) -> "Policy":
@@ -202,5 +206,9 @@ def _identity(fitted: FittedEnvironment, execute: int) -> dict[str, Any]:
         "cameras": cameras_of(seen, fitted.policy.card.cameras),
         "inputs": shapes,
         "columns": list(fitted.facts),
-        "names": {"action": names, "state": [str(place) for place in range(seen.state.size)]},
+        "names": {
+            "action": names,
+            "state": [str(place) for place in range(seen.state.size)],
+            **({TRUTHS: list(fitted.truths)} if fitted.truths else {}),
+        },
     }

@@ -1,5 +1,7 @@
 """What `probe-kit dataset show` says of a data set, and of a model that is to be shown it."""
 
+from collections.abc import Sequence
+
 from probe_kit.extract.recordings.recorded_plan import Recording
 from probe_kit.extract.rollout.recorded.recorded_controller import Fitted
 from probe_kit.extract.sources.recording import ACTION, STATE
@@ -20,7 +22,7 @@ def describe_recording(recording: Recording) -> dict[str, str]:
     return {
         "data set": recording.source.name + (f"@{folder.revision}" if folder.revision else ""),
         "frames per second": f"{folder.fps:g}",
-        "episodes": f"{len(lengths)} of {len(folder.lengths)}, {min(lengths)} to {max(lengths)} frames each",
+        "episodes": f"{len(lengths)} of {len(folder.lengths)}, {_span(lengths)} frames each",
         "frames": f"{chosen} of {sum(lengths)} (every:{every})",
         "instructions": "; ".join(texts[:_LONGEST]) + more,
         "cameras": "; ".join(_camera(recording, feature) for feature in folder.cameras) or "none",
@@ -29,6 +31,11 @@ def describe_recording(recording: Recording) -> dict[str, str]:
         "columns": ", ".join(folder.columns) or "none",
         "data sha": f"meta {folder.meta_blake2b[:12]}",
     }
+
+
+def _span(lengths: Sequence[int]) -> str:
+    least, most = min(lengths), max(lengths)
+    return f"{least}" if least == most else f"{least} to {most}"
 
 
 def describe_fit(fitted: Fitted) -> dict[str, str]:

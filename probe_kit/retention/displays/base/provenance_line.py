@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Self
 
+from probe_kit._system.counting import counted
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.labels.label_results import LabelResults
@@ -36,7 +37,7 @@ class ProvenanceLine:
     def of_run(cls, run: RunReader) -> Self:
         """Of a run's behaviour."""
         rule = getattr(run, "rule", "disc")
-        n = f"n = {len(run.episodes)} episodes" + ("" if rule == "disc" else f" by the rule {rule}")
+        n = f"n = {counted(len(run.episodes), 'episode')}" + ("" if rule == "disc" else f" by the rule {rule}")
         return cls(run.label, run.random_weights, run.weights_sha256, run.suite, n, run.settings_sha256)
 
     @classmethod
@@ -54,7 +55,7 @@ class ProvenanceLine:
     def of_label(cls, results: LabelResults, view: str) -> Self:
         """Of probes of a label in one view."""
         own, groups = results.settings, len(set(results.groups.tolist()))
-        n = f"n = {results.labels.size} samples in {groups} groups, view {view}"
+        n = f"n = {counted(results.labels.size, 'sample')} in {counted(groups, 'group')}, view {view}"
         return cls(
             own.model, own.random_weights, own.weights, own.suite, n, own.run_settings, results.key, own.target,
             own.call if own.window == 1 else None,
@@ -63,7 +64,7 @@ class ProvenanceLine:
     @classmethod
     def of_row(cls, row: RetentionRow) -> Self:
         """Of a row of the retention table, usually a mean."""
-        n = f"n = {row.success.n_episodes} episodes"
+        n = f"n = {counted(row.success.n_episodes, 'episode')}"
         return cls(
             row.run.label or row.run.model,
             row.run.random_weights,

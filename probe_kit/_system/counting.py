@@ -1,0 +1,12 @@
+"""Numbers of things in words."""
+
+
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless it is one: `1 table`, `2 tables`, `3,440 categories`.
+
+    noun: in the singular, with words in front where it has any, such as `independent group`.
+    """
+    if number == 1:
+        return f"1 {noun}"
+    ends_in_y = noun.endswith("y") and noun[-2:-1] not in "aeiou"
+    return f"{number:,} {noun[:-1]}ies" if ends_in_y else f"{number:,} {noun}s"
