@@ -119,6 +119,7 @@ def show(
     from probe_kit.runs import label_run, open_run
     from probe_kit.train.commands import facts_table
     from probe_kit.train.results.inventory import inventory
+    from probe_kit.train.results.store import how_to_probe
 
     if partial and not action_errors:
         raise UsageError("--partial is for --action-errors; `run show` lists unfinished runs too. Leave it out")
@@ -142,5 +143,5 @@ def show(
     }
     out.print(facts_table(found, further))
     if not found.probes:
-        step = f"`probe-kit train {found.run}` fits them" if found.streams else "a policy without streams has none"
-        out.print(f"no probes: {step}", soft_wrap=True)
+        why = f". {how_to_probe(opened)}" if found.streams else ": a policy without streams has none"
+        out.print(f"no probes{why}", soft_wrap=True)
