@@ -1,4 +1,4 @@
-"""The page of commands: the built page has every option, and the file says where they are."""
+"""The page of commands: its file says where the options are. `test_docs` reads the built page."""
 
 import importlib.util
 from pathlib import Path
@@ -17,13 +17,10 @@ def hook() -> Any:
     return module
 
 
-def test_the_file_says_where_the_options_are_and_the_built_page_has_them_all() -> None:
+def test_the_file_says_where_the_options_are_and_the_built_page_does_not() -> None:
     pages, text = hook(), (DOCS / "commands.md").read_text(encoding="utf-8")
     assert "This file holds the headings alone" in text[:400]
     page = SimpleNamespace(file=SimpleNamespace(src_uri=pages.PAGE))
     built = pages.on_page_markdown(text, page)
     assert "This file holds" not in built
     assert "<!--" not in built
-    for path in pages.command_paths():
-        assert f"### probe-kit {path}\n" in built, path
-        assert pages.command_markdown(path) in built, path
