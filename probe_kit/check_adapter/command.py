@@ -1,5 +1,6 @@
 """`probe-kit check-adapter`."""
 
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -10,7 +11,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.parts import WeightsDtype
 
 if TYPE_CHECKING:
-    from probe_kit.check_adapter.outcome import Outcome
+    from probe_kit.hooks.conformance.check import Outcome
 
 Instructions = Annotated[
     list[str] | None,
@@ -47,20 +48,22 @@ def check_adapter(
     if instructions is not None and len(instructions) < 2:
         raise UsageError("one --instruction was given; give at least two, such as two of the same length")
     with err.status("loading the family"):
-        from probe_kit.check_adapter.checking import Checking
+        from probe_kit.check_adapter.checking import outcomes, subjects_of
 
-        checking = Checking(model, checkpoint, options or [], instructions, device, dtype)
-    outcomes = []
-    with checking:
-        for outcome in checking.outcomes():
-            outcomes.append(outcome)
+        subjects = subjects_of(model, checkpoint, options or [], instructions, device, dtype)
+    results = []
+    with ExitStack() as stack:
+        for subject in subjects:
+            stack.enter_context(subject)
+        for outcome in outcomes(subjects):
+            results.append(outcome)
             if not as_json:
                 _print_outcome(outcome)
-    failed = [one for one in outcomes if one.state == "failed"]
+    failed = [outcome for outcome in results if outcome.state == "failed"]
     if as_json:
-        print_json({"model": model, "passed": not failed, "checks": [one.to_json() for one in outcomes]})
+        print_json({"model": model, "passed": not failed, "checks": [outcome.to_json() for outcome in results]})
     else:
-        _print_end(model, checkpoint, outcomes)
+        _print_end(model, checkpoint, results)
     raise typer.Exit(1 if failed else 0)
 
 

@@ -1,18 +1,25 @@
-"""One check of the contract, and how it fails: what was seen, what was expected, what to change."""
+"""One check of the contract; how it fails: what was seen, expected and to be changed; and what came of it."""
 
+import os
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 from unittest import SkipTest
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.errors import ProbeKitError
+from probe_kit.hooks.checkpoints.containment import contained
+from probe_kit.hooks.checkpoints.third_party import in_words
+
 __all__ = [
     "Check",
     "CheckFailedError",
+    "Outcome",
     "SkipTest",
     "check",
     "checks_of",
@@ -20,6 +27,7 @@ __all__ = [
     "require",
     "require_bits",
     "require_close",
+    "tried",
 ]
 
 
@@ -46,6 +54,9 @@ class Check:
     sentence: str
     change: str
     body: Callable[[Any], None]
+
+    def __str__(self) -> str:
+        return self.name
 
     def __call__(self, subject: Any) -> None:
         """Check a `Subject`. Raises as `body` does, and whatever the adapter raises."""
@@ -107,3 +118,80 @@ def refused(asked: str, *errors: type[Exception], says: str = "") -> Iterator[No
         )
         return
     raise CheckFailedError(f"{asked}: no error", f"{named}" + (f" that says {says!r}" if says else ""))
+
+
+# -- what came of it ---------------------------------------------------------------------------------------
+
+State = Literal["passed", "failed", "skipped"]
+_FROM_THE_ERROR = "no error"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one check.
+
+    sentence: the promise that was checked. seen, expected, change: of a failure, in words. reason: of a skip.
+    """
+
+    name: str
+    state: State
+    sentence: str
+    seen: str = ""
+    expected: str = ""
+    change: str = ""
+    reason: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """As `probe-kit check-adapter --json` prints it."""
+        return asdict(self)
+
+
+def tried(name: str, sentence: str, change: str, body: Callable[[], object], package: str) -> Outcome:
+    """Run a check; whatever the adapter raises is a failure. Ctrl-C is raised.
+
+    package: of the adapter, to name the place of its error. What it changes in this process is put back.
+    """
+    try:
+        with contained() as interruptions:
+            body()
+    except SkipTest as skipped:
+        return Outcome(name, "skipped", sentence, reason=str(skipped))
+    except CheckFailedError as failed:
+        return Outcome(name, "failed", sentence, failed.seen, failed.expected, failed.change or change)
+    except BaseException as error:  # some of these end a process, and are the adapter's own here
+        if isinstance(error, KeyboardInterrupt) and interruptions.asked:
+            raise
+        return Outcome(name, "failed", sentence, _in_words(error, package), _FROM_THE_ERROR, change)
+    return Outcome(name, "passed", sentence)
+
+
+def _in_words(error: BaseException, package: str) -> str:
+    """All of an error of ours, the first line of any other, and the line of the adapter that it passed."""
+    cause = error.__cause__
+    if isinstance(error, ProbeKitError) and cause is not None and not isinstance(cause, ProbeKitError):
+        return _in_words(cause, package) if place_of(cause, package) else f"{type(error).__name__}: {error}"
+    said = in_words(error)
+    if isinstance(error, ProbeKitError):
+        said = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
+    place = place_of(error, package)
+    return f"{said} ({place})" if place else said
+
+
+def place_of(error: BaseException, package: str) -> str:
+    """File and line of the last frame of `package` that an error passed; empty if it passed none."""
+    inside = [
+        (frame.f_code.co_filename, line)
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if f"{frame.f_globals.get('__name__', '')}.".startswith(f"{package}.")
+    ]
+    if not inside:
+        return ""
+    file, line = inside[-1]
+    near = os.path.relpath(file)
+    return f"{file if near.startswith('..') else near}:{line}"
+
+
+def package_of(loader: str) -> str:
+    """The package of a family's `loader`: `my_vla` of `my_vla.loading:load`."""
+    module = loader.partition(":")[0]
+    return module.rpartition(".")[0] or module

@@ -41,8 +41,7 @@ def actions_with_a_graph_are_the_actions(subject: PolicySubject) -> None:
 @check("Gradients at sites are central differences of the action, whatever other sites are tapped.", _ADVICE)
 def gradients_at_sites_are_central_differences(subject: PolicySubject) -> None:
     policy, one = _differentiable(subject), subject.one
-    if policy.card.dtype != "float32":
-        raise SkipTest(f"in {policy.card.dtype} a difference is rounded away; load the model in float32")
+    subject.require_float32()
     sites = _some_sites(policy)
     _, slopes = gradients_at(policy, one, [0], sites, _lateral)
     with capture(policy, sites) as own:

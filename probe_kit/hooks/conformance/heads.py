@@ -30,6 +30,7 @@ _SUM_TOLERANCE = 1e-5
     "Tap `heads` at the input of the module that projects them, and correct `Stream.heads`.",
 )
 def heads_make_what_the_output_projection_adds(subject: Subject) -> None:
+    subject.require_float32()
     sites = [site for own in _streams_with_heads(subject) for site in (own.sites(HEADS)[0], own.sites(HEADS)[-1])]
     taps = {site: subject.model.tap(site) for site in sites}
     with ExitStack() as stack:
@@ -42,7 +43,7 @@ def heads_make_what_the_output_projection_adds(subject: Subject) -> None:
         require(width % heads == 0, f"{site} has {width} features", f"a multiple of its {heads} heads")
         added, bias = project_heads(subject.model, tape, site).sum(dim=0), getattr(tap.module, "bias", None)
         apart = float((added + (0 if bias is None else bias.detach()) - whole).abs().max())
-        limit = subject.settings.tolerance * (1 + float(whole.abs().max()))
+        limit = subject.tolerance * (1 + float(whole.abs().max()))
         require(apart <= limit, f"the heads of {site} are off by {apart:.3g}", f"at most {limit:.3g}")
 
 
@@ -51,6 +52,7 @@ def heads_make_what_the_output_projection_adds(subject: Subject) -> None:
     "Tap `heads` directly behind the attention, which torch computes; declare the right number of heads.",
 )
 def attention_patterns_are_the_models_own(subject: Subject) -> None:
+    subject.require_float32()
     seen, streams = subject.seen, _streams_with_heads(subject)
     plain = subject.run(seen)
     with capture_patterns(subject.model, [site for own in streams for site in own.sites(HEADS)]) as patterns:

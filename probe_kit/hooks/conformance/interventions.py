@@ -32,8 +32,8 @@ from probe_kit.hooks.registry import find_family
 )
 def policy_and_family_declare_the_same(subject: PolicySubject) -> None:
     policy, own = subject.policy, subject.policy.interventions
-    if subject.settings.family:
-        declared = find_family(subject.settings.family).interventions
+    if subject.name:
+        declared = find_family(subject.name).interventions
         require(declared == own, f"the family declares {declared}", f"what the policy declares, {own}")
     require(
         own.prompt_kv == (policy.prompt_kv is not None),
@@ -241,7 +241,7 @@ def attention_is_recorded_without_changing_an_action_bit_for_bit(subject: Policy
     blocks, iterations = ({key[at] for key in mass.by_read} for at in (0, 1))
     require(iterations >= set(range(steps)), f"iterations {sorted(iterations)}", f"0 to {steps - 1}")
     require(blocks <= set(range(backbone.layers - 1)), f"blocks {sorted(blocks)}", f"below {backbone.layers - 1}")
-    most = 1 + subject.settings.attention_tolerance
+    most = 1 + subject.attention_tolerance
     for weights, whole in zip(mass.by_read.values(), mass.on(valid).values(), strict=True):
         require(weights.shape == valid.shape, f"weights of shape {weights.shape}", f"{valid.shape}")
         require(bool((weights >= 0).all()), "negative weights", "weights from 0 on")

@@ -86,6 +86,7 @@ def activations_have_the_shape_of_their_stream(subject: Subject) -> None:
 )
 def what_blocks_add_makes_the_next_residual(subject: Subject) -> None:
     """Where a stream declares all three quantities."""
+    subject.require_float32()
     seen, roles = subject.seen, subject.roles_of(subject.seen)
     for name, stream in subject.model.streams.items():
         if not (stream.sums and set(_SUM) <= set(stream.quantities)):
@@ -97,7 +98,7 @@ def what_blocks_add_makes_the_next_residual(subject: Subject) -> None:
             parts = [tape[replace(site, quantity=quantity)].double().cpu() for quantity in _SUM]
             whole = tape[replace(site, layer=site.layer + 1, quantity="residual")].double().cpu()
             apart = float((parts[0] + parts[1] + parts[2] - whole)[valid].abs().max())
-            limit = subject.settings.tolerance * (1 + float(whole[valid].abs().max()))
+            limit = subject.tolerance * (1 + float(whole[valid].abs().max()))
             require(
                 apart <= limit, f"at block {site.layer} of {name} the sum is off by {apart:.3g}", f"≤ {limit:.3g}"
             )

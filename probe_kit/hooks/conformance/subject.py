@@ -1,102 +1,169 @@
 """The adapter under check: the model, the observations it is tried on, and its checkpoint."""
 
+import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.conformance.check import SkipTest, require
 from probe_kit.hooks.contract.model import AnswerModel, Model, Policy, Prompt, Reading
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.options import Option, check_options
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Stream
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.family import SIZE, Family
 from probe_kit.hooks.registry import find_family
 
-
-class ContractSettings:
-    """What checks need to know about a family, with defaults.
-
-    family: name under which the registry loads the checkpoint; empty to leave out the checks of loading.
-    options: what the checkpoint needs to load. unloadable_options: options that cannot be tried, such as
-    quantisation without a GPU. configuration: a file of the checkpoint that the loader reads.
-    tolerance: of a batch against its rows one by one, and of sums against the stream, float32.
-    attention_tolerance: by how much shares of attention may add up to more than 1; they are means of rounded
-    numbers. letters: the options of questions. other_words: what makes a question longer.
-    """
-
-    family: str = ""
-    options: Mapping[str, Any] = {}
-    unloadable_options: frozenset[str] = frozenset()
-    configuration: str = "config.json"
-    tolerance: float = 1e-5
-    attention_tolerance: float = 1e-4
-    letters: tuple[str, ...] = ("A", "B")
-    other_words: str = " please"
-
-    def questions(self, seen: Sequence[Observation]) -> list[Prompt]:
-        """The observations' instructions as questions."""
-        return [Prompt(own, own.instruction, self.letters) for own in seen]
-
-
-class Given(Protocol):
-    """What a check may ask for; each is made when it is asked for, and raises SkipTest where there is none."""
-
-    @property
-    def model(self) -> Model:
-        """Under check."""
-
-    @property
-    def observations(self) -> list[Observation]:
-        """Two whose instructions differ in length."""
-
-    @property
-    def alike(self) -> list[Observation]:
-        """Two or more, of which at least two have instructions of equally many tokens."""
-
-    @property
-    def checkpoint(self) -> Path:
-        """A folder that may be copied, changed and loaded."""
-
-    @property
-    def other_options(self) -> Mapping[str, Any]:
-        """Per option another value than the default."""
-
-    @property
-    def folder(self) -> Path:
-        """An empty one."""
+LARGEST_COPY = 1_000_000_000
+"""Bytes of a checkpoint that is copied and loaded several times; a larger one costs minutes and disk."""
+INSTRUCTIONS = tuple(
+    f"Put the cube on the {name}" for name in ("star", "red shape", "cube", "blue shape", "green shape", "arrow")
+)
+"""Of different lengths; several have equally many letters, words or tokens."""
+NONE: Mapping[str, Any] = MappingProxyType({})
 
 
 class Subject:
-    """A model with one way to run it. given: what it is tried on."""
+    """An adapter under check; a context that removes what its checks wrote.
 
-    def __init__(self, settings: ContractSettings, given: Given) -> None:
-        self.settings, self.given = settings, given
+    family: its name; empty for a model that no registry loads, whose checks of loading are skipped. checkpoint:
+    a folder or hub id, None for the default. options: of loading. other_options: values of options that are not in
+    use; switches and closed lists of values need none. instructions: at least two; the first two differ in length,
+    and two have equally many tokens. model: one that is loaded; else a check that asks for it loads it.
+    tolerance: of a batch against its rows one by one, and of sums against the stream, float32.
+    Raises UsageError for options that the family does not have.
+    """
+
+    acting: ClassVar[bool]
+    """Whether it is checked as a policy."""
+    attention_tolerance: ClassVar[float] = 1e-4
+    """By how much shares of attention may add up to more than 1; they are means of rounded numbers."""
+    letters: ClassVar[tuple[str, ...]] = ("A", "B")
+    """The options of questions."""
+
+    def __init__(
+        self,
+        family: str = "",
+        checkpoint: str | Path | None = None,
+        *,
+        options: Mapping[str, Any] = NONE,
+        other_options: Mapping[str, Any] = NONE,
+        instructions: Sequence[str] = INSTRUCTIONS,
+        model: Model | None = None,
+        device: str = "cpu",
+        dtype: str | None = None,
+        tolerance: float = 1e-5,
+    ) -> None:
+        self.name, self.given_checkpoint = family, None if checkpoint is None else str(checkpoint)
+        self.options = check_options(family, self.family.options, options) if family else dict(options)
+        self._others, self.instructions, self.tolerance = other_options, tuple(instructions), tolerance
+        self.device, self.dtype, self._model = device, dtype, model
+        self._scratch: Path | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Remove what was written, and let the model go."""
+        self._model = None
+        if self._scratch is not None:
+            shutil.rmtree(self._scratch, ignore_errors=True)
+            self._scratch = None
+
+    # -- the model and its checkpoint ---------------------------------------------------------------------
 
     @property
     def model(self) -> Model:
-        """The model under check."""
-        return self.given.model
+        """The model under check, as users load it."""
+        if self._model is None:
+            self._model = self.family.load(self.given_checkpoint, self.device, self.dtype, options=self.options)
+        return self._model
 
-    @property
-    def seen(self) -> list[Observation]:
-        """As many observations as one call takes."""
-        return self.given.observations[: self.model.card.batch]
-
-    @property
-    def one(self) -> list[Observation]:
-        """The first observation."""
-        return self.given.observations[:1]
+    def share_model(self, other: "Subject") -> None:
+        """Check the model that another subject has loaded."""
+        self._model = other.model
 
     @property
     def family(self) -> Family:
         """The family of the registry. Raises SkipTest if none was named."""
-        if not self.settings.family:
-            raise SkipTest("no family was named; set `family`")
-        return find_family(self.settings.family)
+        if not self.name:
+            raise SkipTest("no family was named")
+        return find_family(self.name)
+
+    @cached_property
+    def checkpoint(self) -> Path:
+        """A folder that may be copied and loaded. Raises SkipTest where there is none, or a large one."""
+        place = self.family.place(self.given_checkpoint, self.options.get(SIZE))
+        if place is None:
+            raise SkipTest("the family brings its own weights; give --checkpoint to check how it loads")
+        folder = checkpoint_folder(place)
+        if (size := sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())) > LARGEST_COPY:
+            raise SkipTest(
+                f"the checkpoint has {size / 1e9:.1f} GB and would be copied; check a tiny one of the same layout"
+            )
+        return folder
+
+    @property
+    def folder(self) -> Path:
+        """A new empty folder."""
+        if self._scratch is None:
+            self._scratch = Path(tempfile.mkdtemp(prefix="probe-kit-check-"))
+        return Path(tempfile.mkdtemp(dir=self._scratch))
+
+    @property
+    def other_options(self) -> dict[str, tuple[Any, ...]]:
+        """Of every option the values that are not in use, as far as they are known."""
+        declared = [own for own in self.family.options if own.name != SIZE]
+        others = {own.name: _others(own, self.options.get(own.name, own.default)) for own in declared}
+        named = {name: (value,) for name, value in self._others.items()}
+        return {name: values for name, values in others.items() if values} | named
+
+    def load(self, checkpoint: Path, **options: Any) -> Model:
+        """The model of another checkpoint."""
+        return self.family.load(str(checkpoint), options={**self.loading_options, **options})
+
+    @property
+    def loading_options(self) -> dict[str, Any]:
+        """The options in use without a size, which stands for a checkpoint."""
+        return {name: value for name, value in self.options.items() if name != SIZE}
+
+    # -- what it is tried on ------------------------------------------------------------------------------
+
+    @property
+    def observations(self) -> list[Observation]:
+        """Two whose instructions differ in length."""
+        return self.alike[:2]
+
+    @cached_property
+    def alike(self) -> list[Observation]:
+        """One per instruction; at least two have equally many tokens."""
+        return examples_for(self.model, *self.instructions)
+
+    @property
+    def seen(self) -> list[Observation]:
+        """As many observations as one call takes."""
+        return self.observations[: self.model.card.batch]
+
+    @property
+    def one(self) -> list[Observation]:
+        """The first observation."""
+        return self.observations[:1]
+
+    def require_float32(self) -> None:
+        """Raise SkipTest for a model in a coarser precision, in which small differences are rounded away."""
+        if self.model.card.dtype != "float32":
+            raise SkipTest(f"in {self.model.card.dtype} a difference is rounded away; load the model in float32")
 
     @property
     def probed_backbone(self) -> Stream:
@@ -105,9 +172,7 @@ class Subject:
         require(bool(streams), f"streams {list(self.model.streams)}", "a probed stream with part='backbone'")
         return streams[0]
 
-    def load(self, checkpoint: Path, **options: Any) -> Model:
-        """The model as users load it."""
-        return self.family.load(str(checkpoint), options={**self.settings.options, **options})
+    # -- how it is run ------------------------------------------------------------------------------------
 
     def run(self, seen: Sequence[Observation]) -> NDArray[np.float32]:
         """One inference: a row of numbers per observation."""
@@ -123,8 +188,17 @@ class Subject:
         return self.model.roles(seen)
 
 
+def _others(option: Option, used: Any) -> tuple[Any, ...]:
+    """Return the values besides `used` that the declaration names."""
+    if option.kind is bool:
+        return (not (used is True or str(used).lower() in ("true", "yes", "on", "1")),)
+    return tuple(value for value in option.choices if str(value) != str(used))
+
+
 class PolicySubject(Subject):
     """A policy; one inference gives actions."""
+
+    acting = True
 
     @property
     def policy(self) -> Policy:
@@ -151,6 +225,8 @@ class PolicySubject(Subject):
 class AnswerSubject(Subject):
     """A model that answers; one inference gives the logits of the options."""
 
+    acting = False
+
     @property
     def answer_model(self) -> AnswerModel:
         """The model under check, which answers."""
@@ -166,20 +242,24 @@ class AnswerSubject(Subject):
     @property
     def questions(self) -> list[Prompt]:
         """About all observations."""
-        return self.settings.questions(self.given.observations)
+        return self.questions_of(self.observations)
 
     @property
     def asked(self) -> list[Prompt]:
         """About as many observations as one call takes."""
-        return self.settings.questions(self.seen)
+        return self.questions_of(self.seen)
+
+    def questions_of(self, seen: Sequence[Observation]) -> list[Prompt]:
+        """The observations' instructions as questions."""
+        return [Prompt(own, own.instruction, self.letters) for own in seen]
 
     def run(self, seen: Sequence[Observation]) -> NDArray[np.float32]:
         """The logits of the options."""
-        return self.ask(self.settings.questions(seen))
+        return self.ask(self.questions_of(seen))
 
     def roles_of(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Of the questions asked about them."""
-        return self.answer_model.asked_roles(self.led(self.settings.questions(seen)))
+        return self.answer_model.asked_roles(self.led(self.questions_of(seen)))
 
     def read(self, questions: Sequence[Prompt]) -> Reading:
         """One prefill of the questions."""
@@ -196,3 +276,26 @@ class AnswerSubject(Subject):
             own if own.begun else replace(own, options=tuple(lead + letter for letter in own.options))
             for own in questions
         ]
+
+
+def example_observations(instructions: Sequence[str], cameras: Sequence[str] = ()) -> list[Observation]:
+    """One observation per instruction: noise pictures, plausible states and intrinsics, from a fixed seed."""
+    rng = np.random.default_rng(0)
+    size = (48, 64, 3)
+    intrinsics = np.array([[60, 0, 32], [0, 60, 24], [0, 0, 1]], np.float32)
+    return [
+        Observation(
+            rng.integers(0, 256, size, dtype=np.uint8),
+            np.array([0.3, 0.02 * index, 0.15, 0, 0, 0, 0, 1], np.float32),
+            text,
+            intrinsics,
+            {camera: rng.integers(0, 256, size, dtype=np.uint8) for camera in cameras},
+        )
+        for index, text in enumerate(instructions)
+    ]
+
+
+def examples_for(model: Model, *instructions: str) -> list[Observation]:
+    """Observations that hold what the model needs."""
+    cameras = [need.removeprefix("camera.") for need in sorted(model.card.needs) if need.startswith("camera.")]
+    return example_observations(instructions, cameras)

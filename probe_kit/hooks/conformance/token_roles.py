@@ -32,7 +32,7 @@ def roles_cover_every_position_and_are_the_declared_ones(subject: Subject) -> No
     "Correct the order and the numbers of positions in `roles`.",
 )
 def another_picture_moves_image_positions_only(subject: Subject) -> None:
-    one = subject.given.observations[0]
+    one = subject.observations[0]
     _require_moves(subject, one, replace(one, image=255 - one.image), "image")
 
 
@@ -41,7 +41,7 @@ def another_picture_moves_image_positions_only(subject: Subject) -> None:
     "Correct the order and the numbers of positions in `roles`.",
 )
 def another_instruction_moves_language_positions_only(subject: Subject) -> None:
-    one, other = _alike(subject, subject.given.alike)
+    one, other = _alike(subject, subject.alike)
     _require_moves(subject, one, replace(one, instruction=other.instruction), "language")
 
 

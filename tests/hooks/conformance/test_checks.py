@@ -3,7 +3,8 @@
 import ast
 import dataclasses
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,10 +23,12 @@ from probe_kit.hooks import Family, Model, Observation, Roles, Site, Stream, Tap
 from probe_kit.hooks.checkpoints.weights import read_weights
 from probe_kit.hooks.conformance.check import CheckFailedError, SkipTest, check, refused, require_bits
 from probe_kit.hooks.conformance.contract import ANSWER_CHECKS, POLICY_CHECKS
-from probe_kit.hooks.conformance.examples import examples_for
-from probe_kit.hooks.conformance.subject import AnswerSubject, ContractSettings, PolicySubject, Subject
+from probe_kit.hooks.conformance.subject import (
+    AnswerSubject,
+    PolicySubject,
+    Subject,
+)
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.hooks.testing import AdapterContract, AnswerModelContract
 from tests.support.encoder_vla.policy import CHUNK, STEPS, WIDTH, EncoderPolicy, EncoderVLA, load, write_checkpoint
 from tests.support.parsed import parsed
 from tests.support.position_models import PositionModel, always, likes
@@ -51,14 +54,8 @@ def sound(checkpoint: Path) -> EncoderPolicy:
     return load(str(checkpoint))
 
 
-class Given:
-    """What checks ask for, of a model that is there."""
-
-    def __init__(self, model: Model, checkpoint: Path, folder: Path) -> None:
-        self.model, self.checkpoint, self.folder = model, checkpoint, folder
-        self.observations = examples_for(model, "Put the cube on the star", "Put the cube on the red shape")
-        self.alike = examples_for(model, "Put the cube on the star", "Put the cube on the cube")
-        self.other_options: Mapping[str, Any] = {}
+def policy_subject(model: Model, checkpoint: Path | str = "") -> PolicySubject:
+    return PolicySubject(checkpoint=checkpoint, model=model)
 
 
 # -- policies --------------------------------------------------------------------------------------------------
@@ -204,11 +201,11 @@ class Otherwise(EncoderPolicy):
     ],
 )
 def test_a_policy_that_breaks_a_promise_fails_its_check(
-    broken: type[EncoderPolicy], name: str, said: str, sound: EncoderPolicy, checkpoint: Path, tmp_path: Path
+    broken: type[EncoderPolicy], name: str, said: str, sound: EncoderPolicy, checkpoint: Path
 ) -> None:
-    good = PolicySubject(ContractSettings(), Given(sound, checkpoint, tmp_path))
+    good = policy_subject(sound, checkpoint)
     CHECKS[name](good)
-    bad = PolicySubject(ContractSettings(), Given(broken(sound.network, sound.card), checkpoint, tmp_path))
+    bad = policy_subject(broken(sound.network, sound.card), checkpoint)
     with pytest.raises((CheckFailedError, probe_kit.ProbeKitError), match=re.escape(said)) as failed:
         CHECKS[name](bad)
     assert isinstance(failed.value, probe_kit.ProbeKitError) or "; change: " in str(failed.value)
@@ -239,9 +236,9 @@ class Taking(EncoderPolicy):
     ],
 )
 def test_a_policy_that_taps_other_heads_fails_its_checks(
-    name: str, said: str, pi0_tiny: Pi0, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, said: str, pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    subject = PolicySubject(ContractSettings(), Given(pi0_tiny, tmp_path, tmp_path))
+    subject = policy_subject(pi0_tiny)
     CHECKS[name](subject)
     monkeypatch.setattr(pi0_tiny, "__class__", Tapping)
     with pytest.raises((CheckFailedError, probe_kit.ProbeKitError), match=said):
@@ -249,20 +246,18 @@ def test_a_policy_that_taps_other_heads_fails_its_checks(
 
 
 def test_heads_that_are_not_declared_and_not_refused_fail_their_check(
-    sound: EncoderPolicy, checkpoint: Path, tmp_path: Path
+    sound: EncoderPolicy, checkpoint: Path
 ) -> None:
     own = CHECKS["heads_that_are_not_declared_are_refused_by_name"]
-    own(PolicySubject(ContractSettings(), Given(sound, checkpoint, tmp_path)))
-    bad = PolicySubject(ContractSettings(), Given(Taking(sound.network, sound.card), checkpoint, tmp_path))
+    own(policy_subject(sound, checkpoint))
+    bad = policy_subject(Taking(sound.network, sound.card), checkpoint)
     with pytest.raises(CheckFailedError, match=r"tap\(backbone\.00\.heads\): no error"):
         own(bad)
 
 
-def test_a_model_whose_lens_leaves_the_norm_out_fails_its_check(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_model_whose_lens_leaves_the_norm_out_fails_its_check(monkeypatch: pytest.MonkeyPatch) -> None:
     own, vlm = CHECKS["the_last_row_of_the_logit_lens_is_the_output"], registry.load_model("vlm-tiny")
-    subject = AnswerSubject(ContractSettings(), Given(vlm, tmp_path, tmp_path))
+    subject = AnswerSubject(model=vlm)
     own(subject)
     right = vlm.unembedding
     assert right is not None
@@ -312,21 +307,21 @@ class Promising(EncoderPolicy):
     ],
 )
 def test_gradients_that_are_not_those_of_the_actions_fail_their_check(
-    broken: type[EncoderPolicy], name: str, said: str, sound: EncoderPolicy, checkpoint: Path, tmp_path: Path
+    broken: type[EncoderPolicy], name: str, said: str, sound: EncoderPolicy, checkpoint: Path
 ) -> None:
-    CHECKS[name](PolicySubject(ContractSettings(), Given(Sloped(sound.network, sound.card), checkpoint, tmp_path)))
-    bad = PolicySubject(ContractSettings(), Given(broken(sound.network, sound.card), checkpoint, tmp_path))
+    CHECKS[name](policy_subject(Sloped(sound.network, sound.card), checkpoint))
+    bad = policy_subject(broken(sound.network, sound.card), checkpoint)
     with pytest.raises(CheckFailedError, match=re.escape(said)):
         CHECKS[name](bad)
 
 
-def test_gradients_are_declared_or_refused_by_name(sound: EncoderPolicy, checkpoint: Path, tmp_path: Path) -> None:
+def test_gradients_are_declared_or_refused_by_name(sound: EncoderPolicy, checkpoint: Path) -> None:
     name = "actions_with_a_graph_are_the_actions"
     with pytest.raises(SkipTest, match="declares no gradients"):
-        CHECKS[name](PolicySubject(ContractSettings(), Given(sound, checkpoint, tmp_path)))
+        CHECKS[name](policy_subject(sound, checkpoint))
     promising = Promising(sound.network, sound.card)
     with pytest.raises(NotImplementedError, match="does not implement `differentiable`"):
-        CHECKS[name](PolicySubject(ContractSettings(), Given(promising, checkpoint, tmp_path)))
+        CHECKS[name](policy_subject(promising, checkpoint))
 
 
 # -- loading ---------------------------------------------------------------------------------------------------
@@ -340,13 +335,11 @@ def load_sloppily(checkpoint: str, *_: object, **__: object) -> EncoderPolicy:
     return EncoderPolicy(network.eval(), card)
 
 
-def subject_of(loader: str, given: Given, monkeypatch: pytest.MonkeyPatch) -> Subject:
+def subject_of(loader: str, checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> Subject:
     family = Family("encoder-vla", "", None, loader, needs_checkpoint=True)
     entry = SimpleNamespace(name="encoder-vla", load=lambda: family, value="x:y", dist=None)
     monkeypatch.setattr(registry, "family_entries", lambda: [entry])
-    settings = ContractSettings()
-    settings.family = "encoder-vla"
-    return PolicySubject(settings, given)
+    return PolicySubject("encoder-vla", checkpoint)
 
 
 @pytest.mark.parametrize(
@@ -357,18 +350,17 @@ def subject_of(loader: str, given: Given, monkeypatch: pytest.MonkeyPatch) -> Su
     ],
 )
 def test_a_loader_that_breaks_a_promise_fails_its_check(
-    name: str, said: str, sound: EncoderPolicy, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, said: str, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    given = Given(sound, checkpoint, tmp_path)
-    CHECKS[name](subject_of("tests.support.encoder_vla.policy:load", given, monkeypatch))
-    given.folder = tmp_path / "again"
-    bad = subject_of("tests.hooks.conformance.test_checks:load_sloppily", given, monkeypatch)
-    with pytest.raises((CheckFailedError, UsageError), match=said):
+    with subject_of("tests.support.encoder_vla.policy:load", checkpoint, monkeypatch) as good:
+        CHECKS[name](good)
+    sloppy = subject_of("tests.hooks.conformance.test_checks:load_sloppily", checkpoint, monkeypatch)
+    with sloppy as bad, pytest.raises((CheckFailedError, UsageError), match=said):
         CHECKS[name](bad)
 
 
 def test_weights_that_are_nearly_the_networks_are_found(
-    sound: EncoderPolicy, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sound: EncoderPolicy, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The loader compares nothing, so that a missing tensor stays as it was drawn."""
 
@@ -378,21 +370,31 @@ def test_weights_that_are_nearly_the_networks_are_found(
         return EncoderPolicy(network.eval(), sound.card)
 
     own = CHECKS["weights_that_are_not_exactly_the_models_are_refused"]
-    given = Given(sound, checkpoint, tmp_path)
-    subject = subject_of("tests.support.encoder_vla.policy:load", given, monkeypatch)
-    own(subject)
-    monkeypatch.setattr(Subject, "load", load_nearly)
-    given.folder = tmp_path / "again"
-    with pytest.raises(CheckFailedError, match="a checkpoint in which a tensor is missing: no error"):
+    with subject_of("tests.support.encoder_vla.policy:load", checkpoint, monkeypatch) as subject:
         own(subject)
+        monkeypatch.setattr(Subject, "load", load_nearly)
+        with pytest.raises(CheckFailedError, match="a checkpoint in which a tensor is missing: no error"):
+            own(subject)
+
+
+def test_a_recorded_output_that_differs_fails_its_check(golden_pi0: Path, tmp_path: Path) -> None:
+    """A reference that lies beside the checkpoint is compared without being asked for."""
+    own, folder = CHECKS["recorded_outputs_are_reproduced"], tmp_path / "reference"
+    shutil.copytree(golden_pi0, folder)
+    own(PolicySubject("pi0", folder / "checkpoint"))
+    with np.load(folder / "reference.npz") as stored:
+        arrays = dict(stored)
+    np.savez(folder / "reference.npz", **{**arrays, "actions": arrays["actions"] + 1})
+    with pytest.raises(CheckFailedError, match="other values of actions;"):
+        own(PolicySubject("pi0", folder / "checkpoint"))
 
 
 # -- models that answer ----------------------------------------------------------------------------------------
 
 
-def test_an_answer_model_without_a_picture_in_it_fails_the_checks_of_pictures(tmp_path: Path) -> None:
+def test_an_answer_model_without_a_picture_in_it_fails_the_checks_of_pictures() -> None:
     """It never looks, so that its roles promise a picture that is not read."""
-    subject = AnswerSubject(ContractSettings(), Given(PositionModel(likes("A"), always("A")), tmp_path, tmp_path))
+    subject = AnswerSubject(model=PositionModel(likes("A"), always("A")))
     CHECKS["a_reading_has_a_logit_per_option_and_their_mass_is_a_share"](subject)
     CHECKS["what_is_spoken_repeats_and_is_as_long_as_asked"](subject)
     with pytest.raises(CheckFailedError, match=r"positions with the role image; expected: none.*; change: Build"):
@@ -406,11 +408,9 @@ def test_an_answer_model_without_a_picture_in_it_fails_the_checks_of_pictures(tm
 # -- the mechanism ---------------------------------------------------------------------------------------------
 
 
-def test_the_contract_classes_have_a_test_per_check_and_no_other() -> None:
-    for contract, checks in ((AdapterContract, POLICY_CHECKS), (AnswerModelContract, ANSWER_CHECKS)):
-        tests = {name for name in dir(contract) if name.startswith("test_")}
-        assert tests == {f"test_{own.name}" for own in checks}
-        assert len(checks) == len({own.name for own in checks}) > 25
+def test_the_contracts_name_every_check_once() -> None:
+    for checks in (POLICY_CHECKS, ANSWER_CHECKS):
+        assert len(checks) == len({str(own) for own in checks}) > 25
 
 
 def test_every_check_is_a_sentence_with_an_advice() -> None:
@@ -421,11 +421,10 @@ def test_every_check_is_a_sentence_with_an_advice() -> None:
         assert len(own.sentence.split()) <= 25
 
 
-def test_pytest_is_imported_by_the_contract_classes_alone() -> None:
-    """The command runs where pytest is not installed."""
+def test_pytest_is_imported_nowhere() -> None:
+    """The checks run where it is not installed."""
     root = Path(probe_kit.__file__).parent
-    importing = [path.relative_to(root).as_posix() for path in root.rglob("*.py") if "pytest" in imported(path)]
-    assert importing == ["hooks/testing.py"]
+    assert [path for path in root.rglob("*.py") if "pytest" in imported(path)] == []
 
 
 def imported(path: Path) -> set[str]:
@@ -469,7 +468,7 @@ def test_numbers_are_compared_bit_for_bit_and_with_their_shape() -> None:
         require_bits(ones, ones[:2], "one", "the other")
 
 
-def test_without_a_family_the_checks_of_loading_are_skipped(sound: EncoderPolicy, tmp_path: Path) -> None:
-    subject = PolicySubject(ContractSettings(), Given(sound, tmp_path, tmp_path))
+def test_without_a_family_the_checks_of_loading_are_skipped(sound: EncoderPolicy) -> None:
+    subject = policy_subject(sound)
     with pytest.raises(SkipTest, match="no family was named"):
         CHECKS["an_option_that_is_not_declared_is_refused"](subject)

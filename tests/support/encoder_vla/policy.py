@@ -122,7 +122,7 @@ def load(
         checkpoint=checkpoint,
         weights_sha256=audit.sha256,
         random_weights=audit.random,
-        weights_seed=weights_seed if audit.random else None,
+        weights_seed=weights_seed if random_weights else None,
         parameters=audit.parameters,
         dtype=dtype or "float32",
         device=device,

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,8 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError, WeightsError
 from probe_kit.hooks import Observation, Site, capture, edit
+from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.groot.adapter import Groot, check_groot_words, load_groot
-from probe_kit.hooks.testing import AdapterContract
 from probe_kit.models.lerobot import groot as network
 from tests.support.groot_checkpoints import CHUNK, HORIZON, TAG, write_groot, write_nvidias
 from tests.support.pi05_checkpoints import HIGH, LEAST, MOST
@@ -37,27 +36,9 @@ def groot(folder: Path) -> Groot:
 
 @pytest.fixture
 def seen(groot: Groot) -> list[Observation]:
-    (one,) = AdapterContract.examples(groot, "Put the cube on the star!")
+    (one,) = examples_for(groot, "Put the cube on the star!")
     picture = np.random.default_rng(0).integers(0, 256, (48, 80, 3), np.uint8)
     return [replace(one, image=picture, state=np.linspace(-0.2, 0.7, 8, dtype=np.float32))]
-
-
-class TestGroot(AdapterContract):
-    family = "groot"
-    options: Mapping[str, Any] = {"embodiment": TAG}
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, folder: Path) -> Path:
-        return folder / "base"
-
-    @pytest.fixture
-    def policy(self, folder: Path) -> Groot:
-        return load_groot(str(folder / "base"), "cpu", "float32", embodiment=TAG)
-
-    @pytest.fixture
-    def other_options(self, folder: Path) -> Mapping[str, Any]:
-        vlm = str(folder / "base" / "vlm")
-        return {"embodiment": "other", "vlm": vlm, "resize": "lerobot", "letterbox": True}
 
 
 def lerobots(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[GrootPolicy, Any, Any]:
@@ -264,7 +245,7 @@ def test_the_embodiment_of_nvidias_layout_must_be_chosen_and_be_there(folder: Pa
     with pytest.raises(UsageError, match="Leave it out"):
         load_groot(str(folder), embodiment=TAG)
     one, other = (load_groot(str(folder / "base"), embodiment=tag) for tag in (TAG, "other"))
-    observation = AdapterContract.examples(one, "put the cube on the star")
+    observation = examples_for(one, "put the cube on the star")
     actions = [own.infer_without_acting(observation, [0]) for own in (one, other)]
     assert not np.array_equal(*actions)
 

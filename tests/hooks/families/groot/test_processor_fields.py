@@ -16,8 +16,8 @@ from torchvision.transforms import v2
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks import Observation
+from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.groot.adapter import Groot, load_groot
-from probe_kit.hooks.testing import AdapterContract
 from tests.support.groot_checkpoints import TAG, write_nvidias
 from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST
 
@@ -59,7 +59,7 @@ def changed(stored: Path, tmp_path: Path) -> Changed:
 
 
 def seen(policy: Groot, picture: NDArray[np.uint8] | None = None) -> list[Observation]:
-    (one,) = AdapterContract.examples(policy, "put the cube on the star")
+    (one,) = examples_for(policy, "put the cube on the star")
     image = np.random.default_rng(0).integers(0, 256, (48, 80, 3), np.uint8) if picture is None else picture
     return [replace(one, image=image, state=STATE)]
 

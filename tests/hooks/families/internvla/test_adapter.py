@@ -2,7 +2,6 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,8 +13,6 @@ from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.capturing.capture_context import edit
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.hooks.families.internvla.adapter import InternVLA, load_internvla
-from probe_kit.hooks.families.internvla.convert import convert
-from probe_kit.hooks.testing import AdapterContract
 from probe_kit.models.internvla import dino_pixels
 from tests.support.internvla_checkpoints import write_checkpoint
 
@@ -28,53 +25,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def loaded(run: Path) -> InternVLA:
     return load_internvla(str(run), steps=5, unnorm_key="bridge_dataset")
-
-
-class TestInternVLA(AdapterContract):
-    family = "internvla-m1"
-    options = {"unnorm_key": "bridge_dataset"}
-    configuration = "config.yaml"
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, run: Path) -> Path:
-        return run
-
-    @pytest.fixture
-    def other_options(self, run: Path) -> dict[str, Any]:
-        vlm, weights = str(run.parent / "vlm"), "steps_7_pytorch_model.pt"
-        return {"steps": 5, "guidance": 1.0, "unnorm_key": "fractal20220817_data", "vlm": vlm, "tokenizer": vlm,
-                "weights": weights}  # fmt: skip
-
-    @pytest.fixture
-    def policy(self, loaded: InternVLA) -> InternVLA:
-        return loaded
-
-
-@pytest.mark.slow
-class TestConvertedInternVLA(AdapterContract):
-    """One folder of safetensors, whose tensors can be damaged one by one."""
-
-    family = "internvla-m1"
-    options = {"steps": 2, "unnorm_key": "bridge_dataset"}
-    unloadable_options = frozenset({"weights"})  # it has one file, and no steps
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-        out = tmp_path_factory.mktemp("converted") / "out"
-        convert(str(run), out)
-        return out
-
-    @pytest.fixture
-    def other_options(self, run: Path) -> dict[str, Any]:
-        vlm = str(run.parent / "vlm")
-        return {"steps": 5, "guidance": 1.0, "unnorm_key": "fractal20220817_data", "vlm": vlm, "tokenizer": vlm}
-
-
-@pytest.mark.slow
-class TestInternVLAWithoutGuidance(AdapterContract):
-    @pytest.fixture
-    def policy(self, run: Path) -> InternVLA:
-        return load_internvla(str(run), steps=4, guidance=1.0, unnorm_key="bridge_dataset")
 
 
 def test_all_that_acts_passes_through_the_end_of_the_bridge(loaded: InternVLA, observation: Observation) -> None:

@@ -1,6 +1,4 @@
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks import Observation, Site, capture
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.families.magma.adapter import Magma, load_magma
-from probe_kit.hooks.testing import AdapterContract, AnswerModelContract, example_observations
+from probe_kit.hooks.testing import example_observations
 from tests.support.magma_checkpoints import IDS, small_network, weights, write_checkpoint
 
 INSTRUCTIONS = ["Put the cube on the star", "Put the cube on the red shape"]
@@ -31,74 +29,6 @@ def unsteered(tmp_path_factory: pytest.TempPathFactory) -> Magma:
     return load_magma(
         str(write_checkpoint(tmp_path_factory.mktemp("random"), steered=False)), unnorm_key="bridge_orig"
     )
-
-
-class TestMagma(AdapterContract):
-    family = "magma"
-    options = {"unnorm_key": "bridge_orig"}
-    # They need files of their own: test_every_option_reaches_the_card below and test_checkpoint.py.
-    unloadable_options = frozenset({"unnorm_key", "statistics", "layer_scale"})
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, folder: Path) -> Path:
-        return folder
-
-    @pytest.fixture
-    def other_options(self, folder: Path) -> dict[str, Any]:
-        return {
-            "shrink": 0,
-            "prompt": "act2answer",
-            "temperature": 0.7,
-            "tokenizer": str(folder),
-        }
-
-    @pytest.fixture
-    def policy(self, loaded: Magma) -> Magma:
-        return loaded
-
-
-@pytest.mark.slow
-class TestMagmaWithWholePictures(AdapterContract):
-    """Pictures of another shape than a square, hence maps stitched from several crops."""
-
-    @pytest.fixture
-    def policy(self, folder: Path) -> Magma:
-        return load_magma(str(folder), shrink=0, unnorm_key="bridge_orig")
-
-    @pytest.fixture
-    def observations(self) -> list[Observation]:
-        small, large = example_observations(INSTRUCTIONS)
-        return [small, Observation(np.tile(large.image, (3, 1, 1)), large.state, large.instruction)]
-
-
-@pytest.mark.slow
-class TestMagmaDrawn(AdapterContract):
-    @pytest.fixture
-    def policy(self, folder: Path) -> Magma:
-        return load_magma(str(folder), temperature=0.7, unnorm_key="bridge_orig")
-
-
-@pytest.mark.slow
-class TestMagmaAsked(AnswerModelContract):
-    """Its own questions, not those for an action; a begun answer behind the frames."""
-
-    family = "magma"
-    unloadable_options = TestMagma.unloadable_options
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
-        return write_checkpoint(tmp_path_factory.mktemp("asked"), steered=False)
-
-    @pytest.fixture
-    def other_options(self, checkpoint: Path) -> dict[str, Any]:
-        return {"shrink": 0, "prompt": "act2answer", "temperature": 0.7, "tokenizer": str(checkpoint)}
-
-    @pytest.fixture
-    def answer_model(self, unsteered: Magma) -> Magma:
-        return unsteered
-
-    def questions(self, seen: Sequence[Observation]) -> list[Prompt]:
-        return [Prompt(own, own.instruction, self.letters, "It is ") for own in seen]
 
 
 # -- acting ----------------------------------------------------------------------------------------------

@@ -15,8 +15,8 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CaptureError, CheckpointError, InstructionError, ObservationError, WeightsError
 from probe_kit.hooks import Observation, capture
+from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.molmoact2.adapter import MolmoAct2, check_molmoact2_words, load_molmoact2
-from probe_kit.hooks.testing import AdapterContract
 from probe_kit.models.lerobot import molmoact2 as network
 from tests.support.lerobot_pipelines import changed, raw, save_pipelines
 from tests.support.molmoact2_checkpoints import write_molmoact2
@@ -35,19 +35,7 @@ def molmoact2(folder: Path) -> MolmoAct2:
 
 @pytest.fixture
 def seen(molmoact2: MolmoAct2) -> list[Observation]:
-    return AdapterContract.examples(molmoact2, "Put the cube on the star", "Put the cube on the red shape")
-
-
-class TestMolmoAct2(AdapterContract):
-    family = "molmoact2"
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, folder: Path) -> Path:
-        return folder
-
-    @pytest.fixture
-    def policy(self, molmoact2: MolmoAct2) -> MolmoAct2:
-        return molmoact2
+    return examples_for(molmoact2, "Put the cube on the star", "Put the cube on the red shape")
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
@@ -238,7 +226,7 @@ def test_roles_name_pictures_instruction_and_state(molmoact2: MolmoAct2, seen: l
 
 def test_two_cameras_are_told_apart(tmp_path: Path) -> None:
     policy = load_molmoact2(str(write_molmoact2(tmp_path, cameras=("image", "wrist")))).showing(["image", "wrist"])
-    (one,) = AdapterContract.examples(policy, "put the cube on the star")
+    (one,) = examples_for(policy, "put the cube on the star")
     one = replace(one, cameras={"wrist": one.image[:, ::-1].copy()})
     (roles,) = policy.roles([one])["backbone"]
     counts = [int(roles.mask(f"image.{camera}").sum()) for camera in ("image", "wrist")]

@@ -2,7 +2,6 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import torch
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.families.openvla.adapter import PROMPTS, OpenVLA, load_openvla
-from probe_kit.hooks.testing import AdapterContract
 from probe_kit.models.statistics_choice import STATISTICS_FILE
 from tests.support.prismatic_checkpoints import SINGLE, config_values, write_checkpoint, write_tokenizer
 
@@ -41,51 +39,6 @@ def mistral(tmp_path_factory: pytest.TempPathFactory) -> OpenVLA:
 @pytest.fixture(scope="module")
 def golden(golden_openvla: Path) -> OpenVLA:
     return load_openvla(str(golden_openvla / "checkpoint"), tokenizer="bytes", unnorm_key="bridge_orig")
-
-
-class TestFusedLlama(AdapterContract):
-    family = "openvla"
-    options = {"tokenizer": "bytes", "unnorm_key": "bridge_orig"}
-    unloadable_options = frozenset({"bits"})
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, folder: Path) -> Path:
-        return folder
-
-    @pytest.fixture
-    def other_options(self, tmp_path: Path) -> dict[str, Any]:
-        words = str(write_tokenizer(tmp_path))
-        return {"unnorm_key": "other", "prompt": "openvla-v01", "centre_crop": True, "tokenizer": words,
-                "temperature": 0.6, "resize": "tensor", "top_k": "7"}  # fmt: skip
-
-    @pytest.fixture
-    def policy(self, fused: OpenVLA) -> OpenVLA:
-        return fused
-
-
-@pytest.mark.slow
-class TestSingleTowerMistralWithATokenizerFile(AdapterContract):
-    @pytest.fixture
-    def policy(self, mistral: OpenVLA) -> OpenVLA:
-        return mistral
-
-    @pytest.fixture
-    def observations(self, observation: Observation) -> list[Observation]:
-        return [
-            replace(observation, instruction=text)
-            for text in ("Put the cube on the star", "take the red cube to the star")
-        ]
-
-    @pytest.fixture
-    def alike(self, observation: Observation) -> list[Observation]:
-        return [replace(observation, instruction=f"Put the cube on the {noun}") for noun in ("star", "shape")]
-
-
-@pytest.mark.slow
-class TestGoldenOpenVLA(AdapterContract):
-    @pytest.fixture
-    def policy(self, golden: OpenVLA) -> OpenVLA:
-        return golden
 
 
 # -- prompt ----------------------------------------------------------------------------------------------------

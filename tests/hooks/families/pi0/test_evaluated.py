@@ -4,7 +4,6 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -18,7 +17,6 @@ from probe_kit.hooks.families.pi0 import adapter, evaluated
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
 from probe_kit.hooks.families.shared.statistics_bounds import StatisticsFile
 from probe_kit.hooks.registry import find_family
-from probe_kit.hooks.testing import AdapterContract
 from tests.support.pi0_checkpoints import bounds_of, network_chunk, write_intact, write_statistics
 
 SEED = 3
@@ -44,25 +42,6 @@ def seen() -> Observation:
     image = np.random.default_rng(1).integers(0, 256, (480, 640, 3), dtype=np.uint8)
     state = np.array([0.292, -0.006, 0.135, -0.0045, 0.0568, -0.019, 0.0, 0.8], np.float32)
     return Observation(image, state, "Put the cube on the red shape")
-
-
-@pytest.mark.slow
-class TestTheProtocolsPi0(AdapterContract):
-    family = "pi0"
-    options: ClassVar[dict[str, Any]] = {"statistics": "bridge"}
-    unloadable_options = frozenset({"unread"})  # of config.json, see test_old_layout
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, folder: Path) -> Path:
-        return folder
-
-    @pytest.fixture
-    def other_options(self, statistics: Path) -> dict[str, Any]:
-        return {"statistics": str(statistics), "picture": "padded", "openness": "release"}
-
-    @pytest.fixture
-    def policy(self, policy: Pi0) -> Pi0:
-        return policy
 
 
 @pytest.mark.parametrize("openness", ["measured", "release"])

@@ -16,8 +16,8 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, InstructionError, WeightsError
 from probe_kit.hooks import Observation, capture
+from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.pi05.adapter import Pi05, load_pi05
-from probe_kit.hooks.testing import AdapterContract
 from probe_kit.models.lerobot import pi05 as network
 from tests.support.pi05_checkpoints import write_pi05
 
@@ -34,24 +34,7 @@ def pi05(folder: Path) -> Pi05:
 
 @pytest.fixture
 def seen(pi05: Pi05) -> list[Observation]:
-    return AdapterContract.examples(pi05, "put the cube on the red shape", "put the cube on the star")
-
-
-class TestPi05(AdapterContract):
-    family = "pi05"
-    unloadable_options = frozenset({"statistics"})  # this checkpoint holds its own
-
-    @pytest.fixture
-    def other_options(self) -> dict[str, str]:
-        return {"picture": "squashed", "openness": "release"}
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, folder: Path) -> Path:
-        return folder
-
-    @pytest.fixture
-    def policy(self, pi05: Pi05) -> Pi05:
-        return pi05
+    return examples_for(pi05, "put the cube on the red shape", "put the cube on the star")
 
 
 def test_actions_are_those_of_lerobots_own_blocks_bit_for_bit(

@@ -16,8 +16,8 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.hooks import Observation, capture
+from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast, check_pi0_fast_words, load_pi0_fast
-from probe_kit.hooks.testing import AdapterContract
 from probe_kit.models.lerobot import pi0_fast as network
 from tests.support.pi0_fast_checkpoints import HEAD, INSTRUCTIONS, TRAINED, write_pi0_fast
 
@@ -42,23 +42,7 @@ def untrained(tmp_path_factory: pytest.TempPathFactory) -> Pi0Fast:
 
 @pytest.fixture
 def seen(pi0_fast: Pi0Fast) -> list[Observation]:
-    return AdapterContract.examples(pi0_fast, *INSTRUCTIONS)
-
-
-class TestPi0Fast(AdapterContract):
-    family = "pi0-fast"
-
-    @pytest.fixture
-    def other_options(self) -> dict[str, float]:
-        return {"captured_tokens": 3, "temperature": 0.5, "lowercase": True}
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, folder: Path) -> Path:
-        return folder
-
-    @pytest.fixture
-    def policy(self, pi0_fast: Pi0Fast) -> Pi0Fast:
-        return pi0_fast
+    return examples_for(pi0_fast, *INSTRUCTIONS)
 
 
 def test_whole_chunks_are_acted_on_without_a_flag(pi0_fast: Pi0Fast, seen: list[Observation]) -> None:

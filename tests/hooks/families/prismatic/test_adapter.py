@@ -1,6 +1,5 @@
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +9,7 @@ from probe_kit.errors import InstructionError, ObservationError, UnknownSiteErro
 from probe_kit.hooks import Observation, Prompt, Site, capture, load_policy
 from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
 from probe_kit.hooks.families.prismatic.frames import frame_of
-from probe_kit.hooks.testing import AnswerModelContract
-from tests.support.prismatic_checkpoints import write_checkpoint, write_tokenizer
+from tests.support.prismatic_checkpoints import write_checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -105,24 +103,6 @@ def test_what_is_spoken_goes_on_from_the_prefill(tmp_path: Path, observation: Ob
     assert said.tolist() == decoded.ids.tolist()
     with pytest.raises(UsageError, match="does not come from this model"):
         whole.speak(reading, 3)
-
-
-class TestPrismatic(AnswerModelContract):
-    family = "prismatic"
-    options = {"tokenizer": "bytes"}
-    unloadable_options = frozenset({"bits"})
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, tmp_path_factory: pytest.TempPathFactory) -> Path:
-        return write_checkpoint(tmp_path_factory.mktemp("prismatic"), model_type="prismatic")
-
-    @pytest.fixture
-    def other_options(self, tmp_path: Path) -> dict[str, Any]:
-        return {"steps": 2, "tokenizer": str(write_tokenizer(tmp_path))}
-
-    @pytest.fixture(scope="class")
-    def answer_model(self, checkpoint: Path) -> Prismatic:
-        return load_prismatic(str(checkpoint), tokenizer="bytes")
 
 
 def test_a_reading_compares_what_may_stand_behind_the_prompt(

@@ -10,7 +10,7 @@ import torch
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
 from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.families.spatialvla.adapter import SpatialVLA, load_spatialvla
-from probe_kit.hooks.testing import AdapterContract, example_observations
+from probe_kit.hooks.testing import example_observations
 from probe_kit.models.spatialvla import Decoded
 from tests.support.spatialvla_checkpoints import (
     BINS,
@@ -18,7 +18,6 @@ from tests.support.spatialvla_checkpoints import (
     edges,
     processor_values,
     write_checkpoint,
-    write_tokenizer,
 )
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")
@@ -63,51 +62,6 @@ def seen() -> list[Observation]:
     """Two cameras, two instructions of different length."""
     examples = example_observations(["Put the cube on the star", "Put the cube on the red shape"])
     return [replace(one, intrinsics=SCENE * [[1 + row], [1], [1]]) for row, one in enumerate(examples)]
-
-
-class _Letters:
-    @pytest.fixture
-    def alike(self, seen: list[Observation]) -> list[Observation]:
-        """One letter of a tokenizer of letters."""
-        return [replace(seen[0], instruction=text) for text in ("Put it on the star", "Put it on the stir")]
-
-
-@pytest.mark.slow
-class TestOneStepHeard(_Letters, AdapterContract):
-    family = "spatialvla"
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, folder: Path) -> Path:
-        return folder
-
-    @pytest.fixture
-    def other_options(self, tmp_path: Path) -> dict[str, Any]:
-        return {
-            "unnorm_key": "my_arm", "prompt": "question", "lowercase": False, "camera": "default",
-            "iterations": "chunk", "constrained": True, "ensemble": True,
-            "tokenizer": str(write_tokenizer(tmp_path)),
-        }  # fmt: skip
-
-    @pytest.fixture
-    def policy(self, plain: SpatialVLA) -> SpatialVLA:
-        return plain
-
-    @pytest.fixture
-    def observations(self, seen: list[Observation]) -> list[Observation]:
-        return seen
-
-
-@pytest.mark.slow
-class TestWholeChunkHeardWithinSlotsByTheTrainingCamera(_Letters, AdapterContract):
-    @pytest.fixture
-    def policy(self, chunked: SpatialVLA) -> SpatialVLA:
-        return chunked
-
-
-class TestWithoutDepth(_Letters, AdapterContract):
-    @pytest.fixture
-    def policy(self, flat: SpatialVLA) -> SpatialVLA:
-        return flat
 
 
 # -- capture ---------------------------------------------------------------------------------------------------

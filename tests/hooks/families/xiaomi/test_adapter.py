@@ -2,7 +2,6 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from torch.nn import Module
 from probe_kit.errors import CheckpointError, InstructionError, UsageError, WeightsError
 from probe_kit.hooks import Observation, Site, capture, edit, load_policy
 from probe_kit.hooks.families.xiaomi.adapter import Xiaomi, load_xiaomi
-from probe_kit.hooks.testing import AdapterContract
 from tests.support.qwen_checkpoints import ID
 from tests.support.xiaomi_checkpoints import config_values, write_checkpoint
 
@@ -25,30 +23,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def loaded(folder: Path) -> Xiaomi:
     return load_xiaomi(str(folder), robot="bridge_delta")
-
-
-class TestXiaomi(AdapterContract):
-    family = "xiaomi-r0"
-    options = {"robot": "bridge_delta"}
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, folder: Path) -> Path:
-        return folder
-
-    @pytest.fixture
-    def other_options(self, folder: Path) -> dict[str, Any]:
-        return {"robot": "fractal", "steps": 3, "tokenizer": str(folder), "openness": "release"}
-
-    @pytest.fixture
-    def policy(self, loaded: Xiaomi) -> Xiaomi:
-        return loaded
-
-
-@pytest.mark.slow
-class TestXiaomiAsTheGoogleRobotInThreeSteps(AdapterContract):
-    @pytest.fixture
-    def policy(self, folder: Path) -> Xiaomi:
-        return load_xiaomi(str(folder), robot="fractal", steps=3)
 
 
 def test_only_the_last_blocks_memory_is_read(loaded: Xiaomi, observation: Observation) -> None:

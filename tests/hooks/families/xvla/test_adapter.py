@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,8 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError, WeightsError
 from probe_kit.hooks import Observation, Site, capture, edit
+from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.xvla.adapter import Xvla, check_xvla_words, load_xvla
-from probe_kit.hooks.testing import AdapterContract
 from probe_kit.models.lerobot import xvla as network
 from tests.support.xvla_checkpoints import CHUNK, DOMAIN, DOMAINS, TEXT, to_authors_layout, write_xvla
 
@@ -37,25 +36,9 @@ def xvla(folder: Path) -> Xvla:
 
 @pytest.fixture
 def seen(xvla: Xvla) -> list[Observation]:
-    (one,) = AdapterContract.examples(xvla, "Put the cube on the star")
+    (one,) = examples_for(xvla, "Put the cube on the star")
     picture = np.random.default_rng(0).integers(0, 256, (48, 80, 3), np.uint8)
     return [replace(one, image=picture, state=np.linspace(-0.2, 0.7, 8, dtype=np.float32))]
-
-
-class TestXvla(AdapterContract):
-    family = "xvla"
-
-    @pytest.fixture(scope="class")
-    def checkpoint(self, folder: Path) -> Path:
-        return folder
-
-    @pytest.fixture
-    def policy(self, xvla: Xvla) -> Xvla:
-        return xvla
-
-    @pytest.fixture
-    def other_options(self) -> Mapping[str, Any]:
-        return {"domain": 1, "picture": "squashed"}
 
 
 def lerobots(folder: Path) -> tuple[XVLAPolicy, Any, Any]:

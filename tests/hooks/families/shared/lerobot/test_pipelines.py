@@ -17,9 +17,9 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks import Observation
+from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.pi0_fast.adapter import load_pi0_fast
 from probe_kit.hooks.families.pi05.adapter import load_pi05
-from probe_kit.hooks.testing import AdapterContract
 from probe_kit.models.lerobot.pi0 import Pi0Size, resized
 from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, sized
 from tests.support.lerobot_pipelines import changed, raw, save_pipelines, without_hub
@@ -152,7 +152,7 @@ def test_an_unknown_step_behind_the_policy_forbids_to_act_and_not_to_capture(fol
     _inserted(content["steps"])
     path.write_text(json.dumps(content), encoding="utf-8")
     policy = load_pi05(str(folder))
-    seen = AdapterContract.examples(policy, "put the cube on the star")
+    seen = examples_for(policy, "put the cube on the star")
     with pytest.raises(CheckpointError, match="vla_jepa_binarize_gripper"):
         policy.act(seen, [0])
     assert "vla_jepa_binarize_gripper" in str(policy.embodiment_mismatch())
@@ -181,7 +181,7 @@ def test_changes_relative_to_the_state_are_no_actions_of_this_arm(folder: Path, 
     save_pipelines(folder, use_relative_actions=False)  # what was read at loading counts
     assert policy.predicts_relative
     assert any("relative to the state" in note for note in policy.card.notes)
-    (one,) = AdapterContract.examples(policy, "put the cube on the star")
+    (one,) = examples_for(policy, "put the cube on the star")
     with pytest.raises(CheckpointError, match="relative to the state"):
         policy.act([one], [0])
 
@@ -189,7 +189,7 @@ def test_changes_relative_to_the_state_are_no_actions_of_this_arm(folder: Path, 
 def test_the_length_of_the_text_is_that_of_the_saved_step(folder: Path) -> None:
     save_pipelines(folder, changed("tokenizer_processor", max_length=20))
     policy = load_pi05(str(folder))
-    (one,) = AdapterContract.examples(policy, "put the cube on the star")
+    (one,) = examples_for(policy, "put the cube on the star")
     with pytest.raises(InstructionError, match="this checkpoint reads 20"):
         policy.act([one], [0])
 

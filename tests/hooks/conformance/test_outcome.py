@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from probe_kit.check_adapter.outcome import Outcome, package_of, place_of, tried
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.conformance.check import CheckFailedError, SkipTest
+from probe_kit.hooks.conformance.check import CheckFailedError, Outcome, SkipTest, package_of, place_of, tried
 
 
 def of(error: BaseException | None) -> Outcome:
@@ -16,7 +15,7 @@ def of(error: BaseException | None) -> Outcome:
         if error is not None:
             raise error
 
-    return tried("name", "A promise.", "Do it.", body, "tests.check_adapter")
+    return tried("name", "A promise.", "Do it.", body, "tests.hooks.conformance")
 
 
 def test_no_error_is_passed_and_a_skip_has_its_reason() -> None:
