@@ -269,11 +269,11 @@ def decode_labels(fence: Fence) -> None:
 
 def compare_answers_and_actions(fence: Fence) -> None:
     """Compare the VLM's answers, the policy's probes and its actions."""
-    add_retention(fence, "comparison", "VLM and VLA", ASKED, "acting", "--vlm-vla", "--details", "all")
+    add_retention(fence, "comparison", "VLM and VLA", ASKED, "acting", "--compare", "vlm-vla", "--details", "all")
     # Cubes end within 1 cm of the middle, so that only small zones tell a radius from another.
     small_zones = ("--epsilons", "0.004,0.006,0.008", "--last-steps", 2)
     add_retention(fence, "acting", "retention in small zones", "acting", *small_zones)
-    printed = table("retention", ASKED, "acting", "--stages")
+    printed = table("retention", ASKED, "acting", "--compare", "stages")
     fence.add("comparison", "stages", printed if isinstance(printed, list) else [printed])
 
 
@@ -404,7 +404,9 @@ def compare_two_policies(fence: Fence) -> None:
         add_episodes(fence, f"asked {folder.name}", pk.open_run(folder))
     for score in ("text", "logits", "order-balanced"):
         asked = [*sorted(map(str, Path("two/asked").iterdir())), "two/pi0-tiny", "two/pi0-tiny-state"]
-        add_retention(fence, "two policies", f"answers by {score}", *asked, "--vlm-vla", "--score", score)
+        add_retention(
+            fence, "two policies", f"answers by {score}", *asked, "--compare", "vlm-vla", "--score", score
+        )
 
 
 STUDY = """

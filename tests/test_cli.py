@@ -116,7 +116,7 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(small_suite: Suite, tmp_pa
         (["train", "nowhere", "--permutations", "-3"], 2, "--permutations"),
         (["train", "nowhere", "--jobs", "0"], 2, "--jobs"),
         (["retention", "nowhere", "./nowhere/"], 2, "given twice"),
-        (["retention", "--group", "a=one", "--group", "a=two"], 2, "given twice"),
+        (["retention", "a=one", "a=two", "--compare", "groups"], 2, "given twice"),
         (["retention", "nowhere", "--format", "csv", "--epsilons", "-1"], 2, "positive"),
         (["verify", "pi00", "nowhere"], 2, "Did you mean 'pi0'"),
         (["extract", "--model", "pi0-tiny", "--device", "nonsense"], 2, "cannot be used"),

@@ -99,7 +99,7 @@ def test_pages_and_tables_are_utf_8_under_a_locale_that_is_not(
 ) -> None:
     label = "Modèle π — 模型"
     run, other = (str(little_runs / name) for name in ("run", "other"))
-    groups = ["--group", f"{label}={run}", "--group", f"other={other}"]
+    groups = ["--compare", "groups", f"{label}={run}", f"other={other}"]
     asked = [
         ["retention", *groups, "--html", str(tmp_path / "report.html"), "--format", "json"],
         ["retention", *groups, "--format", "csv"],

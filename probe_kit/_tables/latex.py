@@ -2,9 +2,10 @@
 
 import re
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import cast
 
-from probe_kit._tables.content import Cell, Content, Row
+from probe_kit._tables.content import Cell, Content
 from probe_kit._tables.heat import HEAT
 
 _GREEK = {
@@ -40,7 +41,7 @@ _FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
 
 def preamble(tables: Sequence[Content]) -> str:
     """Return the packages that the tables need as a comment, and their colours."""
-    coloured = any(_css(cell) for table in tables for row in table.rows for cell in row.cells if not cell.strong)
+    coloured = any(_css(cell) for table in tables for row in table.rows for cell in row.cells)
     needs = r"% needs: \usepackage{booktabs} \usepackage{graphicx}" + r" \usepackage[table]{xcolor}" * coloured
     colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT] if coloured else []
     return "\n".join([needs, *colours])
@@ -107,7 +108,7 @@ def _tabular(table: Content) -> list[str]:
     if several:
         columns = pd.MultiIndex.from_arrays([[one.group for one in table.headings], numbers])
     texts = [[escape(cell.text) for cell in row.cells] for row in table.rows]
-    styles = [[_css(cell, row) for cell in row.cells] for row in table.rows]
+    styles = [[_css(cell) for cell in row.cells] for row in table.rows]
     frame = pd.DataFrame(texts, columns=columns, dtype=object)
     look = pd.DataFrame(styles, columns=columns, dtype=object)
     styler = frame.style.hide(axis="index").apply(lambda _: look, axis=None)
@@ -119,14 +120,16 @@ def _tabular(table: Content) -> list[str]:
     aligned = "".join("r" if table.is_numeric(at) else "l" for at in range(len(table.headings)))
     text = styler.to_latex(hrules=True, column_format=aligned, multicol_align="c")
     begin, *inside, end = text.strip().splitlines()
+    starts = [at for at, (before, row) in enumerate(pairwise(table.rows), 1) if before.is_mean != row.is_mean]
+    for at in reversed(starts):  # a rule apart from the means
+        inside.insert(inside.index(r"\midrule") + 1 + at, r"\midrule")
     return [_FITTED, begin, *inside, f"{end}}}"]
 
 
-def _css(cell: Cell, row: Row | None = None) -> str:
+def _css(cell: Cell) -> str:
     """Return the commands around a cell as Styler has them."""
     heat = [] if cell.heat is None else [f"cellcolor:{{{heat_name(cell.heat)}}}"]
-    bold = ["textbf:--rwrap"] * (row is not None and row.is_mean and bool(cell.text))
-    return ";".join([*heat, *["textcolor:{red}--rwrap"] * cell.alarm, *bold])
+    return ";".join([*heat, *["textcolor:{red}--rwrap"] * cell.alarm])
 
 
 def heat_name(value: float) -> str:

@@ -32,7 +32,8 @@ def ask(
 
     Makes one run per prompt and picture size. Use the --suite, --protocol, --scene and --seed of the policy runs
     to compare with. Every question is asked in both orders of the options. Answers are read from the text and from
-    the logits of the options. Compare with policies by `probe-kit retention ASKED… ACTED…`, also with --stages.
+    the logits of the options. Compare with policies by `probe-kit retention ASKED… ACTED…`, also with
+    --compare stages.
 
     The same command resumes interrupted runs. With more items or categories they grow and keep what they have.
     Other settings in the same folder are an error.

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
         success_rate,
     )
     from probe_kit.retention.behaviour.vlm_answers import scored
-    from probe_kit.retention.compare.differences import Difference
+    from probe_kit.retention.compare.compare import Difference
     from probe_kit.retention.compare.known_used import match_runs
     from probe_kit.retention.displays import (
         CallCurveDisplay,
@@ -88,7 +88,7 @@ __getattr__, __dir__ = lazy_names(
         "match_runs": "compare.known_used",
         "CallCurveDisplay": "displays",
         "event_calls": "estimators.by_call",
-        "Difference": "compare.differences",
+        "Difference": "compare.compare",
         "FinalPositionsDisplay": "displays",
         "IterationMapDisplay": "displays",
         "KnowledgeActionDisplay": "displays",

@@ -58,29 +58,38 @@ def read_iterations(text: str) -> "Iterations":
 
 Runs = Annotated[
     list[str] | None,
-    typer.Argument(help="Run folders or URLs. Several runs of the same questions are compared.", metavar="RUN…"),
-]
-Groups = Annotated[
-    list[str] | None,
-    typer.Option("--group", metavar="NAME=RUN,RUN", help="Compare groups of models. Repeat per group."),
-]
-Against = Annotated[
-    str | None,
-    typer.Option(
-        "--against",
-        metavar="NAME",
-        help="Run or group that all others are compared with. Default: the first run; of groups every pair.",
+    typer.Argument(
+        help="Run folders or URLs. Several runs of the same questions are compared. With --compare groups: "
+        "NAME=RUN,RUN per group of models.",
+        metavar="RUN…",
     ),
 ]
-TrainingSteps = Annotated[
+Compare = Annotated[
     str | None,
     typer.Option(
-        "--x",
-        metavar="step|N,N,…",
-        help="Table and figure over training checkpoints. step: read from each checkpoint's folder, such as "
-        "checkpoint-500; or a training step per run.",
+        "--compare",
+        metavar="NAME|groups|vlm-vla|stages|steps",
+        help="What is compared. NAME: every other run with this one; default: the first. groups: every two groups "
+        "of models; groups=NAME: every other with this one. vlm-vla: VLM runs with policy runs. stages: VLM_RUN "
+        "and RUN question by question: answer, probe, success. steps: checkpoints of a training, by the step in "
+        "their folders; steps=N,N: by these steps.",
     ),
 ]
+COMPARISONS = ("groups", "vlm-vla", "stages", "steps")
+
+
+def read_comparison(text: str | None) -> tuple[str, str | None]:
+    """Return the kind of comparison, `run` for that of runs, and what stands behind its `=`; the name of a run."""
+    if text is None:
+        return "run", None
+    kind, separator, value = text.partition("=")
+    if kind not in COMPARISONS:
+        return "run", text
+    if separator and (not value or kind in ("vlm-vla", "stages")):
+        raise UsageError(f"--compare {text}: expected --compare {kind}{'=…' * (kind in ('groups', 'steps'))}")
+    return kind, value or None
+
+
 LabelTargets = Annotated[
     list[str] | None,
     typer.Option(
@@ -171,18 +180,6 @@ Epsilons = Annotated[
 Score = Annotated[
     AnswerScore,
     typer.Option("--score", help="How the answers of VLM runs are read.", rich_help_panel=VLM_RUNS),
-]
-VlmVla = Annotated[
-    bool,
-    typer.Option("--vlm-vla", help="Test VLM − VLA: VLM runs against policy runs.", rich_help_panel=VLM_RUNS),
-]
-Stages = Annotated[
-    bool,
-    typer.Option(
-        "--stages",
-        help="Compare VLM_RUN and RUN question by question: answer, probe, success.",
-        rich_help_panel=VLM_RUNS,
-    ),
 ]
 SideWords = Annotated[
     bool,

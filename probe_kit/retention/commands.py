@@ -25,7 +25,7 @@ WITH_AS_PAPER = (
     "runs", "probes", "views", "iterations", "wording", "partial", "rule", "last_steps", "score",
     "with_side_words", "style",
 )  # fmt: skip
-WITH_X = (
+WITH_STEPS = (
     "runs", "probes", "views", "iterations", "absent_below", "wording", "partial", "rule", "last_steps", "style",
     "figures",
 )  # fmt: skip
@@ -34,9 +34,7 @@ WITH_X = (
 
 def retention(
     runs: own.Runs = None,
-    group: own.Groups = None,
-    against: own.Against = None,
-    x: own.TrainingSteps = None,
+    compare: own.Compare = None,
     target: own.LabelTargets = None,
     family: own.LabelFamily = "label",
     probes: own.ProbeKeys = None,
@@ -49,8 +47,6 @@ def retention(
     last_steps: own.LastSteps = 1,
     epsilons: own.Epsilons = None,
     score: own.Score = "text",
-    vlm_vla: own.VlmVla = False,
-    stages: own.Stages = False,
     with_side_words: own.SideWords = False,
     details: own.Details = own.NO_DETAILS,
     as_paper: own.AsPaper = False,
@@ -62,9 +58,9 @@ def retention(
 
     With `--target COLUMN` the signal is that of a label of your own, see `probe-kit train --target COLUMN`.
 
-    With `--stages` it compares a VLM and a policy question by question: answer, probe, success. Answer: the VLM
-    answers right. Probe: a held-out probe of the policy is right. Success: the cube ends on the correct picture.
-    Each in both layouts. Both runs need the same first frames.
+    With `--compare stages` it compares a VLM and a policy question by question: answer, probe, success. Answer:
+    the VLM answers right. Probe: a held-out probe of the policy is right. Success: the cube ends on the correct
+    picture. Each in both layouts. Both runs need the same first frames.
     """
     given = locals()
     from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
@@ -75,9 +71,10 @@ def retention(
     from probe_kit.retention.training_steps import read_steps
     from probe_kit.runs import open_run
 
-    if stages:
-        _check_only(given, WITH_STAGES)
-        common.check_no_others({f"--format {style}": style not in ("table", "json")}, "--stages")
+    kind, chosen = own.read_comparison(compare)
+    if kind == "stages":
+        _check_only(given, WITH_STAGES, "compare", "--compare stages")
+        common.check_no_others({f"--format {style}": style not in ("table", "json")}, "--compare stages")
         paths = list(runs or ())
         _check_doubles(paths)
         check_file(figures)
@@ -85,7 +82,7 @@ def retention(
         show_stages(paths, views, key, wording, score, with_side_words, style == "json", figures)
         return
     if target:
-        _check_only(given, WITH_TARGET)
+        _check_only(given, WITH_TARGET, "target", "labels of your own")
         _show_labels(
             runs or (), target, family, probes, views, iterations, wording, partial, style, html, figures,
             "all" in details,
@@ -94,14 +91,14 @@ def retention(
     if family != "label":
         raise UsageError("--family is for labels of your own; give --target COLUMN too, or leave it out")
     if as_paper:
-        _check_only(given, WITH_AS_PAPER)
+        _check_only(given, WITH_AS_PAPER, "as_paper", "the paper's own numbers (--as-paper)")
         common.check_no_others({f"--score {score}": score == "order-balanced"}, "--as-paper")
-    if x is not None:
-        _check_only(given, WITH_X)
+    if kind == "steps":
+        _check_only(given, WITH_STEPS, "compare", "a table of training steps (--compare steps)")
     check_epsilons(rule, epsilons is not None)
-    if bool(runs) == bool(group):
-        raise UsageError("give run folders, or groups of them as --group NAME=RUN,RUN")
-    grouped = _groups(group) if group else {"": tuple(runs or ())}
+    if not runs:
+        raise UsageError("give run folders, or groups of them as --compare groups NAME=RUN,RUN NAME=RUN,RUN")
+    grouped = _groups(runs) if kind == "groups" else {"": tuple(runs)}
     _check_doubles([path for paths in grouped.values() for path in paths])
     steps = own.read_iterations(iterations)
     _check_places(html, figures)
@@ -111,18 +108,19 @@ def retention(
     }
     listed = [run for of_group in opened.values() for run in of_group]
     keys = _keys([path for paths in grouped.values() for path in paths], probes or [])
-    if x is not None:
-        training = read_steps(x, listed)
+    if kind == "steps":
+        training = read_steps(chosen, listed)
         order = sorted(range(len(listed)), key=lambda at: training[str(listed[at].location)])
         listed, keys = [listed[at] for at in order], [keys[at] for at in order]
     table = make_table(
-        opened if group else listed, views, iterations=steps, keys=keys, epsilons=epsilons or SENSITIVITY_RADII,
-        rule=rule, last_steps=last_steps, absent_below=absent_below, score=score, vlm_vla=vlm_vla,
-        with_side_words=with_side_words, against=against,
+        opened if kind == "groups" else listed, views, iterations=steps, keys=keys,
+        epsilons=epsilons or SENSITIVITY_RADII, rule=rule, last_steps=last_steps, absent_below=absent_below,
+        score=score, vlm_vla=kind == "vlm-vla", with_side_words=with_side_words,
+        against=chosen if kind in ("run", "groups") else None,
     )  # fmt: skip
     if as_paper:
         _print(table.as_paper, style, table.notes)
-    elif x is not None:
+    elif kind == "steps":
         _show_steps(table, training, style, figures)
     else:
         shown = [scored(run, score, with_side_words) for run in listed]
@@ -219,25 +217,18 @@ def _show_labels(
     show_label_retention(opened, table, style, html, figures, details)
 
 
-def _check_only(given: Mapping[str, object], allowed: Collection[str]) -> None:
-    """Raise UsageError for an option of `retention` that differs from its default and does not go with the table.
+def _check_only(given: Mapping[str, object], allowed: Collection[str], option: str, table: str) -> None:
+    """Raise UsageError for an option of `retention` that differs from its default and does not go with a table.
 
-    given: the value of every parameter, `stages`, `target`, `as_paper` or `x` among them. allowed: what goes
-    with it.
+    given: the value of every parameter. allowed: what goes with it. option: the one that asks for the table.
+    table: what it is called.
     """
-    what = next(name for name in ("stages", "target", "as_paper", "x") if given[name])
     others = {
         f"--{'format' if name == 'style' else name.replace('_', '-')}": given[name] != parameter.default
         for name, parameter in signature(retention).parameters.items()
-        if name not in (*allowed, what)
+        if name not in (*allowed, option)
     }
-    words = {
-        "stages": "--stages",
-        "target": "labels of your own",
-        "as_paper": "the paper's own numbers (--as-paper)",
-        "x": "a table of training steps (--x)",
-    }
-    common.check_no_others(others, words[what])
+    common.check_no_others(others, table)
 
 
 def _check_places(html: Path | None, figures: Path | None) -> None:
@@ -283,13 +274,13 @@ def _check_doubles(paths: Sequence[str]) -> None:
             raise UsageError(f"{path} is given twice; its episodes would count twice. Leave one out")
 
 
-def _groups(texts: list[str]) -> dict[str, tuple[str, ...]]:
+def _groups(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
     groups = {}
     for text in texts:
         name, separator, paths = text.partition("=")
         if not (separator and name and split(paths)):
-            raise UsageError(f"--group {text!r} is not NAME=RUN,RUN")
+            raise UsageError(f"{text!r} is not NAME=RUN,RUN, a group of models")
         if name in groups:
-            raise UsageError(f"--group {name!r} is given twice; write all of its runs after one {name}=")
+            raise UsageError(f"the group {name!r} is given twice; write all of its runs after one {name}=")
         groups[name] = tuple(filter(None, map(str.strip, paths.split(","))))  # a run given twice is refused
     return groups

@@ -1,4 +1,4 @@
-"""`probe-kit retention VLM_RUN RUN --stages`: answers of a VLM, probes of a policy, actions of the policy."""
+"""`probe-kit retention VLM_RUN RUN --compare stages`: answers of a VLM, probes and actions of a policy."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,10 +36,10 @@ def show_stages(
     from probe_kit.train import load_results
 
     if len(runs) != 2:
-        raise UsageError(f"--stages compares two runs, and {len(runs)} are given; expected VLM_RUN RUN --stages")
+        raise UsageError(f"--compare stages compares two runs, and {len(runs)} are given; expected VLM_RUN RUN")
     if views is not None and len(views) != 1:
         raise UsageError(
-            f"--stages reads probes of one view; --views {','.join(views)} has {len(views)}. Give one"
+            f"--compare stages reads probes of one view; --views {','.join(views)} has {len(views)}. Give one"
         )
     view = views[0] if views else None
     vlm = scored(open_run(runs[0]), score, with_side_words)

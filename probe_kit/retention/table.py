@@ -15,7 +15,6 @@ from probe_kit.retention.behaviour.mixed_settings import chosen_wordings, mixed_
 from probe_kit.retention.behaviour.run_labels import distinct_labels
 from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.retention.behaviour.vlm_answers import ask_of, left_out, scored
-from probe_kit.retention.behaviour.wordings import WordingPair, correct_wordings, wording_pairs
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import averaged_fields
 from probe_kit.retention.columns.comparisons import size_table, vlm_vla_tables, wording_tables
@@ -23,9 +22,14 @@ from probe_kit.retention.columns.findings import next_step
 from probe_kit.retention.columns.summary import RunSummary, summarise_runs, summary_table
 from probe_kit.retention.columns.tables import retention_tables
 from probe_kit.retention.columns.text import model_name
-from probe_kit.retention.compare.differences import Difference
-from probe_kit.retention.compare.pairing import PairedRuns, compare_groups, compare_runs
-from probe_kit.retention.compare.vlm_vla import VlmVlaDifference, vlm_vla_differences
+from probe_kit.retention.compare.compare import Difference
+from probe_kit.retention.compare.pairing import (
+    PairedRuns,
+    compare_groups,
+    compare_runs,
+    compare_with_vlms,
+    compare_wordings,
+)
 from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.formats.dataframe import frame_of, part_frame, peak_frame
 from probe_kit.retention.formats.json import table_json
@@ -63,8 +67,8 @@ class RetentionTable:
     results: Mapping[str, ProbeResults] = field(default_factory=dict, repr=False)
     iterations: Iterations = "all"
     notes: tuple[str, ...] = ()
-    wordings: list[WordingPair] = field(default_factory=list)
-    vlm_vla: list[VlmVlaDifference] = field(default_factory=list)
+    wordings: list[Difference] = field(default_factory=list)
+    vlm_vla: list[Difference] = field(default_factory=list)
     unpaired: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
@@ -163,7 +167,7 @@ class RetentionTable:
         groups, runs in several wordings or VLM − VLA, an object with the lists `rows`, `differences` between
         groups, `wordings` and `vlm_vla`, as far as there are any.
         """
-        return table_json(self.all_rows, self.differences, {"wordings": self.wordings, "vlm_vla": self.vlm_vla})
+        return table_json(self.all_rows, self.differences, self.wordings, self.vlm_vla)
 
     def to_csv(self) -> str:
         """All rows as comma-separated values with a header; differences have `differences_frame`.
@@ -174,7 +178,7 @@ class RetentionTable:
 
     def to_markdown(self) -> str:
         """Success rates, retention, controls and differences as Markdown tables."""
-        tables = [*self._tables().values(), *wording_tables(self.wordings), *self.further_tables]
+        tables = [*self._tables().values(), *self.wording_tables, *self.further_tables]
         rows = [one for run in self.summary for one in run.categories]
         sentences = [f"* **{markdown_safe(one.name)}** {markdown_safe(one.finding)}" for one in rows]
         long = [f"* {markdown_safe(one.details)}" for one in rows]
@@ -201,6 +205,11 @@ class RetentionTable:
     def _tables(self, sections: Collection[Section] | None = None) -> dict[str, Table]:
         return retention_tables(self.all_rows, self.differences, self.unpaired, sections)
 
+    @property
+    def wording_tables(self) -> list[Table]:
+        """The wordings of each run against each other, a table per run."""
+        return wording_tables(self.wordings, {row.run.location: row.run.label for row in self.rows})
+
     def _summary_table(self) -> Table:
         return summary_table(self.summary, self.differences)
 
@@ -208,7 +217,7 @@ class RetentionTable:
         """The tables of some sections, without columns that need room."""
         sections: Collection[Section] = get_args(Section) if details == "all" else details
         narrow = (table.details(False) for table in self._tables(sections).values())
-        wordings = wording_tables(self.wordings) if "success" in sections else []
+        wordings = self.wording_tables if "success" in sections else []
         further = self.further_tables if "answers" in sections else vlm_vla_tables(self.vlm_vla)
         return [*(table for table in narrow if table is not None), *wordings, *further]
 
@@ -263,7 +272,7 @@ def retention_table(
     epsilons: Sequence[float] = SENSITIVITY_RADII,
     score: str = "text",
     with_side_words: bool = False,
-    vlm_vla: bool = False,
+    vlm_vla: bool | Sequence[tuple[str, str]] = False,
     rule: str = DEFAULT_RULE,
     last_steps: int = 1,
     absent_below: float = ABSENT_BELOW,
@@ -286,11 +295,12 @@ def retention_table(
     is called absent. A run that keeps no trajectories has no success rate by another rule than `disc`. A run
     without activations or probes shows success rates only. score: by which VLM runs are read, `text`, `logits` or
     `order-balanced`; they stand first. with_side_words: count their items in whose name a side stands. vlm_vla:
-    compare every VLM run with every acting one, see `vlm_vla_differences`. labels: names of runs in tables and
-    figures by their location, instead of their own. pairs: by location, the runs that are compared, each the first
-    minus the second, instead of every other with the first; all of them are one family of tests. origins: of
-    groups, what the models grew from by the location of their runs; models of one origin count as one. By default
-    checkpoints of one training do. categories: rows of these alone, and means over them; probes are those of the
+    compare every VLM run with every acting one, see `compare_with_vlms`, or pairs of these by their locations.
+    labels: names of runs in tables and figures by their location, instead of their own. pairs: by location, the
+    runs that are compared, each the first minus the second, instead of every other with the first; all of them are
+    one family of tests. origins: of groups, what the models grew from by the location of their runs; models of one
+    origin count as one. By default checkpoints of one training do. categories: rows of these alone, and means over
+    them; probes are those of the
     whole runs. with_behaviour: False leaves empty what the rule `disc` does not need (other rules and behaviour),
     so that no trajectory is read. Raises UnknownSiteError for a view that was not probed, UsageError for an
     unknown key or a number of keys that is not that of the runs, for a run that is given twice, or for `against`
@@ -327,7 +337,7 @@ def retention_table(
         by_group = {name: [run for group, run in listed if group == name] for name in runs}
         compared = compare_groups(by_group, drawn, against, origins)
     elif len(listed) > 1 or against is not None:
-        compared = compare_runs([run for _, run in listed], drawn, names, against, vlm_vla, pairs)
+        compared = compare_runs([run for _, run in listed], drawn, names, against, bool(vlm_vla), pairs)
     notes += [
         f"{run.location} captured activations only and did not act: SR is n/a." for _, run in listed if _heard(run)
     ]
@@ -338,12 +348,15 @@ def retention_table(
         for part in ([d.row for d in drawn], means)
     )
     judged = [under_rule(run, rule, last_steps) for _, run in listed if can_be_judged(run, rule, last_steps)]
-    worded = correct_wordings([pair for run in judged for pair in _wordings(run, names[str(run.location)])])
-    found_differences = vlm_vla_differences([run for _, run in listed], names) if vlm_vla else []
-    if vlm_vla and not found_differences:
+    worded = compare_wordings([run for run in judged if not _heard(run)])
+    chosen_pairs = None if isinstance(vlm_vla, bool) else vlm_vla
+    found_differences = (
+        [] if vlm_vla is False else compare_with_vlms([run for _, run in listed], drawn, names, chosen_pairs)
+    )
+    if vlm_vla is True and not found_differences:
         raise UsageError(
-            "--vlm-vla compares VLM runs with policy runs in the same categories, and these runs have no such "
-            "pair. Make the missing ones with `probe-kit ask` or `probe-kit extract`"
+            "--compare vlm-vla compares VLM runs with policy runs in the same categories, and these runs have no "
+            "such pair. Make the missing ones with `probe-kit ask` or `probe-kit extract`"
         )
     return RetentionTable(
         rows,
@@ -356,15 +369,6 @@ def retention_table(
         found_differences,
         compared.unpaired,
     )
-
-
-def _wordings(run: RunReader, label: str) -> list[WordingPair]:
-    """The wordings of a run against each other; none for a run in its items' own words, or that did not act."""
-    names: Sequence[str] = getattr(run, "wordings", ())
-    if len(names) < 2 or _heard(run):
-        return []
-    whole: RunReader = getattr(run, "whole", run)
-    return wording_pairs(whole.episodes, names, str(run.location), label)
 
 
 def _not_scored(run: RunReader, rule: str, last_steps: int) -> str | None:

@@ -15,7 +15,6 @@ from probe_kit.retention.table import RetentionTable
 from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
 
-STEP = "step"
 _COLUMNS = {
     "category": "",
     "step": "step: of the training",
@@ -40,33 +39,34 @@ def training_step(run: RunReader) -> int:
     raise UsageError(
         f"the training step of {run.location} is unknown: its checkpoint is {checkpoint or 'not stored'!r}; "
         "expected a folder such as checkpoints/020000 or checkpoint-500. Give the steps in the order of the runs, "
-        "such as --x 1000,2000"
+        "such as --compare steps=1000,2000"
     )
 
 
-def read_steps(text: str, runs: Sequence[RunReader]) -> dict[str, int]:
-    """Return the training step of every run by its location, from `step` or comma-separated numbers.
+def read_steps(text: str | None, runs: Sequence[RunReader]) -> dict[str, int]:
+    """Return the training step of every run by its location; text: comma-separated numbers, None for the folders'.
 
     Raises UsageError for another text, a number of steps that is not that of the runs, runs of one step, or VLM
     runs, which have no retention.
     """
     if asked := [str(run.location) for run in runs if ask_of(run) is not None]:
-        raise UsageError(f"--x is for policy runs; {asked[0]} is a VLM run. Leave it out")
-    if text == STEP:
+        raise UsageError(f"--compare steps is for policy runs; {asked[0]} is a VLM run. Leave it out")
+    if text is None:
         steps = [training_step(run) for run in runs]
     else:
         parts = [part.strip() for part in text.split(",")]
         if not all(part.isdecimal() for part in parts):
-            raise UsageError(f"--x {text!r}; expected `step`, or a training step per run such as 1000,2000")
+            raise UsageError(f"--compare steps={text}; expected a training step per run, such as steps=1000,2000")
         steps = [int(part) for part in parts]
     if len(steps) != len(runs):
         raise UsageError(
-            f"--x gives {counted(len(steps), 'step')} for {counted(len(runs), 'run')}; give one per run, in "
-            "their order"
+            f"--compare steps has {counted(len(steps), 'step')} for {counted(len(runs), 'run')}; give one per "
+            "run, in order"
         )
     if len(runs) < 2 or len(set(steps)) < len(steps):
         raise UsageError(
-            f"--x needs several runs of different training steps; these are of {', '.join(map(str, steps))}"
+            "--compare steps needs several runs of different training steps; these are of "
+            f"{', '.join(map(str, steps))}"
         )
     return {str(run.location): step for run, step in zip(runs, steps, strict=True)}
 

@@ -83,7 +83,7 @@ ALLOWED = {"text", "text_special", "strong_open", "strong_close", "softbreak"}
 def test_latex_has_a_line_per_row_whose_cells_read_back(table: Table) -> None:
     text = table.to_latex()
     body = text.partition(r"\midrule")[2].partition(r"\bottomrule")[0]
-    lines = [line.removesuffix(r" \\").strip() for line in body.strip().splitlines()]
+    lines = [line.removesuffix(r" \\").strip() for line in body.strip().splitlines() if line != r"\midrule"]
     assert len(lines) == len(table.rows)
     back = {code: character for character, code in _SPECIAL.items() if character not in "\n\r\0"} | {"-{}": "-"}
     pattern = re.compile("|".join(re.escape(code) for code in sorted(back, key=len, reverse=True)))
@@ -92,9 +92,8 @@ def test_latex_has_a_line_per_row_whose_cells_read_back(table: Table) -> None:
         assert len(cells) == len(row.cells)
         for found, cell in zip(cells, row.cells, strict=True):
             bare = re.sub(r"\\cellcolor\{\w+\} ?", "", found)
-            for wrap in (r"\textcolor{red}{", r"\textbf{"):
-                if wrap in bare:
-                    bare = bare.replace(wrap, "", 1).removesuffix("}")
+            if r"\textcolor{red}{" in bare:
+                bare = bare.replace(r"\textcolor{red}{", "", 1).removesuffix("}")
             assert words(pattern.sub(lambda match: back[match[0]], bare)) == words(cell.text)
     assert bool(re.search(r"\\cellcolor", text)) == any(
         c.heat is not None for row in table.rows for c in row.cells

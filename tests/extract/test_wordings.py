@@ -103,7 +103,9 @@ def test_retention_shows_one_wording_and_all_of_them_against_each_other(ladder):
         retention_table([ladder])
     table = retention_table([ladder.in_wording("named")])
     assert {row.success.n_episodes for row in table.rows} == {4}
-    assert [(pair.wording, pair.other, pair.n_episodes) for pair in table.wordings] == [("knowledge", "named", 4)]
+    assert [(pair.group, pair.minus, pair.category, pair.n_items) for pair in table.wordings] == [
+        ("knowledge", "named", name, 2) for name in ("color", "mean")
+    ]
     assert any("wording 'named'" in note for note in table.notes)
     assert set(json.loads(table.to_json())) == {"rows", "wordings"}
     assert "knowledge / named" in table.to_markdown()

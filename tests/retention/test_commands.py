@@ -52,9 +52,10 @@ def test_what_names_no_run_or_two_keys_is_refused(chosen: list[str], message: st
         ["nowhere", "--epsilons", "wide"],
         ["nowhere", "--html", "."],
         ["nowhere", "--figures", __file__],
-        ["nowhere", "--group", "a=b"],
+        ["nowhere", "--compare", "steps="],
+        ["nowhere", "--compare", "vlm-vla=x"],
     ],
-    ids=lambda options: options[1],
+    ids=" ".join,
 )
 def test_options_are_checked_before_runs_are_opened(options: list[str]) -> None:
     """The run is not there either, but that is not what is said."""
@@ -80,8 +81,14 @@ def test_the_inventory_names_the_probes_of_a_table(
 
 @pytest.mark.parametrize(
     "options",
-    [["--group", "a=b"], ["--score", "order-balanced"], ["--vlm-vla"], ["--details", "all"], ["--html", "r.html"]],
-    ids=lambda options: options[0],
+    [
+        ["--compare", "groups"],
+        ["--score", "order-balanced"],
+        ["--compare", "vlm-vla"],
+        ["--details", "all"],
+        ["--html", "r.html"],
+    ],
+    ids=" ".join,
 )
 def test_the_papers_own_numbers_refuse_what_the_paper_does_not_have(options: list[str]) -> None:
     result = CliRunner().invoke(app, ["retention", "nowhere", "--as-paper", *options])

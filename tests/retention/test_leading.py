@@ -12,7 +12,7 @@ from probe_kit._tables.table import Table
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.summary import HEADINGS
 from probe_kit.retention.columns.tables import retention_tables
-from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.report.summaries import read_row
 from probe_kit.train import ArrayRun
 

@@ -33,7 +33,7 @@ def runs(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> tuple[
 
 def test_it_prints_the_counts_of_match_runs_and_draws_their_figure(runs: tuple[Run, Run], tmp_path: Path) -> None:
     asked, acted = runs
-    command = ["retention", str(asked.path), str(acted.path), "--stages"]
+    command = ["retention", str(asked.path), str(acted.path), "--compare", "stages"]
     answer = CliRunner().invoke(app, [*command, "--format", "json"])
     assert answer.exit_code == 0, answer.output
     assert json.loads(answer.stdout) == json.loads(
@@ -47,20 +47,22 @@ def test_it_prints_the_counts_of_match_runs_and_draws_their_figure(runs: tuple[R
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--format", "csv"], "--format csv is not for --stages"),
-        (["--rule", "box"], "--rule is not for --stages"),
-        (["--vlm-vla"], "--vlm-vla is not for --stages"),
-        (["--views", "mean,last"], "--stages reads probes of one view; --views mean,last has 2. Give one"),
+        (["--format", "csv"], "--format csv is not for --compare stages"),
+        (["--rule", "box"], "--rule is not for --compare stages"),
+        (["--as-paper"], "--as-paper is not for --compare stages"),
+        (["--views", "mean,last"], "--compare stages reads probes of one view; --views mean,last has 2. Give one"),
         (["--views", "mean"], "has no probes. Run `probe-kit train"),
     ],
 )
 def test_options_of_other_tables_are_refused(options: list[str], words: str, runs: tuple[Run, Run]) -> None:
-    answer = CliRunner().invoke(app, ["retention", *(str(run.path) for run in runs), "--stages", *options])
+    answer = CliRunner().invoke(
+        app, ["retention", *(str(run.path) for run in runs), "--compare", "stages", *options]
+    )
     assert answer.exit_code == 2
     assert words in " ".join(answer.stderr.split())
 
 
 def test_it_needs_two_runs(runs: tuple[Run, Run]) -> None:
-    answer = CliRunner().invoke(app, ["retention", str(runs[0].path), "--stages"])
+    answer = CliRunner().invoke(app, ["retention", str(runs[0].path), "--compare", "stages"])
     assert answer.exit_code == 2
-    assert "expected VLM_RUN RUN --stages" in answer.stderr
+    assert "expected VLM_RUN RUN" in answer.stderr

@@ -188,7 +188,7 @@ FLOATS = (
     "chance",
     "p_fwe",
 )
-TEXTS = ("retention.note", "answers.score", "minus", "minus_run")
+TEXTS = ("retention.note", "answers.score", "minus", "minus_run", "only_minus")
 
 
 def test_the_first_iteration_stands_beside_the_best(probed_run: ProbedRun) -> None:

@@ -39,7 +39,7 @@ def test_the_step_is_that_of_the_checkpoints_folder(path: str, step: int) -> Non
 
 @pytest.mark.parametrize("path", ["", "embedded", "lerobot/pi0_base", "data/20261124/policy", "models/pi05"])
 def test_a_folder_that_names_no_step_is_refused_and_no_date_above_is_taken_for_one(path: str) -> None:
-    with pytest.raises(UsageError, match=r"training step of runs/a is unknown.*--x 1000,2000"):
+    with pytest.raises(UsageError, match=r"training step of runs/a is unknown.*--compare steps=1000,2000"):
         training_step(of_checkpoint(path))
 
 

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from probe_kit.retention import retention_table
-from probe_kit.retention.behaviour.wordings import EVERY
-from probe_kit.retention.compare.vlm_vla import vlm_vla_differences
+from probe_kit.retention.compare.known_used import OVERALL
 from probe_kit.retention.joins import joins_of
+from probe_kit.retention.rows.row import MEAN
 from tests.retention.asked_runs import SaidRun, acted, asked
 
 SHARES = {"color": (20, 0.9), "shape": (16, 0.7)}
@@ -49,8 +49,8 @@ def runs(tmp_path: Path) -> list[SaidRun]:
 
 
 def test_gaps_are_one_family_over_categories_and_pairs_and_means_another(runs: list[SaidRun]) -> None:
-    found = vlm_vla_differences(runs)
-    assert len({(gap.asked, gap.acted) for gap in found}) == 6
+    found = retention_table(runs, vlm_vla=True).vlm_vla
+    assert len({(gap.group, gap.minus) for gap in found}) == 6
     check([(gap.p, gap.p_holm) for gap in found if gap.category != "mean"], 12)
     check([(gap.p, gap.p_holm) for gap in found if gap.category == "mean"], 6)
 
@@ -63,17 +63,17 @@ def test_differences_are_one_family_and_means_another(runs: list[SaidRun]) -> No
 def test_joins_that_a_report_shows_together_are_one_family(runs: list[SaidRun]) -> None:
     table = retention_table(runs)
     joins = joins_of(runs, table).found
-    tests = [one for join in joins for row in join.rows if row.category != EVERY for one in row.comparisons]
+    tests = [one for join in joins for row in join.rows if row.category != OVERALL for one in row.comparisons]
     check([(one.p, one.p_holm) for one in tests], len(list(product(range(2), range(3), SHARES))))
-    summaries = [one for join in joins for row in join.rows if row.category == EVERY for one in row.comparisons]
+    summaries = [one for join in joins for row in join.rows if row.category == OVERALL for one in row.comparisons]
     assert len(summaries) == 6
     assert all(one.p_holm is None for one in summaries)
 
 
 def test_wordings_of_all_runs_are_one_family_over_categories_and_pairs(tmp_path: Path) -> None:
     found = retention_table([worded(tmp_path / f"run {seed}", seed) for seed in range(2)]).wordings
-    check([(pair.p_groups, pair.p_holm) for pair in found if pair.category != EVERY], 2 * 3 * 2)
-    check([(pair.p_groups, pair.p_holm) for pair in found if pair.category == EVERY], 2 * 3)
+    check([(pair.p, pair.p_holm) for pair in found if pair.category != MEAN], 2 * 3 * 2)
+    check([(pair.p, pair.p_holm) for pair in found if pair.category == MEAN], 2 * 3)
 
 
 class Worded(SaidRun):

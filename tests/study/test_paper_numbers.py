@@ -221,7 +221,7 @@ def test_vlm_minus_vla_of_the_two_policies_whose_source_is_there(
 ) -> None:
     asked = run_of(vlm, tables["sr_main"]["values"][vlm], tables["items"]["values"], asked=True)
     table = retention_table([asked, runs[policy]], vlm_vla=True)
-    found = {row.category: 100 * row.difference for row in table.vlm_vla if row.category != "mean"}
+    found = {row.category: 100 * row.sr for row in table.vlm_vla if row.category != "mean"}
     assert found == pytest.approx(derived["gap_pairs"][f"{vlm} - {policy}"], abs=0.005)
     assert all(row.paired for row in table.vlm_vla)
     assert len(vlm_vla_table(table.vlm_vla).texts) == 13

@@ -28,7 +28,7 @@ from probe_kit.retention.columns.text import (
     success_interval,
     verdict_text,
 )
-from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.statistics.significance import SIGNIFICANCE
 

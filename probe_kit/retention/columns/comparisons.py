@@ -3,44 +3,57 @@
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 
-from probe_kit._tables.numbers import number, percent, with_limits
+from probe_kit._tables.numbers import number, percent, points, with_limits
 from probe_kit._tables.table import Heading, Table
-from probe_kit.retention.behaviour.wordings import EVERY, WordingPair
-from probe_kit.retention.columns.text import P_DECIDES, is_vlm, model_name, once_per_category, success_interval
+from probe_kit.retention.columns.text import (
+    P_DECIDES,
+    difference_test,
+    is_vlm,
+    model_name,
+    once_per_category,
+    success_interval,
+)
+from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.known_used import OVERALL, PAIRS, CategoryCounts, Comparison, KnownUsedTable
 from probe_kit.retention.compare.source_weights import Relation
-from probe_kit.retention.compare.vlm_vla import VlmVlaDifference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 _LADDER = (
     "same items, same seeds; only one: episodes right in the first wording alone, and in the second alone; p: "
-    "McNemar, exact; by group: items that share pictures count once; Holm: that, over all categories, pairs and "
-    "runs shown"
+    "exact, signs of whole groups of items flipped; (Holm): over all categories, pairs and runs shown, means apart"
 )
 
 
-def wording_tables(wordings: Sequence[WordingPair]) -> list[Table]:
-    """The wordings of each run against each other."""
+def wording_tables(wordings: Sequence[Difference], names: Mapping[str, str]) -> list[Table]:
+    """The wordings of each run against each other. names: of runs, by location."""
     return [
         Table.of(
-            title,
-            ("category", "wordings", "n", "SR %", "only one", "p", "p by group", "Holm"),
+            f"Wordings, {names[str(run)]}",
+            ("category", "wordings", "items", "SR %", "difference, points [95 %]", "only one", "p (Holm)"),
             [
                 (
                     row.category,
-                    f"{row.wording} / {row.other}",
-                    str(row.n_episodes),
-                    f"{percent(row.sr)} / {percent(row.other_sr)}",
-                    f"{row.only} / {row.only_other}",
-                    *(number(p, 3) for p in (row.p, row.p_groups, row.p_holm)),
+                    f"{row.group} / {row.minus}",
+                    _items(row),
+                    f"{percent(row.sr_group)} / {percent(row.sr_minus)}",
+                    with_limits(row.sr, row.sr_ci, points),
+                    "–" if row.only is None else f"{row.only} / {row.only_minus}",
+                    difference_test(row),
                 )
-                for row in pairs
+                for row in rows
             ],
-            mean=EVERY,
+            mean=MEAN,
             notes=[_LADDER],
         )
-        for title, pairs in groupby(wordings, key=lambda pair: f"Wordings, {pair.label}")
+        for run, rows in groupby(wordings, key=lambda row: row.run)
     ]
+
+
+def _items(row: Difference) -> str:
+    """How many are compared, and of how many where some are left out."""
+    if row.n_items is None:
+        return "other items"
+    return str(row.n_items) if row.of_items in (None, row.n_items) else f"{row.n_items} of {row.of_items}"
 
 
 def size_table(means: Sequence[RetentionRow]) -> list[Table]:
@@ -76,15 +89,15 @@ _SOURCES: Mapping[Relation, str] = {
 }
 
 
-def vlm_vla_tables(gaps: Sequence[VlmVlaDifference]) -> list[Table]:
+def vlm_vla_tables(gaps: Sequence[Difference]) -> list[Table]:
     """One table per pair of a VLM run and a policy run."""
     return [
         _gap_table(asked, acted, list(rows))
-        for (asked, acted), rows in groupby(gaps, key=lambda gap: (gap.asked, gap.acted))
+        for (asked, acted), rows in groupby(gaps, key=lambda gap: (gap.group, gap.minus))
     ]
 
 
-def _gap_table(asked: str, acted: str, rows: Sequence[VlmVlaDifference]) -> Table:
+def _gap_table(asked: str, acted: str, rows: Sequence[Difference]) -> Table:
     frames = {row.same_frames for row in rows}
     first = (
         "the same first frames" if frames == {True} else "OTHER first frames" if False in frames else "no hashes"
@@ -97,17 +110,17 @@ def _gap_table(asked: str, acted: str, rows: Sequence[VlmVlaDifference]) -> Tabl
     cells = [
         (
             row.category,
-            percent(row.accuracy),
-            percent(row.sr),
-            with_limits(row.difference, row.difference_ci, percent),
+            percent(row.sr_group),
+            percent(row.sr_minus),
+            with_limits(row.sr, row.sr_ci, percent),
             number(row.p, 4),
             number(row.p_holm, 4),
-            str(row.n_items) if row.of_items in (None, row.n_items) else f"{row.n_items} of {row.of_items}",
+            _items(row),
         )
         for row in rows
     ]
     columns = ("category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p", "p (Holm)", "items")
-    notes = [items, first, _SOURCES[rows[0].source], tests]
+    notes = [items, first, _SOURCES[rows[0].source or "unknown"], tests]
     return Table.of(f"VLM − VLA: {asked} − {acted}", columns, cells, mean=MEAN, notes=["; ".join(notes)])
 
 

@@ -15,7 +15,7 @@ TERMS = {
         "was run. So there may be nothing to retain."
     ),
     "B − A": (
-        "Difference of a run and the first one, or that of --against, on the same questions. They count as pairs, "
+        "Difference of a run and the first one, or that of --compare, on the same questions. They count as pairs, "
         "with a 95 % interval. Zero inside it: they may be equal."
     ),
     "against": ("Before a verdict: the same, away from the correct picture."),

@@ -16,7 +16,7 @@ from probe_kit.retention.columns.text import (
     models_p,
     title_of,
 )
-from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 

@@ -22,7 +22,7 @@ from probe_kit.retention.columns.text import (
     probed,
     title_of,
 )
-from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.outcome_rules import rule_sentence
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.statistics.significance import detectable

@@ -4,7 +4,8 @@ from collections.abc import Callable, Sequence
 
 from probe_kit._tables.numbers import NONE, Write, number, p_text, percent, with_limits
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.compare.differences import Difference, ModelTest
+from probe_kit.retention.compare.compare import Difference
+from probe_kit.retention.compare.model_test import ModelTest
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.suite.categories import category_of

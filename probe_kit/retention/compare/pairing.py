@@ -1,12 +1,14 @@
-"""Which of several runs are compared with which, and why some are not."""
+"""The sides that are compared: runs, groups of models, VLMs with policies, wordings; and why some are not."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
+from itertools import combinations, product
+from typing import TYPE_CHECKING, Any
 
+from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.run_labels import full_names
-from probe_kit.retention.behaviour.success_rate import success_share
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.compare.common_items import (
     CommonItems,
@@ -14,17 +16,14 @@ from probe_kit.retention.compare.common_items import (
     has_item_content,
     wording_of,
 )
-from probe_kit.retention.compare.differences import (
-    ComparedSides,
-    Difference,
-    Side,
-    group_pairs,
-    pair_differences,
-)
+from probe_kit.retention.compare.compare import Difference, Side, compare, with_holm
 from probe_kit.retention.compare.origins import origins_of
-from probe_kit.retention.estimators.stream_scores import RowEstimates
-from probe_kit.retention.rows.build import RowWithEstimates
-from probe_kit.train.data.run_reader import RunReader, seed_text_of
+from probe_kit.retention.compare.source_weights import grew_from
+from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
+from probe_kit.train.data.run_reader import RunReader
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -55,9 +54,9 @@ def compare_runs(
     Raises UsageError for a name that is none of the runs, or several.
     """
     if against is not None and len(runs) < 2:
-        raise UsageError(f"--against {against} needs a second run to compare with it")
+        raise UsageError(f"--compare {against} needs a second run to compare with it")
     names = dict(zip(map(_place, runs), full_names(runs, labels), strict=True))
-    pairs: list[ComparedSides] = []
+    found: list[Difference] = []
     unpaired: list[str] = []
     for here, there in _pairs(runs, names, against, chosen):
         both = f"{names[_place(here)]} and {names[_place(there)]}"
@@ -65,15 +64,12 @@ def compare_runs(
         if why := _why_not(here, there, items):
             unpaired.append(f"{both} are not compared: {why}.")
             continue
-        sides = [
-            Side(names[_place(run)], [d for d in drawn if d.row.run.location == _place(run)], _place(run))
-            for run in (here, there)
-        ]
         unpaired += _left_out(both, items)
-        pairs.append(_on_common_items((sides[0], sides[1]), items, [here, there]))
+        first, second = (Side.of(names[_place(run)], run, drawn) for run in (here, there))
+        found += compare(first, second, items=items)
     if not vlm_vla and chosen is None and len({ask_of(run) is None for run in runs}) == 2:
-        unpaired.append("VLM runs and policy runs are not compared with each other here; --vlm-vla does that.")
-    return PairedRuns(pair_differences(pairs), tuple(unpaired))
+        unpaired.append("VLM runs and policy runs are not compared with each other; --compare vlm-vla does that.")
+    return PairedRuns(with_holm(found), tuple(unpaired))
 
 
 def compare_groups(
@@ -88,49 +84,125 @@ def compare_groups(
     and then on these items alone. In other categories each group has its own items. origins: see `origins_of`.
     Raises UsageError for a group that is none of them, and a declared origin of no run.
     """
-    pairs, notes = [], []
+    found: list[Difference] = []
+    notes: list[str] = []
     grown = origins_of([run for of_group in groups.values() for run in of_group], origins)
     for names in group_pairs(list(groups), against):
         runs = [run for name in names for run in groups[name]]
         items = {name: one for name, one in common_items(runs).items() if one.is_many}
-        sides = [Side(name, [one for one in drawn if one.row.group == name], origins=grown) for name in names]
-        notes += _left_out(" and ".join(names), items)
-        pairs.append(_on_common_items((sides[0], sides[1]), items, runs, others_too=True))
-    return PairedRuns(pair_differences(pairs), tuple(notes))
-
-
-def _on_common_items(
-    sides: tuple[Side, Side],
-    items: Mapping[str, CommonItems],
-    runs: Sequence[RunReader],
-    others_too: bool = False,
-) -> ComparedSides:
-    """Both sides on the same items, with the draws of the first of `runs`.
-
-    others_too: keep categories without such items.
-    """
-    seed_texts = {_place(run): seed_text_of(run) for run in runs}
-    seed_text = seed_text_of(runs[0])
-
-    def common(one: RowWithEstimates) -> RowWithEstimates:
-        own = items.get(one.row.category)
-        if own is None or (own.whole and seed_texts[one.row.run.location] == seed_text):
-            return one
-        outcomes = None if one.outcomes is None else own.select(one.outcomes)
-        rates = {} if outcomes is None else {"sr": success_share(outcomes, seed_text)}
-        streams = one.estimates.streams if own.whole else None
-        return replace(
-            one,
-            estimates=RowEstimates(rates, None if streams is None else streams.as_of(seed_text)),
-            outcomes=outcomes,
+        first, second = (
+            Side(name, tuple(groups[name]), tuple(one for one in drawn if one.row.group == name), origins=grown)
+            for name in names
         )
+        notes += _left_out(" and ".join(names), items)
+        found += compare(first, second, items=items, others_too=True)
+    return PairedRuns(with_holm(found), tuple(notes))
 
-    kept = {name for name, own in items.items() if own.n_items}
-    here, there = (
-        replace(side, drawn=[common(one) for one in side.drawn if others_too or one.row.category in kept])
-        for side in sides
-    )
-    return ComparedSides(here, there, items)
+
+def group_pairs(groups: Sequence[str], against: str | None = None) -> list[tuple[str, str]]:
+    """Return every group with every earlier one, or every other group with `against`: minuend, subtrahend.
+
+    Raises UsageError for a group that is none of them.
+    """
+    if against is None:
+        return [(later, earlier) for earlier, later in combinations(groups, 2)]
+    if against not in groups:
+        raise UsageError(f"there is no group {against!r} to compare with; there are {', '.join(groups)}")
+    return [(name, against) for name in groups if name != against]
+
+
+def compare_with_vlms(
+    runs: Sequence[RunReader],
+    drawn: Sequence[RowWithEstimates],
+    names: Mapping[str, str],
+    chosen: Sequence[tuple[str, str]] | None = None,
+) -> list[Difference]:
+    """Return every VLM run minus every acting one that it can be compared with, in answers and success alone.
+
+    A policy whose network grew from weights that were asked is not compared with VLMs of other weights. names:
+    what runs are called, by location. chosen: locations of the VLM runs and policy runs that are compared instead.
+    """
+    asked, acted = ([run for run in runs if _asked(run) == kind] for kind in (True, False))
+    related = [(vlm, policy, grew_from(policy, vlm)) for vlm, policy in product(asked, acted)]
+    grown = {_place(policy) for _, policy, source in related if source == "yes"}
+    found: list[Difference] = []
+    for vlm, policy, source in related:
+        if (
+            (_place(vlm), _place(policy)) not in chosen
+            if chosen is not None
+            else (source == "no" and _place(policy) in grown)
+        ):
+            continue
+        items = common_items([vlm, policy]) if wording_of(vlm) == wording_of(policy) else {}
+        items = {name: own for name, own in items.items() if own.n_items}
+        first, second = (Side.of(names[_place(run)], run, drawn) for run in (vlm, policy))
+        rows = compare(first, second, "success", items=items, others_too=True)
+        found += [
+            replace(
+                row,
+                source=source,
+                paired=row.n_items is not None,
+                same_frames=_same_frames(vlm, policy, row.categories or (row.category,), items),
+            )
+            for row in rows
+        ]
+    return with_holm(found)
+
+
+def _same_frames(
+    vlm: RunReader, policy: RunReader, categories: Sequence[str], items: Mapping[str, CommonItems]
+) -> bool | None:
+    """Return whether all episodes of both began with the same frames; None where a run has no hashes."""
+    column = "first_frame_sha256"
+    if column not in vlm.episodes or column not in policy.episodes:
+        return None
+    found = []
+    for category in categories:
+        first, second = (run.episodes[run.episodes["category"] == category] for run in (vlm, policy))
+        if category in items:
+            first, second = items[category].select(first), items[category].select(second)
+        both = first[["episode_id", column]].merge(second[["episode_id", column]], on="episode_id")
+        found.append(bool(len(both) and (both[f"{column}_x"] == both[f"{column}_y"]).all()))
+    return all(found)
+
+
+# -- wordings ----------------------------------------------------------------------------------------------------
+
+
+class _InWording:
+    """A run with the episodes of one wording; everything else is the run's own."""
+
+    def __init__(self, run: RunReader, wording: str) -> None:
+        self._run, self._wording = run, wording
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._run, name)
+
+    @cached_property
+    def episodes(self) -> "pd.DataFrame":
+        """Return the episodes of the wording."""
+        episodes = self._run.episodes
+        return episodes[episodes["wording"] == self._wording]
+
+
+def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
+    """Return every two wordings of each run against each other, the earlier one minus the later.
+
+    It separates not knowing from not being able: who places the cube by "the left picture" and not by what the
+    picture shows can act and does not know. runs: those that acted, judged by the rule of the table.
+    """
+    settings = RowSettings(None, "all", (), DEFAULT_RULE, with_behaviour=False)
+    found: list[Difference] = []
+    for run in runs:
+        whole = getattr(run, "whole", run)
+        sides = {}
+        for wording in getattr(run, "wordings", ()):
+            own: RunReader = _InWording(whole, wording)
+            if len(own.episodes):
+                sides[wording] = Side(wording, (own,), tuple(run_rows(own, None, settings)), _place(run))
+        for first, second in combinations(sides.values(), 2):
+            found += compare(first, second, "success")
+    return with_holm(found)
 
 
 def _left_out(both: str, items: Mapping[str, CommonItems]) -> list[str]:
@@ -182,7 +254,7 @@ def _run_called(name: str, runs: Sequence[RunReader], names: Mapping[str, str]) 
         if len(found) == 1:
             return found[0]
     there = ", ".join(f"{run.location.name} ({names[_place(run)]})" for run in runs)
-    raise UsageError(f"--against {name!r} is {'several' if found else 'none'} of the runs {there}")
+    raise UsageError(f"--compare {name!r} is {'several' if found else 'none'} of the runs {there}")
 
 
 def _why_not(here: RunReader, there: RunReader, items: Mapping[str, CommonItems]) -> str:

@@ -128,10 +128,19 @@ def _point(row: RetentionRow, stream: str) -> GapPoint | None:
 
 
 def _draw_ground(axes: "Axes") -> None:
-    axes.fill_between([0, 100], [0, 100], color="0.93", lw=0, zorder=0, label="more decodable than success shows")
+    axes.fill_between([0, 100], [0, 100], [0, 0], color="0.955", lw=0, zorder=0)
     axes.plot([0, 100], [0, 100], color="0.45", lw=1, zorder=1)
     for draw in (axes.axvline, axes.axhline):
         draw(50, color="0.45", lw=0.8, ls="--", zorder=1)
+    axes.text(
+        99,
+        2,
+        "more decodable than success shows",
+        ha="right",
+        fontsize=8,
+        style="italic",
+        color="0.35",
+    )
     axes.text(0.5, 50.5, "guessing", fontsize=7, color="0.35")
     axes.text(50.5, 100, "chance", fontsize=7, color="0.35", rotation=90, va="top")
     axes.set_xlim(-2, 102)

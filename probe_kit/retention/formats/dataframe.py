@@ -5,7 +5,7 @@ from dataclasses import fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from probe_kit.retention.columns.text import model_name, once_per_category
-from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.parts import RetentionPart
 from probe_kit.retention.rows.row import RetentionRow
 

@@ -1,26 +1,33 @@
 """The retention table as JSON."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from probe_kit.retention.columns.findings import finding
 from probe_kit.retention.columns.sentences import conclusion, verdict
-from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 
 
 def table_json(
-    rows: Sequence[RetentionRow], differences: Sequence[Difference], beside: Mapping[str, Sequence[Any]]
+    rows: Sequence[RetentionRow],
+    differences: Sequence[Difference],
+    wordings: Sequence[Difference],
+    vlm_vla: Sequence[Difference],
 ) -> str:
-    """See `RetentionTable.to_json`. beside: further lists of dataclasses by their name, shown if not empty."""
+    """See `RetentionTable.to_json`."""
     between_runs = [one for one in differences if one.run is not None]
     between_groups = [one for one in differences if one.run is None]
     several = len({row.run.location for row in rows}) > 1 and not any(row.group for row in rows)
     lines = [asdict(row) | _in_words(row) | (_own(row, between_runs) if several else {}) for row in rows]
-    lists = {"differences": between_groups, **beside}
-    shown = {name: [asdict(one) for one in found] for name, found in lists.items() if found}
+    records = {
+        "differences": [asdict(row) for row in between_groups],
+        "wordings": list(map(_of_wordings, wordings)),
+        "vlm_vla": list(map(_of_vlm_and_policy, vlm_vla)),
+    }
+    shown = {name: found for name, found in records.items() if found}
     content = {"rows": lines, **shown} if shown else lines
     return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
 
@@ -40,3 +47,21 @@ def _own(row: RetentionRow, differences: Sequence[Difference]) -> dict[str, Any]
         if (one.run, one.category) == (row.run.location, row.category) and one.view in (row.view, None)
     ]
     return {"differences": found}
+
+
+def _of_wordings(row: Difference) -> dict[str, Any]:
+    """Two wordings of a run by the words of their table."""
+    names = {"run": row.run, "category": row.category, "wording": row.group, "other": row.minus}
+    rates = {"sr": row.sr_group, "other_sr": row.sr_minus, "difference": row.sr, "difference_ci": row.sr_ci}
+    return names | rates | {"only": row.only, "only_other": row.only_minus} | _test(row)
+
+
+def _of_vlm_and_policy(row: Difference) -> dict[str, Any]:
+    """A VLM minus a policy by the words of their table."""
+    names = {"asked": row.group, "acted": row.minus, "category": row.category, "paired": row.paired}
+    rates = {"accuracy": row.sr_group, "sr": row.sr_minus, "difference": row.sr, "difference_ci": row.sr_ci}
+    return names | rates | {"same_frames": row.same_frames, "source": row.source} | _test(row)
+
+
+def _test(row: Difference) -> dict[str, Any]:
+    return {name: getattr(row, name) for name in ("p", "p_holm", "n_items", "of_items", "n_groups")}

@@ -8,7 +8,7 @@ from probe_kit._tables.heat import heat_key
 from probe_kit._tables.table import Table
 from probe_kit._terminal.local_paths import without_places
 from probe_kit.errors import UsageError
-from probe_kit.retention.columns.comparisons import known_used_tables, wording_tables
+from probe_kit.retention.columns.comparisons import known_used_tables
 from probe_kit.retention.columns.modes import Modes, modes_of
 from probe_kit.retention.columns.summary import summary_table
 from probe_kit.retention.columns.tables import SUBJECTS, retention_tables
@@ -91,7 +91,7 @@ def report_html(
         warnings=[(views[0].name, warning) for views in in_words for warning in views[0].warnings],
         notes=table.notes,
         tables=tables,
-        wordings=wording_tables(table.wordings),
+        wordings=table.wording_tables,
         further=further,
         joined=joined,
         join_notes=[*joins.refused, *dict.fromkeys(note for joined in joins.found for note in joined.notes)],

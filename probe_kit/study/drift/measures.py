@@ -12,7 +12,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.compare.common_items import common_items, wording_of
-from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import retention_table
 from probe_kit.statistics.estimates.cka import unbiased_cka

@@ -6,12 +6,10 @@ from dataclasses import replace
 from probe_kit._tables.numbers import p_text, percent, points, with_limits
 from probe_kit.retention.columns.text import P_DECIDES, difference_test, models_test
 from probe_kit.retention.compare.common_items import MANY
-from probe_kit.retention.compare.differences import Difference
+from probe_kit.retention.compare.compare import Difference, with_holm
 from probe_kit.retention.compare.known_used import OVERALL, CategoryCounts, KnownUsedTable, without_signal
-from probe_kit.retention.compare.vlm_vla import VlmVlaDifference
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.retention.table import RetentionTable
-from probe_kit.statistics.multiple_testing import corrected
 from probe_kit.study.tables.named_table import NamedTable, Number, caption
 from probe_kit.suite.categories import category_of
 
@@ -54,11 +52,9 @@ def _of_pairs(
     return NamedTable.of(title, columns, cells, names=2, mean=mean, notes=[note], numbers=numbers)
 
 
-def _tested[Compared: (Difference, VlmVlaDifference)](rows: Sequence[Compared]) -> list[Compared]:
+def _tested(rows: Sequence[Difference]) -> list[Difference]:
     """The same without tests of fewer than FEWEST_GROUPS groups, and Holm's p over those that are left."""
-    kept = [row if (row.n_groups or 0) >= FEWEST_GROUPS else replace(row, p=None) for row in rows]
-    p_holm = corrected(kept, lambda row: row.p, lambda row: row.category == MEAN)
-    return [replace(row, p_holm=p) for row, p in zip(kept, p_holm, strict=True)]
+    return with_holm([row if (row.n_groups or 0) >= FEWEST_GROUPS else replace(row, p=None) for row in rows])
 
 
 def _items(count: int | None, of_count: int | None) -> str:
@@ -70,7 +66,7 @@ def _items(count: int | None, of_count: int | None) -> str:
     return f"{count} of {of_count}" + (f" {_FEW}" if count < MANY * of_count else "")
 
 
-def _remarks(rows: Sequence[Difference] | Sequence[VlmVlaDifference]) -> list[str]:
+def _remarks(rows: Sequence[Difference]) -> list[str]:
     """What marks and missing p-values of these rows mean."""
     left_out = any(row.n_items is not None and (row.n_items < MANY * (row.of_items or 0)) for row in rows)
     few = any(row.n_groups is not None and row.n_groups < FEWEST_GROUPS for row in rows)
@@ -99,16 +95,16 @@ def group_table(table: RetentionTable, title: str) -> NamedTable:
     return _of_pairs(title, columns, cells, caption(table, [note]), numbers)
 
 
-def vlm_vla_table(differences: Sequence[VlmVlaDifference]) -> NamedTable:
+def vlm_vla_table(differences: Sequence[Difference]) -> NamedTable:
     """Share right of VLMs minus success rate of policies, where the file names the VLM of a policy."""
     found = _tested(differences)
     cells = [
         (
-            f"{row.asked} − {row.acted}",
+            f"{row.group} − {row.minus}",
             _category(row.category),
-            percent(row.accuracy),
-            percent(row.sr),
-            with_limits(row.difference, row.difference_ci, percent),
+            percent(row.sr_group),
+            percent(row.sr_minus),
+            with_limits(row.sr, row.sr_ci, percent),
             p_text(row.p_holm),
             _items(row.n_items, row.of_items),
         )
@@ -116,13 +112,13 @@ def vlm_vla_table(differences: Sequence[VlmVlaDifference]) -> NamedTable:
     ]
     numbers = [
         {
-            "vlm": row.asked,
-            "policy": row.acted,
+            "vlm": row.group,
+            "policy": row.minus,
             "category": row.category,
-            "accuracy": row.accuracy,
-            "sr": row.sr,
-            "difference": row.difference,
-            "ci": row.difference_ci,
+            "accuracy": row.sr_group,
+            "sr": row.sr_minus,
+            "difference": row.sr,
+            "ci": row.sr_ci,
             "p": row.p,
             "p_holm": row.p_holm,
             "items": row.n_items,

@@ -12,7 +12,6 @@ from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
 from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
-from probe_kit.retention.compare.vlm_vla import vlm_vla_differences
 from probe_kit.retention.table import RetentionTable
 from probe_kit.runs.provenance import differences
 from probe_kit.study.archive import TABLES, Pack
@@ -126,8 +125,8 @@ def _made(study: LoadedStudy, table: TableTable, runs: StoredRuns, name: str, pa
         values = {place: further.values[name] for place, name in named.items() if name in further.values}
         return score_table(scores, further.title, further.source, values)
     if table.kind == "vlm-vla":
-        read = [scored(run, "text") for run in opened]
-        return vlm_vla_table(vlm_vla_differences(read, labels, _sources(study, runs.found)))
+        pairs = _sources(study, runs.found)
+        return vlm_vla_table(retention_table(opened, labels=labels, pairs=(), keys=none, vlm_vla=pairs).vlm_vla)
     if table.kind in _OF_PROBED_RUNS:
         probed = [(one, one.probed.in_wording()) for one in runs.found]
         keys, categories = probe_keys(study, probed, partial), _categories(table)

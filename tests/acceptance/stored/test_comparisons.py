@@ -59,7 +59,7 @@ def test_against_names_the_run_that_is_subtracted_and_the_table_prints_the_diffe
 
     straight = color(runs.trained, runs.untrained)
     turned = color(runs.untrained, runs.trained)
-    against = color(runs.untrained, runs.trained, "--against", runs.untrained)
+    against = color(runs.untrained, runs.trained, "--compare", runs.untrained)
     assert turned["sr"] > 0.5
     assert straight["sr"] == pytest.approx(-turned["sr"])
     assert against["sr"] == pytest.approx(turned["sr"])
@@ -70,7 +70,7 @@ def test_against_names_the_run_that_is_subtracted_and_the_table_prints_the_diffe
 
 def test_a_group_of_models_is_compared_with_another_with_the_exact_p_over_models(runs: StoredRuns) -> None:
     groups = (f"right={runs.expert}", f"wrong={runs.mirrored},{runs.idle}")
-    typed = [word for group in groups for word in ("--group", group)]
+    typed = ("--compare", "groups", *groups)
     answer = probe_kit("retention", *typed, "--format", "json").json()
     (color,) = [one for one in differences(answer) if one["category"] == "color"]
     assert (color["group"], color["minus"]) == ("wrong", "right")
@@ -85,7 +85,7 @@ def test_a_group_of_models_is_compared_with_another_with_the_exact_p_over_models
 
 
 def test_vlm_minus_vla_is_the_paired_difference_on_the_same_first_frames(runs: StoredRuns) -> None:
-    answer = probe_kit("retention", runs.asked, runs.trained, "--vlm-vla", "--format", "json").json()
+    answer = probe_kit("retention", runs.asked, runs.trained, "--compare", "vlm-vla", "--format", "json").json()
     pairs = {pair["category"]: pair for pair in answer["vlm_vla"]}
     assert set(pairs) == {"color", "state", "mean"}
     for category in ("color", "state"):
@@ -98,13 +98,13 @@ def test_vlm_minus_vla_is_the_paired_difference_on_the_same_first_frames(runs: S
         assert 0 < pair["p"] <= pair["p_holm"] <= 1
     # State: the VLM answers it, the policy was not trained to act on it.
     assert pairs["state"]["difference"] > 0.2
-    text = probe_kit("retention", runs.asked, runs.trained, "--vlm-vla").out
+    text = probe_kit("retention", runs.asked, runs.trained, "--compare", "vlm-vla").out
     printed = f"{100 * pairs['state']['difference']:.1f}"
     assert any(printed in " ".join(cells) for cells in rows_with(text, "state"))
 
 
 def test_stages_count_items_by_answered_encoded_and_acted(runs: StoredRuns) -> None:
-    typed = ("retention", runs.asked, runs.trained, "--stages")
+    typed = ("retention", runs.asked, runs.trained, "--compare", "stages")
     rows = {row["category"]: row for row in probe_kit(*typed, "--format", "json").json()["rows"]}
     for category in ("color", "state"):
         row = rows[category]

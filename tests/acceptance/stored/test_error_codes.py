@@ -102,7 +102,7 @@ def other_frames(room: Room) -> tuple[object, ...]:
     )
     probe_kit("ask", *settings, "--out", room.folder / "asked")
     asked = next((room.folder / "asked").glob("*/run.json")).parent
-    return ("retention", asked, room.runs.trained, "--stages")
+    return ("retention", asked, room.runs.trained, "--compare", "stages")
 
 
 def too_few_groups(room: Room) -> tuple[object, ...]:

@@ -1,13 +1,26 @@
-import json
+"""Wordings of one run against each other, on the episodes that were played in both."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import success_rate
-from probe_kit.retention.behaviour.wordings import wording_pairs
 from probe_kit.retention.columns.comparisons import wording_tables
+from probe_kit.retention.compare.compare import Difference
+from probe_kit.retention.compare.pairing import compare_wordings
+from probe_kit.train import ArrayRun
 from probe_kit.train.data.labels import target_labels
+
+
+@dataclass(frozen=True)
+class Ladder(ArrayRun):
+    """A run of several wordings."""
+
+    wordings: tuple[str, ...] = ()
+    settings: dict = field(default_factory=dict)
 
 
 @pytest.fixture
@@ -25,22 +38,26 @@ def ladder(outcome_table):
     return pd.concat(parts, ignore_index=True)
 
 
+def pairs(episodes: pd.DataFrame, *wordings: str) -> list[Difference]:
+    return compare_wordings([Ladder(Path("run"), "m", "suite@1#0123456789ab", episodes, {}, wordings=wordings)])
+
+
 def test_pairs_count_what_one_wording_alone_got_right_on_the_same_episodes(ladder):
-    by_names = {(p.wording, p.other): p for p in wording_pairs(ladder, ("knowledge", "named", "side"), "r", "m")}
+    by_names = {(p.group, p.minus): p for p in pairs(ladder, "knowledge", "named", "side") if p.category != "mean"}
     assert len(by_names) == 3
     pair = by_names["knowledge", "side"]
-    assert (pair.n_episodes, pair.sr, pair.other_sr, pair.only, pair.only_other) == (12, 0.5, 1.0, 0, 6)
-    assert pair.p == pytest.approx(2 / 2**6)
-    assert pair.p_groups == pytest.approx(2 / 2**3)
+    assert (pair.n_items, pair.sr_group, pair.sr_minus, pair.only, pair.only_minus) == (6, 0.5, 1.0, 0, 6)
+    assert pair.sr == -0.5
+    assert pair.p == pytest.approx(2 / 2**3), "three groups of two items, each a toss of a coin"
     fewer = by_names["knowledge", "named"]
-    assert (fewer.n_episodes, fewer.sr, fewer.only_other) == (8, 0.75, 2)
-    assert all(pair.p_holm >= pair.p_groups for pair in by_names.values())
+    assert (fewer.n_items, fewer.of_items, fewer.sr_group, fewer.only_minus) == (4, 6, 0.75, 2)
+    assert all(pair.p_holm >= pair.p for pair in by_names.values())
 
 
-def test_several_categories_have_a_row_together(ladder):
+def test_several_categories_have_a_mean(ladder):
     shape = ladder.assign(category="shape", item_id="s" + ladder["item_id"], group_id="s" + ladder["group_id"])
-    pairs = wording_pairs(pd.concat([ladder, shape]), ("knowledge", "side"), "r", "m")
-    assert [(p.category, p.n_episodes) for p in pairs] == [("color", 12), ("shape", 12), ("all", 24)]
+    found = pairs(pd.concat([ladder, shape]), "knowledge", "side")
+    assert [(p.category, p.n_items) for p in found] == [("color", 6), ("shape", 6), ("mean", 12)]
 
 
 def test_success_rates_and_probes_take_one_wording(ladder):
@@ -52,13 +69,12 @@ def test_success_rates_and_probes_take_one_wording(ladder):
 
 def test_a_pair_that_shares_no_episode_is_left_out(ladder):
     apart = ladder[(ladder["wording"] == "knowledge") == (ladder["item_id"] < "color-3")]
-    pairs = wording_pairs(apart, ("knowledge", "named", "side"), "r", "m")
-    assert [(p.wording, p.other) for p in pairs] == [("named", "side")]
-    assert json.dumps(pairs[0].p)
+    found = pairs(apart, "knowledge", "named", "side")
+    assert {(p.group, p.minus) for p in found} == {("named", "side")}
 
 
-def test_the_wordings_are_a_table_wherever_plain_tables_are(ladder):
-    pairs = wording_pairs(ladder, ("knowledge", "side"), "r", "m")
-    (table,) = wording_tables(pairs)
+def test_the_wordings_are_a_table(ladder):
+    (table,) = wording_tables(pairs(ladder, "knowledge", "side"), {"run": "m"})
+    assert table.title == "Wordings, m"
     assert table.texts[0][0] == "color"
     assert "0 / 6" in table.texts[0]  # what one wording alone got right, and the other

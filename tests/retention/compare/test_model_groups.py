@@ -11,7 +11,7 @@ from probe_kit._tables.numbers import points, signed
 from probe_kit.errors import UsageError
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.text import models_test
-from probe_kit.retention.compare.differences import ModelTest
+from probe_kit.retention.compare.compare import ModelTest
 from probe_kit.train import ArrayRun
 
 ProbedRun = Callable[..., ArrayRun]

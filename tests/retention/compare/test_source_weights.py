@@ -16,7 +16,6 @@ from probe_kit.hooks.registry import find_family, own_families
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.retention import retention_table
 from probe_kit.retention.compare.source_weights import grew_from
-from probe_kit.retention.compare.vlm_vla import vlm_vla_differences
 from probe_kit.retention.report import report_html
 from tests.retention.asked_runs import SaidRun, acted, asked
 
@@ -119,11 +118,13 @@ def test_the_declared_source_is_a_released_size_of_its_family(name: str) -> None
 def test_a_policy_whose_source_was_asked_is_not_compared_with_other_weights(tmp_path: Path) -> None:
     vlms = [vlm(tmp_path / str(n), one, f"vlm {n}") for n, one in enumerate((QWEN_4B, QWEN_32B))]
     grown = policy(tmp_path / "p", xiaomi())
-    found = vlm_vla_differences([*vlms, grown])
-    assert {(gap.asked, gap.source) for gap in found} == {("vlm 0", "yes")}
-    assert {(gap.asked, gap.source) for gap in vlm_vla_differences([vlms[1], grown])} == {("vlm 1", "no")}
+    found = retention_table([*vlms, grown], vlm_vla=True).vlm_vla
+    assert {(gap.group, gap.source) for gap in found} == {("vlm 0", "yes")}
+    assert {(gap.group, gap.source) for gap in retention_table([vlms[1], grown], vlm_vla=True).vlm_vla} == {
+        ("vlm 1", "no")
+    }
     unknown = vlm(tmp_path / "u", replace(QWEN_4B, checkpoint="my/copy"), "copy")
-    assert {(gap.asked, gap.source) for gap in vlm_vla_differences([*vlms, unknown, grown])} == {
+    assert {(gap.group, gap.source) for gap in retention_table([*vlms, unknown, grown], vlm_vla=True).vlm_vla} == {
         ("vlm 0", "yes"),
         ("copy", "unknown"),
     }

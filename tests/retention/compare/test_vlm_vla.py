@@ -13,7 +13,6 @@ from rich.console import Console
 
 from probe_kit.errors import UsageError
 from probe_kit.retention import retention_table
-from probe_kit.retention.compare.vlm_vla import vlm_vla_differences
 from tests.retention.asked_runs import SaidRun, acted, asked
 from tests.retention.paired_limits import mover
 
@@ -98,7 +97,7 @@ def test_the_gap_is_what_an_independent_count_gives(runs: list[SaidRun]) -> None
     for gap in table.vlm_vla[:2]:
         here = vlm[vlm["category"] == gap.category]["outcome"] == "correct"
         there = (policy["outcome"] == "correct")[here.index]
-        assert gap.difference == pytest.approx(sum(here) / len(here) - sum(there) / len(there))
+        assert gap.sr == pytest.approx(sum(here) / len(here) - sum(there) / len(there))
         gains: dict[str, int] = {}
         for name in here.index:
             group = vlm.loc[name, "group_id"]
@@ -111,22 +110,22 @@ def test_the_gap_is_what_an_independent_count_gives(runs: list[SaidRun]) -> None
         ps.append(sum(one >= abs(sum(values)) for one in sums) / len(sums))
         assert gap.p == pytest.approx(ps[-1])
         tables = [run.loc[here.index].reset_index() for run in (vlm, policy)]
-        assert gap.difference_ci == pytest.approx(mover(*tables))
+        assert gap.sr_ci == pytest.approx(mover(*tables))
         assert (gap.paired, gap.same_frames) == (True, True)
     smaller, larger = sorted(ps)
     corrected = {smaller: min(1, 2 * smaller), larger: min(1, max(2 * smaller, larger))}
     assert [gap.p_holm for gap in table.vlm_vla[:2]] == [pytest.approx(corrected[p]) for p in ps]
     mean = table.vlm_vla[2]
     assert mean.category == "mean"
-    assert mean.difference == pytest.approx(np.mean([gap.difference for gap in table.vlm_vla[:2]]))
+    assert mean.sr == pytest.approx(np.mean([gap.sr for gap in table.vlm_vla[:2]]))
 
 
 def test_only_items_in_common_are_compared_and_counted(runs: list[SaidRun]) -> None:
     policy, vlm = runs
     fewer = replace(policy, episodes=policy.episodes[policy.episodes["item_id"] != "color-0"])
-    color, _, mean = vlm_vla_differences([vlm, fewer])
+    color, _, mean = retention_table([vlm, fewer], vlm_vla=True).vlm_vla
     asked_too = replace(vlm, episodes=vlm.episodes[vlm.episodes["item_id"] != "color-0"])
-    assert replace(color, of_items=19) == vlm_vla_differences([asked_too, fewer])[0]
+    assert replace(color, of_items=19) == retention_table([asked_too, fewer], vlm_vla=True).vlm_vla[0]
     assert (color.n_items, color.of_items, mean.n_items, mean.of_items) == (19, 20, 35, 36)
     shown = retention_table([vlm, fewer], vlm_vla=True).further_tables[-1]
     assert [line[-1] for line in shown.texts] == ["19 of 20", "16", "35 of 36"]
@@ -135,12 +134,12 @@ def test_only_items_in_common_are_compared_and_counted(runs: list[SaidRun]) -> N
 def test_other_items_are_not_paired_and_have_no_p(runs: list[SaidRun]) -> None:
     policy, vlm = runs
     others = policy.episodes.assign(item_id="new " + policy.episodes["item_id"])
-    color = vlm_vla_differences([vlm, replace(policy, episodes=others)])[0]
+    color = retention_table([vlm, replace(policy, episodes=others)], vlm_vla=True).vlm_vla[0]
     assert (color.paired, color.p) == (False, None)
     other = replace(policy, episodes=policy.episodes.assign(first_frame_sha256="another"))
-    assert vlm_vla_differences([vlm, other])[0].same_frames is False
+    assert retention_table([vlm, other], vlm_vla=True).vlm_vla[0].same_frames is False
     bare = replace(policy, episodes=policy.episodes.drop(columns="first_frame_sha256"))
-    assert vlm_vla_differences([vlm, bare])[0].same_frames is None
+    assert retention_table([vlm, bare], vlm_vla=True).vlm_vla[0].same_frames is None
 
 
 def test_a_policy_is_compared_with_the_vlm_it_grew_from(tmp_path: Path) -> None:
@@ -153,7 +152,7 @@ def test_a_policy_is_compared_with_the_vlm_it_grew_from(tmp_path: Path) -> None:
     grown = {"source": "paligemma", "source_weights": {"checkpoint": "google/paligemma-3b-pt-224"}}
     pi0 = replace(pi0, certificate={"policy": grown})
     tiny = acted(tmp_path / "d", by_chance(4, 0.5), "pi0-tiny")
-    pairs = {(gap.asked, gap.acted) for gap in vlm_vla_differences([qwen, gemma, pi0, tiny])}
+    pairs = {(gap.group, gap.minus) for gap in retention_table([qwen, gemma, pi0, tiny], vlm_vla=True).vlm_vla}
     assert pairs == {("paligemma", "pi0"), ("qwen3-vl", "pi0-tiny"), ("paligemma", "pi0-tiny")}
 
 
@@ -184,7 +183,7 @@ def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path
     assert "VLM $-$ VLA" in latex
     content = json.loads(table.to_json())
     assert len(content["vlm_vla"]) == 9
-    assert {"difference", "difference_ci", "p_holm", "paired"} <= content["vlm_vla"][0].keys()
+    assert {"difference", "difference_ci", "accuracy", "sr", "p_holm", "paired"} <= content["vlm_vla"][0].keys()
     assert isinstance(json.loads(retention_table(runs).to_json()), list)
     sizes = next(own for own in table.further_tables if own.columns[:2] == ("model", "prompt"))
     assert sizes.columns == ("model", "prompt", "224x224", "560x480")

@@ -1,0 +1,351 @@
+"""One comparison: the first side minus the second, on the same items, with one exact test.
+
+Two runs, two groups of models, a VLM and a policy, two wordings of a run are calls of `compare`; `pairing` says
+which sides are compared. Rows pair by item, layout and content; groups of items
+are the unit of intervals and of p.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from probe_kit.retention.behaviour.success_rate import success_share
+from probe_kit.retention.compare.common_items import CommonItems, common_items
+from probe_kit.retention.compare.gains import Gains
+from probe_kit.retention.compare.model_test import (
+    ModelTest,
+    compare_models,
+    retention_of_model,
+    success_of_model,
+)
+from probe_kit.retention.compare.source_weights import Relation
+from probe_kit.retention.estimators.stream_scores import (
+    ACTION,
+    BACKBONE,
+    Limits,
+    PooledScores,
+    Rate,
+    RowEstimates,
+    limits,
+)
+from probe_kit.retention.rows.build import RowWithEstimates
+from probe_kit.retention.rows.parts import Mode
+from probe_kit.retention.rows.row import MEAN
+from probe_kit.statistics.estimates.retention import Ratio, retention_difference
+from probe_kit.statistics.estimates.scores import Scores
+from probe_kit.statistics.multiple_testing import corrected
+from probe_kit.train.data.run_reader import RunReader, seed_text_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class Difference:
+    """`group` minus `minus` in one category and view, each the mean of its runs; 95 % intervals.
+
+    group, minus: names of groups, or of single runs, whose locations are then `run` and `minus_run`. paired:
+    whether both ran the same items, which then count as pairs. view: None where the two have no probed view in
+    common. sr, backbone, action: success rate and cross-fitted accuracies. retention: None unless defined on
+    both sides. p: of `sr`, exact, signs of whole groups of items flipped, in the row `mean` of all items at
+    once; None unless paired. p_holm: over the categories of all pairs of the table, or over the pairs in rows
+    `mean`. Intervals and p are of these models on other items. sr_models, retention_models: of other models,
+    where a side is a group of several. call: the captured inference that both were probed at, None without
+    probes or where they differ. mode: what the models of both did. n_items: items that all runs of both sides have
+    and that the numbers are of; of_items: items that any of them has. None where that is not known. n_groups:
+    independent groups of items whose signs `p` flips, None without a p. sr_group, sr_minus: the two rates. only,
+    only_minus: episodes in which one side alone is right, or more often than the other; None unless paired.
+    same_frames, source: of a VLM minus a policy, whether all began with the same frames, and whether the policy's
+    network grew from the weights that were asked; None of others, and where unknown. In a row of category `mean`,
+    numbers are averages over the `categories` that both groups have.
+    """
+
+    group: str
+    minus: str
+    category: str
+    view: str | None
+    paired: bool
+    sr: float | None = None
+    sr_ci: Limits | None = None
+    backbone: float | None = None
+    backbone_ci: Limits | None = None
+    action: float | None = None
+    action_ci: Limits | None = None
+    retention: float | None = None
+    retention_ci: Limits | None = None
+    sr_models: ModelTest | None = None
+    retention_models: ModelTest | None = None
+    call: int | None = None
+    p: float | None = None
+    p_holm: float | None = None
+    run: str | None = None
+    minus_run: str | None = None
+    mode: Mode = "acts"
+    categories: tuple[str, ...] = ()
+    n_items: int | None = None
+    of_items: int | None = None
+    n_groups: int | None = None
+    sr_group: float | None = None
+    sr_minus: float | None = None
+    only: int | None = None
+    only_minus: int | None = None
+    same_frames: bool | None = None
+    source: Relation | None = None
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of a comparison: what it is called, its runs and their rows, and where it lies if it is one run.
+
+    origins: see `compare_models`.
+    """
+
+    name: str
+    runs: tuple[RunReader, ...]
+    rows: tuple[RowWithEstimates, ...]
+    run: str | None = None
+    origins: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, name: str, run: RunReader, rows: Sequence[RowWithEstimates]) -> "Side":
+        """Return a single run; rows: those of several runs, of which its own are taken."""
+        place = str(run.location)
+        return cls(name, (run,), tuple(row for row in rows if row.row.run.location == place), place)
+
+
+def compare(
+    first: Side,
+    second: Side,
+    of: Literal["all", "success"] = "all",
+    *,
+    items: Mapping[str, CommonItems] | None = None,
+    others_too: bool = False,
+) -> list[Difference]:
+    """Return the first side minus the second, per view and category, and over all categories.
+
+    of: success rates, backbone, action and retention; or success rates (answers of a VLM) alone. items: by
+    category, what all runs have in common, see `common_items`. others_too: compare categories without such items,
+    each side on its own. Holm's p is that of `with_holm`, over all rows that are shown together.
+    """
+    runs = [*first.runs, *second.runs]
+    shared = common_items(runs) if items is None else items
+    sides = tuple(_on_common_items(side, shared, runs, others_too) for side in (first, second))
+    mine, theirs = (_by_view(side.rows) for side in sides)
+    views: list[str | None] = [view for view in mine if view in theirs]
+    if of == "success" or not views:  # not probed, or in other views: behaviour can still be compared
+        mine, theirs, views = _behaviour(mine), _behaviour(theirs), [None]
+    outcomes = _outcomes(sides[0].rows), _outcomes(sides[1].rows)
+    calls = {row.row.run.call for side in sides for row in side.rows}
+    found = [
+        row for view in views for row in _compare((sides[0], sides[1]), view, (mine[view], theirs[view]), outcomes)
+    ]
+    call = next(iter(calls)) if len(calls) == 1 and of == "all" else None
+    mode = sides[0].rows[0].row.run.mode if found else "acts"
+    named = [replace(row, call=call, run=first.run, minus_run=second.run, mode=mode) for row in found]
+    return [_with_counts(row, shared) for row in named]
+
+
+def with_holm(rows: Sequence[Difference]) -> list[Difference]:
+    """Return the rows, which are shown together, with `p_holm`.
+
+    Categories of all pairs are one family, means of all pairs another; views do not multiply tests of success.
+    """
+    found = corrected(rows, lambda row: row.p, lambda row: row.category == MEAN, _test)
+    return [replace(row, p_holm=p) for row, p in zip(rows, found, strict=True)]
+
+
+def _test(row: Difference) -> tuple[str | None, str, str, str]:
+    return row.run, row.group, row.minus, row.category
+
+
+def _with_counts(row: Difference, items: Mapping[str, CommonItems]) -> Difference:
+    """Return the row with `n_items` and `of_items`, where they are known."""
+    names = row.categories or (row.category,)
+    if not all(name in items for name in names):
+        return row
+    found = [items[name] for name in names]
+    return replace(row, n_items=sum(one.n_items for one in found), of_items=sum(one.of_items for one in found))
+
+
+def _on_common_items(
+    side: Side, items: Mapping[str, CommonItems], runs: Sequence[RunReader], others_too: bool
+) -> Side:
+    """Return the side on the items in common, with the draws of the first of `runs`."""
+    seed_texts = {str(run.location): seed_text_of(run) for run in runs}
+    seed_text = seed_text_of(runs[0])
+
+    def common(one: RowWithEstimates) -> RowWithEstimates:
+        own = items.get(one.row.category)
+        if own is None or (own.whole and seed_texts[one.row.run.location] == seed_text):
+            return one
+        outcomes = None if one.outcomes is None else own.select(one.outcomes)
+        rates = {} if outcomes is None else {"sr": success_share(outcomes, seed_text)}
+        streams = one.estimates.streams if own.whole else None
+        estimates = RowEstimates(rates, None if streams is None else streams.as_of(seed_text))
+        return replace(one, estimates=estimates, outcomes=outcomes)
+
+    shared = {name for name, own in items.items() if own.n_items}
+    return replace(side, rows=tuple(common(one) for one in side.rows if others_too or one.row.category in shared))
+
+
+Outcomes = Mapping[str, Sequence["pd.DataFrame"]]
+"""Per category, a table of outcomes of each run."""
+Drawn = Mapping[str, Sequence[RowWithEstimates]]
+"""Per category, the row of each run."""
+
+
+def _outcomes(drawn: Sequence[RowWithEstimates]) -> Outcomes:
+    """Once per run, whatever number of views it has."""
+    found: dict[str, dict[str, pd.DataFrame]] = {}
+    for one in drawn:
+        if one.outcomes is not None:
+            found.setdefault(one.row.category, {})[one.row.run.location] = one.outcomes
+    return {category: list(tables.values()) for category, tables in found.items()}
+
+
+def _behaviour(views: Mapping[str | None, Drawn]) -> dict[str | None, Drawn]:
+    """What does not depend on the view, under the view None."""
+    first = next(iter(views.values()), {})
+    return {
+        None: {
+            category: [replace(one, estimates=RowEstimates(one.estimates.rates)) for one in of_category]
+            for category, of_category in first.items()
+        }
+    }
+
+
+def _by_view(drawn: Sequence[RowWithEstimates]) -> dict[str | None, Drawn]:
+    """Rows per view and category."""
+    views: dict[str | None, dict[str, list[RowWithEstimates]]] = {}
+    for one in drawn:
+        views.setdefault(one.row.view, {}).setdefault(one.row.category, []).append(one)
+    return dict(views)
+
+
+@dataclass(frozen=True)
+class _Gap:
+    """One category of two sides. accuracies: by stream. pooled: scores of either side, None without probes."""
+
+    paired: bool
+    sr: Rate | None
+    accuracies: Mapping[str, Rate] = field(default_factory=dict)
+    pooled: tuple[PooledScores, PooledScores] | None = None
+
+    @classmethod
+    def of(cls, here: Sequence[RowWithEstimates], there: Sequence[RowWithEstimates]) -> "_Gap":
+        """Means over the runs of either side; a number that a run lacks is left out."""
+        rates = [_rate(side) for side in (here, there)]
+        pooled = [_pooled(side) for side in (here, there)]
+        mine, theirs = rates
+        sr = None if mine is None or theirs is None else mine.minus(theirs)
+        first, second = pooled
+        if first is None or second is None:
+            return cls(mine is not None and theirs is not None and mine.paired_with(theirs), sr)
+        same = first.shares_groups_with(second)
+        paired = same if mine is None or theirs is None else mine.paired_with(theirs)
+        names = [name for name in first.names if name in second.names]
+        gaps = {name: first.accuracy_difference(second, name) for name in names}
+        return cls(paired, sr, gaps, (first, second))
+
+    @property
+    def has_retention(self) -> bool:
+        """Whether both sides have both streams."""
+        return self.pooled is not None and all(side.names == (ACTION, BACKBONE) for side in self.pooled)
+
+
+def _rate(rows: Sequence[RowWithEstimates]) -> Rate | None:
+    shares = [one.estimates.rates["sr"] for one in rows if "sr" in one.estimates.rates]
+    return Rate.pooled(shares) if shares and len(shares) == len(rows) else None
+
+
+def _pooled(rows: Sequence[RowWithEstimates]) -> PooledScores | None:
+    streams = [one.estimates.streams for one in rows if one.estimates.streams is not None]
+    return PooledScores.of(streams) if streams and len(streams) == len(rows) else None
+
+
+def _compare(
+    sides: tuple[Side, Side], view: str | None, drawn: tuple[Drawn, Drawn], outcomes: tuple[Outcomes, Outcomes]
+) -> list[Difference]:
+    here, there = drawn
+    gaps = {category: _Gap.of(here[category], there[category]) for category in here if category in there}
+    gaps = {category: gap for category, gap in gaps.items() if gap.sr is not None or gap.accuracies}
+    rows = [
+        _row(sides, [category], view, [gap], drawn, _gains(outcomes, [category], [gap]))
+        for category, gap in gaps.items()
+    ]
+    if rows:
+        common, found = list(gaps), list(gaps.values())
+        mean = _row(sides, common, view, found, drawn, _gains(outcomes, common, found))
+        rows.append(replace(mean, category=MEAN, categories=tuple(common)))
+    return rows
+
+
+def _gains(outcomes: tuple[Outcomes, Outcomes], categories: Sequence[str], gaps: Sequence[_Gap]) -> Gains | None:
+    """Return the test of success rates, if both sides have one on the same items."""
+    if not all(gap.paired and gap.sr is not None for gap in gaps):
+        return None
+    first, second = ([table for name in categories for table in side.get(name, ())] for side in outcomes)
+    return Gains.of(first, second)
+
+
+def _row(
+    sides: tuple[Side, Side],
+    categories: Sequence[str],
+    view: str | None,
+    gaps: Sequence[_Gap],
+    drawn: tuple[Drawn, Drawn],
+    gains: Gains | None,
+) -> Difference:
+    """Of one category, or of the mean of several."""
+    first, second = ([of_side[category] for category in categories] for of_side in drawn)
+    sr, backbone, action = (
+        _mean_rate(found)
+        for found in (
+            [gap.sr for gap in gaps],
+            [gap.accuracies.get(BACKBONE) for gap in gaps],
+            [gap.accuracies.get(ACTION) for gap in gaps],
+        )
+    )
+    defined = all(any(one.row.retention.defined for found in side for one in found) for side in (first, second))
+    ratio = _retention([gap for gap in gaps if gap.has_retention]) if defined else None
+    rates = [[_rate(of_category) for of_category in side] for side in (first, second)]
+    known = sr is not None
+    origins = {**sides[0].origins, **sides[1].origins}
+    numbers: dict[str, float | Limits | None] = {
+        name: float(np.mean([rate.value for rate in of_side if rate is not None])) if known else None
+        for name, of_side in zip(("sr_group", "sr_minus"), rates, strict=True)
+    }
+    for name, found in (("sr", sr), ("backbone", backbone), ("action", action), ("retention", ratio)):
+        if found is not None:
+            numbers |= {name: found.value, f"{name}_ci": limits(found.interval)}
+    return Difference(
+        sides[0].name,
+        sides[1].name,
+        categories[0],
+        view,
+        all(gap.paired for gap in gaps),
+        **numbers,  # type: ignore[arg-type]
+        sr_models=compare_models((first, second), origins, success_of_model, largest=1.0),
+        retention_models=None if ratio is None else compare_models((first, second), origins, retention_of_model),
+        p=None if gains is None else gains.p,
+        n_groups=None if gains is None else gains.n_groups,
+        only=None if gains is None else gains.more,
+        only_minus=None if gains is None else gains.fewer,
+    )
+
+
+def _mean_rate(found: Sequence[Rate | None]) -> Rate | None:
+    known = [rate for rate in found if rate is not None]
+    return Rate.mean(known) if known else None
+
+
+def _retention(gaps: Sequence[_Gap]) -> Ratio | None:
+    """The difference of the ratios of the sides' mean scores."""
+    pairs = [gap.pooled for gap in gaps if gap.pooled is not None]
+    if not pairs:
+        return None
+    here, there = (Scores.mean([pair[side].scores for pair in pairs]) for side in (0, 1))
+    between = np.sum([mine.covariance_with(theirs) for mine, theirs in pairs], axis=0) / len(pairs) ** 2
+    return retention_difference(here, there, between)
