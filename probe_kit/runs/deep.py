@@ -31,7 +31,7 @@ READERS = min(8, max(4, os.cpu_count() or 1))
 BATCH = 256
 RESULT_READERS = (
     "probe_kit.train.every_result:readers_of_results",
-    "probe_kit.intervene.results.every_result:readers_of_results",
+    "probe_kit.intervene.results.inventory:readers_of_results",
 )
 """Functions that give a reader per stored result of a run. They lie in folders above."""
 
