@@ -17,7 +17,8 @@ from probe_kit.hashing import derive_seed
 from probe_kit.statistics.estimates.balanced import balanced_sums
 from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
 from probe_kit.statistics.folds import fold_numbers, fold_of_groups, sums_by_group
-from probe_kit.train.crossval.site_probe import SiteProbe, nested_folds, probe_site
+from probe_kit.train.crossval.nested_folds import nested_folds
+from probe_kit.train.crossval.site_probe import SiteProbe, probe_site
 from probe_kit.train.data.samples import Samples
 
 Matrix = NDArray[np.float64]

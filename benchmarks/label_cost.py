@@ -14,17 +14,17 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from probe_kit.train import ArrayRun, Labels
+from probe_kit.train import ArrayRun, ProbeSettings, Target
 from probe_kit.train.choices import TASKS
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.labels.label_problem import LabelProblem, label_problem
-from probe_kit.train.labels.labelled_samples import LabelledSamples
+from probe_kit.train.problem import Problem, make_problem
+from probe_kit.train.target_samples import TargetSamples
 
 GROUPS, EPISODES, FRAMES = 43, 4, 10
 WIDTHS = (96, 2048)
 
 
-def problem_of(task: str, permutations: int) -> LabelProblem:
+def problem_of(task: str, permutations: int) -> Problem:
     """A label of every frame: a wandering quantity, its terciles or its halves."""
     draw = np.random.default_rng(0)
     group, episode, frame = (axis.ravel() for axis in np.indices((GROUPS, EPISODES, FRAMES)))
@@ -36,9 +36,12 @@ def problem_of(task: str, permutations: int) -> LabelProblem:
     names = np.array([f"e{number}" for number in range(GROUPS * EPISODES)])
     table = pd.DataFrame({"episode_id": names[rows], "inference": frame, "y": values})
     episodes = pd.DataFrame({"episode_id": names, "group_id": np.repeat(np.arange(GROUPS), EPISODES).astype(str)})
+    episodes["category"] = "all"
     run = ArrayRun(Path("nowhere"), "none", "none", episodes, {})
-    samples = LabelledSamples(rows, frame, values, group.astype(str), np.full(rows.size, "all"), FRAMES, {})
-    return label_problem(run, Labels.read(table, "y", task), samples, permutations, 0)  # type: ignore[arg-type]
+    samples = TargetSamples(rows, frame, values, group.astype(str), np.full(rows.size, "all"), FRAMES, {})
+    target = Target.read(table, "y", task)  # type: ignore[arg-type]
+    settings = ProbeSettings("m", False, None, "", "", "", "", ("all",), ("mean",), "y", permutations, 0)
+    return make_problem(run, target, samples, "all", settings)
 
 
 def main() -> None:
@@ -49,12 +52,12 @@ def main() -> None:
     options = parser.parse_args()
     problem = problem_of(options.task, options.permutations)
     for width in WIDTHS:
-        features = np.random.default_rng(1).normal(size=(len(problem.columns), width)).astype(np.float32)
+        features = np.random.default_rng(1).normal(size=(problem.labels.size, width)).astype(np.float32)
         processor, clock = time.process_time(), time.perf_counter()
         problem.probe(Samples.pooled(features))
         processor, clock = time.process_time() - processor, time.perf_counter() - clock
         print(
-            f"{options.task}, {len(problem.columns)} x {width}, {options.permutations} permutations: "
+            f"{options.task}, {problem.labels.size} x {width}, {options.permutations} permutations: "
             f"{processor:.1f} CPU-s, {clock:.1f} s"
         )
 

@@ -24,8 +24,9 @@ from probe_kit.statistics.paired_bootstrap import SHARED_PROBE, better_than_best
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.student import explained_interval
 from probe_kit.train.crossval.nested_folds import nested_folds
-from probe_kit.train.labels.label_probe import fit_label_probe
-from probe_kit.train.labels.task_scores import squared_deviations
+from probe_kit.train.crossval.site_probe import probe_labels
+from probe_kit.train.crossval.task_scores import squared_deviations
+from probe_kit.train.data.samples import Samples
 
 Matrix = NDArray[np.float64]
 Kind = Literal["white", "group", "skewed", "ar"]
@@ -85,8 +86,8 @@ def draw(world: LabelWorld, seed: int) -> tuple[float, tuple[float, float], bool
     labels, group_of = world.labels(generator)
     folds = nested_folds(np.zeros(labels.size), group_of, seed, stratified_folds)
     here, there = (
-        fit_label_probe(world.features(labels, group_of, generator), labels[:, None], "continuous", folds).scores
-        for _ in range(2)
+        probe_labels(Samples.pooled(features), labels[:, None], "continuous", folds).scores
+        for features in (world.features(labels, group_of, generator) for _ in range(2))
     )
     deviations = squared_deviations(labels, [fold.outer for fold in folds])
     interval = explained_interval(here, deviations, group_of, SHARED_TRAINING)

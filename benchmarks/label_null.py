@@ -26,11 +26,11 @@ from threadpoolctl import threadpool_limits
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train import ArrayRun, Labels
+from probe_kit.train import ArrayRun, ProbeSettings, Target
 from probe_kit.train.choices import TASKS, Task
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.labels.label_problem import label_problem
-from probe_kit.train.labels.labelled_samples import LabelledSamples
+from probe_kit.train.problem import make_problem
+from probe_kit.train.target_samples import TargetSamples
 
 GROUPS, EPISODES, FRAMES, WIDTH, SITES, PERMUTATIONS = 20, 2, 8, 12, 3, 99
 SHAPE = GROUPS, EPISODES, FRAMES
@@ -82,13 +82,15 @@ def p_values(kind: str, task: Task, fitted: int, seed: int) -> tuple[float, floa
     rows = group * EPISODES + episode
     table = pd.DataFrame({"episode_id": names[rows], "inference": frame, "y": values})
     episodes = pd.DataFrame({"episode_id": names, "group_id": np.repeat(np.arange(GROUPS), EPISODES).astype(str)})
+    episodes["category"] = "all"
     run = ArrayRun(Path("nowhere"), "none", "none", episodes, {})
-    samples = LabelledSamples(rows, frame, values, group.astype(str), np.full(rows.size, "all"), FRAMES, {})
+    samples = TargetSamples(rows, frame, values, group.astype(str), np.full(rows.size, "all"), FRAMES, {})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        problem = label_problem(run, Labels.read(table, "y", task), samples, PERMUTATIONS, seed)
+        settings = ProbeSettings("m", False, None, "", "", "", "", ("all",), ("mean",), "y", PERMUTATIONS, seed)
+        problem = make_problem(run, Target.read(table, "y", task), samples, "all", settings)
     probes = [problem.probe(Samples.pooled(site)) for site in sites]
-    metric, null = np.array([probe.metric for probe in probes]), np.stack([probe.null for probe in probes])
+    metric, null = np.array([probe.scores.mean() for probe in probes]), np.stack([probe.null for probe in probes])
     every = np.column_stack([metric, null])
     excess = every - every.mean(axis=1, keepdims=True)
     family = pointwise_p(excess.max(axis=0)[:1], excess.max(axis=0)[None, 1:])

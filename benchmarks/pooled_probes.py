@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_limits
 
 from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS
 from probe_kit.statistics.label_permutations import flip_items
-from probe_kit.train.crossval import site_probe as probe
+from probe_kit.train.crossval import logistic_folds as probe
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.design_matrix import DenseDesign

@@ -21,8 +21,9 @@ from threadpoolctl import threadpool_limits
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.controls.random_features import LAYERS
-from probe_kit.train.crossval.site_probe import nested_folds, probe_site
+from probe_kit.train.controls.features import LAYERS
+from probe_kit.train.crossval.nested_folds import nested_folds
+from probe_kit.train.crossval.site_probe import probe_site
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.power import ALIKE, NEIGHBOURS, simulate
 

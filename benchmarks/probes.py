@@ -23,7 +23,8 @@ from threadpoolctl import threadpool_limits
 from probe_kit.runs.rows import TokenBlock
 from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS
 from probe_kit.statistics.label_permutations import flip_items
-from probe_kit.train.crossval.site_probe import STRENGTHS, nested_folds, probe_site
+from probe_kit.train.crossval.nested_folds import STRENGTHS, nested_folds
+from probe_kit.train.crossval.site_probe import probe_site
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.projection import Projection
 

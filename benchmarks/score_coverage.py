@@ -24,7 +24,8 @@ from probe_kit.hashing import derive_seed
 from probe_kit.statistics.estimates.balanced import balanced_sums
 from probe_kit.statistics.estimates.shares import Accuracy, Share
 from probe_kit.statistics.folds import fold_numbers
-from probe_kit.train.crossval.site_probe import nested_folds, probe_site
+from probe_kit.train.crossval.nested_folds import nested_folds
+from probe_kit.train.crossval.site_probe import probe_site
 from probe_kit.train.data.samples import Samples
 
 WIDTH = 8

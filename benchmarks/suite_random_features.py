@@ -19,13 +19,14 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from probe_kit.hashing import derive_seed
+from probe_kit.hooks import Site
 from probe_kit.suite import Suite, build_suite
-from probe_kit.train import ArrayRun, ProbeSettings
-from probe_kit.train.controls.random_features import LAYERS, RandomFeatureInputs
-from probe_kit.train.crossval.category_problem import category_problem
+from probe_kit.train import ArrayRun
+from probe_kit.train.controls.features import LAYERS, ControlInputs
 from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.results.probe_results import episodes_sha256
+from probe_kit.train.execution import ExecutionSettings
+from probe_kit.train.probe_sweep import Sweep
 
 
 def main() -> None:
@@ -56,22 +57,17 @@ def main() -> None:
 
 def free_accuracy(suite: Suite, width: int) -> dict[str, tuple[float, float]]:
     """By category, the accuracy of the best random layer and the mean of all."""
-    run = ArrayRun(suite.folder, "none", suite.identity, _episodes(suite), {})
-    inputs = RandomFeatureInputs.of(run, suite)
-    settings = ProbeSettings(
-        model="none", random_weights=True, weights=None, suite=suite.identity,
-        seed_text=suite.seed_text, run_settings=run.settings_sha256,
-        episodes=episodes_sha256(run), categories=tuple(suite.categories), views=("mean",), target="correct",
-        permutations=0, seed=0,
-    )  # fmt: skip
+    blank = np.zeros((len(_episodes(suite)), 1), np.float32)
+    run = ArrayRun(suite.folder, "none", suite.identity, _episodes(suite), {(Site("backbone", 0), "mean"): blank})
+    sweep = Sweep.of(run, "correct", None, ExecutionSettings(), None, views=("mean",), permutations=0, seed=0)
+    inputs = ControlInputs(run, sweep.samples, True, suite)
     found = {}
     for category in track(suite.categories, suite.identity, console=Console(stderr=True)):
-        problem = category_problem(run.episodes, category, settings)
-        nothing = np.empty((problem.labels.size, 0), bool)
+        problem = sweep.problems[category]
         accuracies = []
         for number in range(LAYERS):
-            layer = inputs.layer(problem.rows, width, derive_seed("binding", 0, number))
-            decisions = problem.fit(Samples.pooled(layer), nothing).decisions
+            layer = inputs.layer(problem.positions, width, derive_seed("binding", 0, number))
+            decisions = problem.fit(Samples.pooled(layer)).decisions
             accuracies.append(float(correctness(decisions, problem.labels).mean()))
         found[category] = (max(accuracies), float(np.mean(accuracies)))
     return found

@@ -35,7 +35,8 @@ from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most, findab
 from probe_kit.statistics.folds import fold_numbers, fold_of_groups, sums_by_group
 from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.crossval.site_probe import nested_folds, probe_site
+from probe_kit.train.crossval.nested_folds import nested_folds
+from probe_kit.train.crossval.site_probe import probe_site
 from probe_kit.train.data.samples import Samples
 
 Sizes = NDArray[np.int64]

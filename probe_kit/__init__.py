@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from probe_kit.retention.report import write_report
     from probe_kit.runs import Run, open_run
     from probe_kit.suite import Suite, build_suite, default_suite, load_suite
-    from probe_kit.train import Labels, load_results, probe, train_probes
+    from probe_kit.train import Target, load_results, probe, train_probes
 
 __all__ = [
     "Act2AnswerEnv",
@@ -60,7 +60,6 @@ __all__ = [
     "IterationMapDisplay",
     "JointPlaces",
     "KnowledgeActionDisplay",
-    "Labels",
     "LayerCurveDisplay",
     "LeRobotSource",
     "ModelDepthDisplay",
@@ -71,6 +70,7 @@ __all__ = [
     "Site",
     "Steering",
     "Suite",
+    "Target",
     "build_suite",
     "capture",
     "default_suite",
@@ -107,7 +107,6 @@ __getattr__, __dir__ = lazy_names(
         "ImageSwap": "intervene",
         "IterationMapDisplay": "retention.displays",
         "KnowledgeActionDisplay": "retention.displays",
-        "Labels": "train",
         "LayerCurveDisplay": "retention.displays",
         "LeRobotSource": "extract",
         "ModelDepthDisplay": "retention.displays",
@@ -117,6 +116,7 @@ __getattr__, __dir__ = lazy_names(
         "Site": "hooks",
         "ReplaySource": "intervene",
         "Suite": "suite",
+        "Target": "train",
         "build_suite": "suite",
         "capture": "hooks",
         "default_suite": "suite",

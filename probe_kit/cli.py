@@ -34,8 +34,8 @@ from probe_kit.retention.commands import retention
 from probe_kit.study.commands import app as study_app
 from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import train
-from probe_kit.train.label_commands import labels
 from probe_kit.train.power_commands import power
+from probe_kit.train.target_commands import labels
 from probe_kit.view.commands import RUNS_BY_NAME, view
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 PANELS = {
     "Start": ("demo", "doctor", "models"),
     "Make runs": ("suite", "extract", "ask", "dataset", "run"),
-    "Probe": ("power", "train", "labels"),
+    "Probe": ("power", "targets", "train", "labels"),
     "Is it used?": ("intervene",),
     "Read results": ("retention", "view"),
     "A whole study from one file": ("study",),

@@ -261,8 +261,8 @@ def decode_labels(fence: Fence) -> None:
     ):
         options = ("--permutations", permutations, "--controls", ",".join(controls) or "none", "--task", task)
         call("train", "acting", "--target", target, *options)
-        labels = pk.Labels.of_run(run, target, task=task)
-        found = pk.train_probes(run, labels=labels, permutations=permutations, controls=controls)
+        labels = pk.Target.of_run(run, target, task=task)
+        found = pk.train_probes(run, target=labels, permutations=permutations, controls=controls)
         add_probes(fence, "acting", f"label {target}, {task}", found)
     add_retention(fence, "acting", "label retention", "acting", "--target", "sim.tool_y")
 
@@ -300,8 +300,8 @@ def show_recordings(fence: Fence) -> None:
     add_inputs(fence, "recording", run, "state", "action", "prediction", "pixels", "columns")
     target = "dataset.next.reward"
     call("train", "shown", "--target", target, "--permutations", 31, "--controls", "step,state")
-    labels = pk.Labels.of_run(run, target)
-    found = pk.train_probes(run, labels=labels, permutations=31, controls=("step", "state"))
+    labels = pk.Target.of_run(run, target)
+    found = pk.train_probes(run, target=labels, permutations=31, controls=("step", "state"))
     add_probes(fence, "recording", f"label {target}", found)
 
 
@@ -315,7 +315,7 @@ def play_own_environment(fence: Fence) -> None:
     add_inputs(fence, "environment", run, "state", "action", "pixels")
     target = "env.away"
     call("train", "environment", "--target", target, "--permutations", 31)
-    found = pk.train_probes(run, labels=pk.Labels.of_run(run, target), permutations=31)
+    found = pk.train_probes(run, target=pk.Target.of_run(run, target), permutations=31)
     add_probes(fence, "environment", f"label {target}", found)
     add_retention(fence, "environment", "label retention", "environment", "--target", "env.away")
 

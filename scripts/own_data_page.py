@@ -21,8 +21,9 @@ from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention import LabelRetentionTable, label_retention_table
 from probe_kit.retention.displays import label_curves, label_figures, save_figures
 from probe_kit.retention.report import write_label_report
-from probe_kit.train import LabelResults
-from probe_kit.train.labels.builtin_columns import label_frame
+from probe_kit.train import ProbeResults
+from probe_kit.train.columns.builtin import label_frame
+from probe_kit.train.results.score_rows import exceeds_column
 
 PAGE = Path(__file__).parents[1] / "docs" / "own-data.md"
 FIGURE, FIGURE_DPI = PAGE.with_name("own-data.png"), 110
@@ -47,7 +48,7 @@ def main() -> None:
     table.to_csv(folder / "labels.csv", index=False)
     results = [
         pk.train_probes(
-            run, labels=pk.Labels.read(folder / "labels.csv", name, group_by="scene"), permutations=PERMUTATIONS
+            run, target=pk.Target.read(folder / "labels.csv", name, group_by="scene"), permutations=PERMUTATIONS
         )
         for name in LABELS
     ]
@@ -113,7 +114,7 @@ def own_table(run: pk.Run, scene: pk.Run) -> pd.DataFrame:
     return label_frame(run).merge(wanted, on=keys, how="left")
 
 
-def table_of(run: pk.Run, results: list[LabelResults]) -> str:
+def table_of(run: pk.Run, results: list[ProbeResults]) -> str:
     """The best site of every stream and label, as Markdown."""
     heads = ("label", "task", "stream", "best site", "score", "chance", "p", "exceeds every control")
     rows = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
@@ -122,7 +123,7 @@ def table_of(run: pk.Run, results: list[LabelResults]) -> str:
         excess = scores["score"] - scores["chance"]
         for place in excess.groupby(scores["stream"], sort=False).idxmax():
             row = scores.loc[place]
-            missed = [name for name in found.controls.names if not row[f"exceeds_{name}"]]
+            missed = [name for name in found.controls.names if not row[exceeds_column(name)]]
             cells = [
                 f"`{found.settings.target}`",
                 found.settings.task,

@@ -42,18 +42,7 @@ from probe_kit.scene_names import ArmName, Rendering, RuleName, SceneName
 from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
 from probe_kit.suite.ladder import WORDINGS, Wording
-from probe_kit.train.choices import (
-    BASELINES,
-    INCOMPLETE,
-    LABEL_CONTROLS,
-    TARGETS,
-    TASKS,
-    Baseline,
-    Incomplete,
-    LabelControl,
-    Target,
-    Task,
-)  # fmt: skip
+from probe_kit.train.choices import CONTROLS, INCOMPLETE, SIDES, TASKS, Control, Incomplete, Side, Task
 
 LEAVES: dict[str, Any] = dict(commands_of(typer.main.get_command(app), None))
 MOST_LINES = 100
@@ -80,7 +69,7 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("train", "--task"): TASKS,
     ("train", "--folds"): FOLD_UNITS,
     ("train", "--incomplete"): INCOMPLETE,
-    ("train", "--controls"): BASELINES | LABEL_CONTROLS,
+    ("train", "--controls"): CONTROLS,
     ("intervene", "--kind"): kind_names(),
     ("intervene", "--readout"): get_args(Readout),
     ("intervene", "--format"): get_args(get_args(Format)[0]),
@@ -143,9 +132,9 @@ def test_every_option_that_has_choices_is_one_of_those_above(command: str) -> No
 @pytest.mark.parametrize(
     ("names", "declared"),
     [
-        (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Target, TARGETS),
-        (Task, TASKS), (LabelControl, LABEL_CONTROLS),
-        (Incomplete, INCOMPLETE), (Baseline, BASELINES), (FoldUnit, FOLD_UNITS), (Wording, WORDINGS),
+        (SceneName, PRESETS), (ArmName, ARMS), (ProtocolName, SCENES), (Query, QUERIES), (Side, SIDES),
+        (Task, TASKS), (Control, CONTROLS),
+        (Incomplete, INCOMPLETE), (FoldUnit, FOLD_UNITS), (Wording, WORDINGS),
         (ExportFormat, FORMATS),
         (RuleName, RULES), (AnswerScore, SCORES),
     ],

@@ -13,7 +13,7 @@ from notebooks.execute import FOLDER, executed, kernel, notebooks
 from probe_kit.intervene import stored_site_effects
 from probe_kit.retention import retention_table
 from probe_kit.runs import compare_actions, open_run
-from probe_kit.train import load_label_results, load_results
+from probe_kit.train import load_results
 
 NAMES = (
     "01-first-run", "02-layer-curves", "03-compare-models", "04-your-own-model", "05-your-own-questions",
@@ -188,7 +188,7 @@ def test_the_recordings_of_the_ninth_notebook_are_shown_and_their_side_is_decode
     assert run.recorded
     assert compare_actions(run).by_number.set_index("number").loc[["x", "y"], "first"].max() < 0.6
     (stored,) = (path.name for path in (run.path / "probes").iterdir())
-    assert load_label_results(run, stored).scores["score"].max() > 0.9
+    assert load_results(run, stored).scores["score"].max() > 0.9
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -417,6 +417,11 @@ def _read_probes(
                 shares = "Success rates" if ask_of(run) is None else "Answers"
                 missing.append(f"{shares} only: {error}")
             continue
+        if not found.settings.is_side:
+            raise UsageError(
+                f"{run.location}: the probes {found.key} are of {found.settings.target!r}, not of a side. Add "
+                f"--target {found.settings.target}, or give the key of other probes"
+            )
         results[str(run.location)] = found
         if not is_current(found.settings, run):
             missing.append(

@@ -10,7 +10,8 @@ from probe_kit.hooks.contract.protocol import ProtocolName
 from probe_kit.hooks.family import Dtype
 from probe_kit.runs.layout import AskTokens, LaterViews
 from probe_kit.scene_names import ArmName, Rendering, SceneName
-from probe_kit.train.choices import Baseline, Target
+from probe_kit.train.choices import Control as FeatureControl
+from probe_kit.train.choices import Side
 
 SCHEMA_VERSION = 1
 
@@ -61,7 +62,7 @@ TableKind = Literal[
     "stages",
     "drift",
 ]
-Control = Literal["untrained"] | Baseline
+Control = Literal["untrained"] | FeatureControl
 FigureKind = Literal["curves", "sides", "dose", "overview"]
 KINDS: tuple[TableKind, ...] = get_args(TableKind)
 
@@ -170,7 +171,7 @@ class ProbesTable(_Table):
     views: Names = ["mean"]
     permutations: Annotated[int, Field(ge=0, le=100_000)] = 200
     controls: Annotated[list[Control], AfterValidator(_each_once)] = []
-    target: Target = "correct"
+    target: Side = "correct"
     seed: Seed = 0
 
 

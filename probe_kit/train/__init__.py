@@ -10,49 +10,44 @@ from probe_kit._system.lazy import lazy_names
 if TYPE_CHECKING:
     from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
     from probe_kit.train.array_probe import ArrayProbes, probe
-    from probe_kit.train.choices import BASELINES, INCOMPLETE, TARGETS, Baseline, Incomplete, Target
+    from probe_kit.train.choices import CONTROLS, INCOMPLETE, SIDES, Control, Incomplete, Side
     from probe_kit.train.data.array_run import ArrayRun
     from probe_kit.train.data.run_reader import RunReader
-    from probe_kit.train.labels.label_results import LabelCurve, LabelResults
-    from probe_kit.train.labels.label_store import load_label_results
-    from probe_kit.train.labels.labels import Labels
     from probe_kit.train.probe_sweep import Progress, train_probes
     from probe_kit.train.results.by_call import load_results_by_call
-    from probe_kit.train.results.control_scores import BaselineScore, ControlComparison, Controls, UntrainedScore
+    from probe_kit.train.results.control_scores import ControlComparison, Controls, ControlScore, UntrainedScore
     from probe_kit.train.results.probe_curve import ProbeCurve
     from probe_kit.train.results.probe_directions import Direction
     from probe_kit.train.results.probe_results import ProbeResults
     from probe_kit.train.results.store import load_results, save_results
     from probe_kit.train.settings import ProbeSettings
+    from probe_kit.train.target import Target
     from probe_kit.train.transfer.transfer import transfer_probes
     from probe_kit.train.transfer.transfer_results import TransferResults
 
 __all__ = [
-    "BASELINES",
+    "CONTROLS",
     "FOLD_UNITS",
     "INCOMPLETE",
-    "TARGETS",
+    "SIDES",
     "ArrayProbes",
     "ArrayRun",
-    "Baseline",
-    "BaselineScore",
+    "Control",
     "ControlComparison",
+    "ControlScore",
     "Controls",
     "Direction",
     "FoldUnit",
     "Incomplete",
-    "LabelCurve",
-    "LabelResults",
-    "Labels",
     "ProbeCurve",
     "ProbeResults",
     "ProbeSettings",
     "Progress",
     "RunReader",
+    "Side",
     "Target",
     "TransferResults",
     "UntrainedScore",
-    "load_label_results",
     "load_results",
     "load_results_by_call",
     "probe",
@@ -68,9 +63,6 @@ __getattr__, __dir__ = lazy_names(
         "ArrayProbes": "array_probe",
         "ArrayRun": "data.array_run",
         "probe": "array_probe",
-        "BASELINES": "choices",
-        "Baseline": "choices",
-        "BaselineScore": "results.control_scores",
         "Controls": "results.control_scores",
         "ProbeCurve": "results.probe_curve",
         "Direction": "results.probe_directions",
@@ -79,16 +71,16 @@ __getattr__, __dir__ = lazy_names(
         "FoldUnit": "probe_kit.statistics.folds",
         "INCOMPLETE": "choices",
         "Incomplete": "choices",
-        "LabelCurve": "labels.label_results",
-        "LabelResults": "labels.label_results",
-        "Labels": "labels.labels",
-        "load_label_results": "labels.label_store",
+        "CONTROLS": "choices",
+        "Control": "choices",
+        "ControlScore": "results.control_scores",
+        "SIDES": "choices",
+        "Side": "choices",
+        "Target": "target",
         "ProbeResults": "results.probe_results",
         "ProbeSettings": "settings",
         "Progress": "probe_sweep",
         "RunReader": "data.run_reader",
-        "TARGETS": "choices",
-        "Target": "choices",
         "UntrainedScore": "results.control_scores",
         "load_results_by_call": "results.by_call",
         "load_results": "results.store",

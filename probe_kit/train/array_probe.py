@@ -15,9 +15,12 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.train.choices import Task
 from probe_kit.train.data.array_run import ArrayRun
-from probe_kit.train.labels.label_results import LabelResults
-from probe_kit.train.labels.labels import Labels
 from probe_kit.train.probe_sweep import train_probes
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.score_rows import exceeds_column
+from probe_kit.train.target import Target
+from probe_kit.train.target_samples import EVERYWHERE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,8 +29,8 @@ Sites = ArrayLike | Mapping[str, ArrayLike]
 """Features of one site (N, D), of several (S, N, D), or by name."""
 VIEW, STREAM = "mean", "backbone"  # a stream of any other name would need a part
 _OF_RUNS = (
-    "model", "random_weights", "target", "view", "site", "stream", "part", "layer", "depth", "iteration",
-    "episodes", "settings",
+    "model", "random_weights", "target", "category", "view", "site", "stream", "part", "layer", "depth",
+    "iteration", "episodes", "items", "settings",
 )  # fmt: skip
 """Columns of scores that arrays do not have."""
 _RESERVED = ("chance", "untrained", "random-features")
@@ -35,53 +38,56 @@ _RESERVED = ("chance", "untrained", "random-features")
 
 @dataclass(frozen=True, repr=False)
 class ArrayProbes:
-    """Probes of plain arrays. names: of the S sites, in order. results: as `train_probes` gives them for labels.
+    """Probes of plain arrays. names: of the S sites, in order. results: as `train_probes` gives them.
 
     order: (N,) the row of X that each sample of `results` is. classes: values of y in the order of their codes,
     empty for quantities.
     """
 
     names: tuple[str, ...]
-    results: LabelResults
+    results: ProbeResults
     order: NDArray[np.intp]
     classes: NDArray[Any]
 
     @cached_property
     def scores(self) -> "pd.DataFrame":
-        """One row per site, by name; the columns are those of `LabelResults.scores`."""
-        found = self.results.scores.drop(columns=list(_OF_RUNS))
-        found.index = list(self.names)
-        return found.rename_axis("site")
+        """One row per site, by name; the columns are those of `ProbeResults.scores`."""
+        scores = self.results.scores.drop(columns=list(_OF_RUNS))
+        scores.index = list(self.names)
+        return scores.rename_axis("site")
 
     @property
     def best(self) -> str:
         """The site whose score exceeds its chance most; its score is too high by the luck of being chosen."""
-        curve = self.results.curves[VIEW]
-        return self.names[curve.largest_excess(np.arange(len(self.names)))]
+        return self.names[self._curve.largest_excess(np.arange(len(self.names)))]
+
+    @property
+    def _curve(self) -> ProbeCurve:
+        return self.results.curves[EVERYWHERE, VIEW]
 
     @property
     def predictions(self) -> NDArray[Any]:
         """(S, N) held-out predictions in the order of X: values of y, or quantities."""
-        codes = np.empty_like(self.results.curves[VIEW].predictions)
-        codes[:, self.order] = self.results.curves[VIEW].predictions
+        codes = np.empty_like(self._curve.decisions)
+        codes[:, self.order] = self._curve.decisions
         return self.classes[codes.astype(int)] if self.classes.size else codes
 
     @property
     def fold_of(self) -> NDArray[np.int64]:
         """(N,) number of the outer fold in which a row of X was held out."""
-        found = np.empty_like(self.results.fold_of)
-        found[self.order] = self.results.fold_of
-        return found
+        fold_of = np.empty_like(self._curve.fold_of)
+        fold_of[self.order] = self._curve.fold_of
+        return fold_of
 
     @property
     def null(self) -> NDArray[np.float64]:
         """(S, P) score of every site with every permutation of the labels."""
-        return self.results.curves[VIEW].null
+        return self._curve.null
 
     def __repr__(self) -> str:
         row = self.scores.loc[self.best]
         p = "no p" if row["p_fwe"] != row["p_fwe"] else f"p {row['p_fwe']:.3f}"
-        missed = [name for name in self.results.controls.names if not row[f"exceeds_{name}"]]
+        missed = [name for name in self.results.controls.names if not row[exceeds_column(name)]]
         limits = f"[{row['ci_low']:.3f}, {row['ci_high']:.3f}]"
         parts = [
             f"<ArrayProbes of {len(self.names)} sites, {row['n']} samples in {row['groups']} groups:",
@@ -158,15 +164,15 @@ def probe(
         }
         results = train_probes(
             runs["arrays"],
-            labels=Labels.read(table, "y", task, exchange_within=None if strata is None else "strata"),
+            target=Target.read(table, "y", task, exchange_within=None if strata is None else "strata"),
             views=(VIEW,),
             permutations=permutations,
-            controls=tuple(_names(controls)),  # type: ignore[arg-type]
+            controls=tuple(_names(controls)),
             untrained=runs.get("untrained"),
             seed=seed,
             jobs=jobs,
         )
-    classes = np.unique(np.asarray(y)) if results.classes else np.empty(0)
+    classes = np.unique(np.asarray(y)) if results.curves[EVERYWHERE, VIEW].classes else np.empty(0)
     return ArrayProbes(tuple(sites), results, order, classes)
 
 

@@ -8,7 +8,7 @@ import typer
 
 from probe_kit._terminal.options import LISTED, NAMED, Names, choices, some_of, speed_option
 from probe_kit.statistics.folds import FoldUnit
-from probe_kit.train.choices import BASELINES, LABEL_CONTROLS, Incomplete, Task
+from probe_kit.train.choices import CONTROLS, Incomplete, Task
 
 _label_option = partial(typer.Option, rich_help_panel="Labels of your own")
 _transfer_option = partial(typer.Option, rich_help_panel="Transfer")
@@ -22,7 +22,8 @@ Categories = Annotated[
     typer.Option(
         "--categories",
         **NAMED,
-        help="Categories, comma-separated. all: pool every episode. Default: each category of the run.",
+        help="Categories, each by itself, comma-separated. all: pool every episode. Default: each category "
+        "of the run for a side, all for other targets.",
     ),
 ]
 Views = Annotated[
@@ -40,7 +41,7 @@ ProbeTarget = Annotated[
         metavar="NAME",
         help="Label to decode. correct: side of the correct picture. chosen: side where the cube was placed. "
         "shuffled: correct side, flipped for half of the items. Or a column of --labels, or a built-in column "
-        "such as sim.tool_y or item.named; `probe-kit labels RUN` lists them.",
+        "such as sim.tool_y or item.named; `probe-kit targets RUN` lists them.",
     ),
 ]
 Calls = Annotated[
@@ -114,7 +115,7 @@ TestOn = Annotated[
     _transfer_option(
         "--test-on",
         metavar="RUN",
-        help="Fit the probes of a label on all of the first run, and score them on this one. Nothing is stored.",
+        help="Fit the probes on all of the first run, and score them on this one. Nothing is stored.",
     ),
 ]
 TestLabels = Annotated[
@@ -129,11 +130,11 @@ Controls = Annotated[
     Names | None,
     _control_option(
         "--controls",
-        parser=some_of({**BASELINES, **LABEL_CONTROLS}, none="none"),
-        metavar=f"{choices({**BASELINES, **LABEL_CONTROLS})},…",
-        help="Baselines that never see the model, comma-separated, or none. Default: random-features and "
-        "pixels, if the pictures of the suite are available. Labels of your own have step and state, not "
-        "position; default: all but action. pixels takes as long as one or two sites.",
+        parser=some_of(CONTROLS, none="none"),
+        metavar=f"{choices(CONTROLS)},…",
+        help="Features that never see the model, comma-separated, or none. Default of a side: random-features and "
+        "pixels, if the pictures of the suite are available; of other targets all but action and position. pixels "
+        "takes as long as one or two sites.",
     ),
 ]
 Untrained = Annotated[

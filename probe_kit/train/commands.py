@@ -1,7 +1,8 @@
 """`probe-kit train`, and how `probe-kit run show` lists what it stored."""
 
+import shlex
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
@@ -15,8 +16,9 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from probe_kit.runs import Run
-    from probe_kit.train import Baseline, ProbeResults, RunReader, Target
+    from probe_kit.train import ProbeResults, RunReader
     from probe_kit.train.results.inventory import Inventory, StoredProbes
+    from probe_kit.train.train_options import TargetOptions, TransferOptions
 
 
 def train(
@@ -56,82 +58,128 @@ def train(
     `probe-kit train RUN --labels labels.csv --target drawer --task classes`.
     """
     from probe_kit.runs import open_run
-    from probe_kit.train.label_commands import (
-        ColumnOptions,
-        TransferOptions,
-        print_label_results,
-        train_on_column,
-        transfer_column,
-    )  # fmt: skip
+    from probe_kit.train.train_options import TargetOptions, TransferOptions
 
-    column = ColumnOptions.of(target, labels, task, group_by, exchange_within, window, align_to)
-    transfer = TransferOptions.of(test_on, test_labels, across_weights, column)
+    asked = TargetOptions(target, labels, task, group_by, exchange_within, align_to)
+    asked.check(window)
+    transfer = TransferOptions.of(test_on, test_labels, across_weights, asked)
     opened = open_run(run, allow_partial=partial).in_wording(wording)
-    control = None if untrained is None else open_run(untrained, allow_partial=partial).in_wording(wording)
     options = {
         "views": views,
         "permutations": permutations,
-        "seed": seed,
-        "jobs": jobs,
-        "ray": ray,
-        "suite": suite,
-    }
-    if column is not None:
-        refused = {"--folds": folds != "groups", "--incomplete": incomplete != "keep", "--device": device}
-        common.check_no_others(refused)
-        if transfer is not None:
-            of_one = {"--controls": controls is not None, "--suite": suite, "--jobs": jobs, "--ray": ray}
-            common.check_no_others({**of_one, "--untrained": untrained, "--align-to": align_to}, "a transfer")
-            other = open_run(transfer.run, allow_partial=partial).in_wording(wording)
-            options = {"views": views, "permutations": permutations, "seed": seed}
-            transfer_column(opened, other, column, transfer, categories, call, window, options, details)
-            return
-        options["untrained"] = control
-        results = train_on_column(opened, column, categories, call, controls, window, options)
-        print_label_results(run, results, details)
-        return
-    sides = {
-        **options,
-        "target": cast("Target", target),
         "token_permutations": token_permutations,
+        "seed": seed,
+        "window": window,
+    }
+    if transfer is not None:
+        common.check_no_others(
+            {
+                "--controls": controls is not None, "--suite": suite, "--jobs": jobs, "--ray": ray,
+                "--device": device, "--untrained": untrained, "--align-to": align_to,
+                "--folds": folds != "groups", "--incomplete": incomplete != "keep",
+            },
+            "a transfer",
+        )  # fmt: skip
+        other = open_run(transfer.run, allow_partial=partial).in_wording(wording)
+        _transfer(opened, other, asked, transfer, categories, call, options, details)
+        return
+    control = None if untrained is None else open_run(untrained, allow_partial=partial).in_wording(wording)
+    options |= {
         "folds": folds,
         "incomplete": incomplete,
-        "controls": cast("tuple[Baseline, ...] | None", controls),
+        "controls": controls,
+        "suite": suite,
         "untrained": control,
+        "jobs": jobs,
         "device": device,
+        "ray": ray,
     }
-    _train_sides(opened, categories, call, sides, details)
-    say(marked("next: [bold]probe-kit retention {}[/]", run))
+    _train(opened, asked, categories, call, options, details)
+    of_target = "" if asked.is_side else f" --target {shlex.quote(target)}"
+    say(marked("next: [bold]probe-kit retention {}{}[/]", run, of_target))
 
 
-def _train_sides(run: "Run", categories: Any, call: str, options: Mapping[str, Any], details: bool) -> None:
-    """Probe the side of a picture at the captured inferences that `call` names, and print the best sites."""
+def _train(
+    run: "Run", asked: "TargetOptions", categories: Any, call: str, options: Mapping[str, Any], details: bool
+) -> None:
+    """Probe the target at the captured inferences that `call` names, and print the best sites."""
     from probe_kit.train import train_probes
-    from probe_kit.train.results.best_sites import best_sites_sentences, best_sites_table
+    from probe_kit.train.results.summary import best_sites_sentences, best_sites_table
 
+    read = asked.read(run, seed=options["seed"])
+    if not asked.is_side:
+        out.print(read.contents, markup=False, highlight=False)
     left_out: dict[int, Exception] = {}
     fitted: list[ProbeResults] = []
     for number in _calls(call, run):
         try:
             with progress() as bar:
-                shown = counter(bar, f"sites, call {number}" if number else "sites")
-                found = train_probes(run, categories, call=number, progress=shown, **options)
+                results = train_probes(
+                    run,
+                    categories,
+                    target=read,
+                    align_to=asked.event(run),
+                    call=number,
+                    progress=counter(bar, f"sites, call {number}" if number else "sites"),
+                    **options,
+                )
         except (TooFewGroupsError, UnbalancedEpisodesError) as error:
             if call != "all" or number == 0:
                 raise
             left_out[number] = error
             continue
-        fitted.append(found)
-    out.print(best_sites_table(fitted, run.random_weights, splits=details))
+        fitted.append(results)
+    out.print(best_sites_table(fitted, splits=details))
     for number, reason in left_out.items():
         say(marked("[yellow]left out:[/] call {}: {}", number, reason))
-    if not fitted[0].controls.excess:
+    if not fitted[0].controls.comparisons:
         say(
             "signal is judged against chance only: add the control random-features, or a --untrained by random "
             "weights"
         )
     for sentence in best_sites_sentences(fitted[0]):
-        out.print(sentence)
+        out.print(sentence, markup=False, highlight=False)
+
+
+def _transfer(
+    run: "Run",
+    other: "Run",
+    asked: "TargetOptions",
+    transfer: "TransferOptions",
+    categories: Any,
+    call: str,
+    options: Mapping[str, Any],
+    details: bool,
+) -> None:
+    """Fit probes of a target on `run`, score them on `other` with a progress bar, and print the scores."""
+    from probe_kit.train import transfer_probes
+    from probe_kit.train.transfer.transfer_summary import transfer_sentences, transfer_table
+
+    numbers = _calls(call, run)
+    if len(numbers) != 1:
+        raise UsageError(f"--call {call!r} with a transfer; expected one number")
+    fitted_on, scored_on = (
+        asked.read(run, seed=options["seed"]),
+        asked.read(other, transfer.labels, options["seed"]),
+    )
+    for contents in dict.fromkeys([fitted_on.contents, scored_on.contents]):
+        out.print(contents, markup=False, highlight=False)
+    with progress() as bar:
+        results = transfer_probes(
+            run,
+            other,
+            fitted_on,
+            scored_on,
+            categories,
+            call=numbers[0],
+            across_weights=transfer.across_weights,
+            progress=counter(bar, "sites"),
+            **options,
+        )
+    out.print(transfer_table(results, splits=details))
+    for sentence in transfer_sentences(results):
+        out.print(sentence, markup=False, highlight=False)
+    say(marked("nothing was stored; [bold]transfer_probes[/] in Python gives every site as a frame"))
 
 
 def facts_table(found: "Inventory", further: Mapping[str, str]) -> "Table":

@@ -8,15 +8,15 @@ from probe_kit._execution.process_pool import ProcessPool
 from probe_kit._execution.ray_pool import RayPool
 from probe_kit.errors import WorkerDiedError
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.train.crossval.category_problem import CategoryProblem
 from probe_kit.train.crossval.site_probe import SiteProbe
 from probe_kit.train.data.samples import Samples
+from probe_kit.train.problem import Problem
 
 Key = tuple[str, Site]
 """A view and a site."""
 
 Columns = Iterator[tuple[Key, Samples]]
-Problems = Mapping[str, CategoryProblem]
+Problems = Mapping[str, Problem]
 Probed = dict[str, SiteProbe]
 
 
@@ -77,5 +77,5 @@ def fit_columns(
 
 
 def _probe(samples: Samples, problems: Problems, device: str | None = None) -> Probed:
-    there = samples.to(device)
-    return {category: problem.probe(there) for category, problem in problems.items()}
+    on_device = samples.to(device)
+    return {category: problem.probe(on_device) for category, problem in problems.items()}

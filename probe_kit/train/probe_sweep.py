@@ -1,33 +1,33 @@
 """Probes of every site of a run: `train_probes`."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import cast, overload
-
-import numpy as np
+from typing import Any
 
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
-from probe_kit.runs.scene_only import check_scene_run
-from probe_kit.statistics.folds import FoldUnit, sums_by_group
-from probe_kit.train.choices import Baseline, Incomplete, LabelControl, Target
-from probe_kit.train.controls.fit_controls import add_baselines, add_untrained, check_untrained, prepare_baselines
-from probe_kit.train.crossval.category_problem import POOLED, CategoryProblem, category_problem
-from probe_kit.train.data.captured_call import restrict_to_call
-from probe_kit.train.data.run_reader import RunReader, seed_text_of
+from probe_kit.hashing import sha256_json
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.statistics.folds import FoldUnit
+from probe_kit.train.choices import SIDES, Incomplete
+from probe_kit.train.controls.fit import add_controls, prepare_controls
+from probe_kit.train.controls.untrained import add_untrained, check_untrained
+from probe_kit.train.crossval.site_probe import SiteProbe
+from probe_kit.train.data.run_reader import RunReader, check_several_wordings, seed_text_of
 from probe_kit.train.data.samples import is_token_view, read_samples, sites_of
-from probe_kit.train.execution import ExecutionSettings, Key, Probed, probe_columns
-from probe_kit.train.labels.label_results import LabelResults
-from probe_kit.train.labels.label_sweep import train_label_probes
-from probe_kit.train.labels.labels import Labels
-from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.execution import ExecutionSettings, Key, probe_columns
+from probe_kit.train.problem import Problem, make_problem
+from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.probe_directions import Direction
 from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
 from probe_kit.train.results.resume import SweepCheckpoint
 from probe_kit.train.results.store import is_stored, load_results, save_results, stamp_of_run
 from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.solver.backend import check_device
+from probe_kit.train.target import Target
+from probe_kit.train.target_samples import EVERYWHERE, TargetSamples, groups_of, target_samples
 
 TOKEN_PERMUTATIONS = 59
 """Label permutations of token views by default."""
@@ -35,41 +35,20 @@ Progress = Callable[[int, int, str], None]
 """Called with (sites done, sites in all, what was just done)."""
 
 
-@overload
 def train_probes(
     run: RunReader,
     categories: Sequence[str] | None = None,
     views: Sequence[str] = ("mean",),
     *,
-    labels: Labels,
+    target: Target | str = "correct",
     window: int | None = None,
-    permutations: int = 200,
+    align_to: Target | None = None,
     call: int = 0,
-    controls: Sequence[LabelControl] | None = None,
-    suite: Path | None = None,
-    untrained: RunReader | None = None,
-    align_to: Labels | None = None,
-    seed: int = 0,
-    jobs: int | None = None,
-    ray: str | None = None,
-    progress: Progress | None = None,
-) -> LabelResults: ...
-
-
-@overload
-def train_probes(
-    run: RunReader,
-    categories: Sequence[str] | None = None,
-    views: Sequence[str] = ("mean",),
-    *,
     permutations: int = 200,
     token_permutations: int = TOKEN_PERMUTATIONS,
-    target: Target = "correct",
-    labels: None = None,
-    call: int = 0,
     folds: FoldUnit = "groups",
     incomplete: Incomplete = "keep",
-    controls: Sequence[Baseline] | None = None,
+    controls: Sequence[str] | None = None,
     suite: Path | None = None,
     untrained: RunReader | None = None,
     seed: int = 0,
@@ -77,54 +56,32 @@ def train_probes(
     device: str | None = None,
     ray: str | None = None,
     progress: Progress | None = None,
-) -> ProbeResults: ...
-
-
-def train_probes(
-    run: RunReader,
-    categories: Sequence[str] | None = None,
-    views: Sequence[str] = ("mean",),
-    *,
-    permutations: int = 200,
-    token_permutations: int = TOKEN_PERMUTATIONS,
-    target: Target = "correct",
-    labels: Labels | None = None,
-    window: int | None = None,
-    align_to: Labels | None = None,
-    call: int = 0,
-    folds: FoldUnit = "groups",
-    incomplete: Incomplete = "keep",
-    controls: Sequence[Baseline] | Sequence[LabelControl] | None = None,
-    suite: Path | None = None,
-    untrained: RunReader | None = None,
-    seed: int = 0,
-    jobs: int | None = None,
-    device: str | None = None,
-    ray: str | None = None,
-    progress: Progress | None = None,
-) -> ProbeResults | LabelResults:
+) -> ProbeResults:
     """Probe every site of every stream for `target`, per category and view, and store the results in the run.
 
-    categories: each one by default; `all` pools every episode of the run. views: pooled ones, and `tokens` or
-    `tokens:ROLE`, where every token is a sample and an episode's decision the mean of its tokens'. permutations:
-    label permutations behind the p-values, of which token views, many times as dear, take the first
-    `token_permutations`. call: which captured inference, counted from 0; episodes that ended before it are left
-    out. folds: `concepts` also keeps items about the same two concepts together. incomplete: `drop` leaves out
-    items of which an episode is missing. controls: baselines that never see the model, of `position`,
-    `instruction`, and `pixels` and `random-features`, which need pictures; () for none. By default
-    `random-features` and `pixels`; where the pictures cannot be found a warning says that they were left out.
-    suite: folder of the run's suite; the embedded one is found or drawn again without it. untrained: a run of the
-    same episodes, usually by random weights, to subtract. What is no better than `random-features` and the
-    untrained network is no signal, whatever its p-value. jobs: processes that probe, this one alone by default;
-    with more than one, a script needs `if __name__ == "__main__":`. device: where torch solves the probes, such as
-    `cuda`; numpy without one. ray: address of a Ray cluster that probes, `auto` for the one this process belongs
-    to or a new one on this machine; `jobs` is then how many sites at once, by default as many as it has cores.
+    target: a side, such as `correct`, a built-in column, such as `sim.tool_y`, or a `Target` of a table of one's
+    own. categories: each one by itself, by default of a side; `all` pools every episode, by default of every other
+    target. views: pooled ones, and `tokens` or `tokens:ROLE`, where every token is a sample and the decision about
+    a sample the mean of its tokens'. permutations: label permutations behind the p-values, of which token views,
+    many times as dear, take the first `token_permutations`. call: which captured inference, counted from 0, a
+    label of whole episodes is decoded from; episodes that ended before it are left out. window: with a label for
+    every inference, how many of each episode take part; by default as many as 90 % of the episodes reach.
+    align_to: where windows begin: at the first inference at which this target is true. folds: `concepts` also
+    keeps items about the same two concepts together. incomplete: `drop` leaves out items of which an episode is
+    missing.
 
-    labels: a label of one's own, see `Labels`, instead of `target`. Its categories are probed together, as
-    `window`, `align_to`, `controls`, `untrained` and pooled views of `train_label_probes` have it, and the results
-    are a `LabelResults`. `target`, `folds`, `incomplete` and `device` are then left out.
+    controls: features that never see the model, see `CONTROLS`; () for none. By default of a side
+    `random-features` and `pixels`, of other targets all that the run allows but `action` and `position`; where
+    pictures cannot be found a warning says that they were left out. suite: folder of the run's suite; the embedded
+    one is found or drawn again without it. untrained: a run of the same episodes, usually by random weights, to
+    compare with. What is no better than `random-features` and the untrained network is no signal, whatever its
+    p-value.
 
-    progress: by default a bar in a notebook, nothing elsewhere.
+    jobs: processes that probe, this one alone by default; with more than one, a script needs `if __name__ ==
+    "__main__":`. device: where torch solves logistic probes, such as `cuda`; numpy without one. ray: address of a
+    Ray cluster that probes, `auto` for the one this process belongs to or a new one on this machine; `jobs` is
+    then how many sites at once, by default as many as it has cores. progress: by default a bar in a notebook,
+    nothing elsewhere.
 
     With the same settings and episodes the stored results are returned, whatever jobs and device; an
     interrupted sweep continues after the last finished site; controls are added to what is stored. Nothing is
@@ -134,58 +91,27 @@ def train_probes(
     ProbeNotConvergedError, UsageError, SuiteError for another suite, and SuiteNotFoundError for a control that was
     asked for and whose pictures cannot be found.
     """
-    _check_options(views, permutations, token_permutations, jobs, device, ray)
-    if labels is not None:
-        _check_label_options(target, folds, incomplete, device)
-        return train_label_probes(
-            run,
-            labels,
-            categories,
-            views,
-            window=window,
-            permutations=permutations,
-            call=call,
-            controls=controls,
-            suite=suite,
-            untrained=untrained,
-            align_to=align_to,
-            seed=seed,
-            jobs=jobs,
-            ray=ray,
-            progress=progress,
-        )
-    if window is not None or align_to is not None:
-        given = f"window={window}" if window is not None else "align_to"
-        raise UsageError(f"{given} without labels; it needs labels of single inferences")
-    check_scene_run(run, f"a probe of the side ({target})")
+    check_options(views, permutations, token_permutations, jobs, device, ray)
+    options: dict[str, Any] = {
+        "views": views, "permutations": permutations, "token_permutations": token_permutations, "folds": folds,
+        "incomplete": incomplete, "seed": seed, "call": call, "window": window, "align_to": align_to,
+    }  # fmt: skip
     crew = ExecutionSettings(jobs, device, ray)
-    if len(run.episodes) == 0:
-        raise RunIncompleteError(f"{run.location} has no finished episode to probe. Finish it first")
-    categories = _categories(run, categories)
-    run = restrict_to_call(run, call)
-    asked = _settings(
-        run, categories, views, target, folds, incomplete, permutations, token_permutations, seed, call
-    )
-    sweep = _Sweep.of(run, asked, crew, progress)
-    prepared = prepare_baselines(run, cast("Sequence[Baseline] | None", controls), suite, sweep.stored)
+    sweep = Sweep.of(run, target, categories, crew, progress, **options)
+    _check_device_of(sweep.target, device)
+    sweep.check()
+    own = sweep.settings
+    stored = Controls() if sweep.stored is None else sweep.stored.controls
+    prepared = prepare_controls(
+        run, sweep.samples, own.is_side, controls, suite, stored, own.categories
+    )  # fmt: skip
     beside = None
     if untrained is not None:
-        untrained = restrict_to_call(untrained, call)
-        other = _settings(
-            untrained,
-            asked.categories,
-            views,
-            target,
-            folds,
-            incomplete,
-            permutations,
-            token_permutations,
-            seed,
-            call,
-        )
-        check_untrained(run, untrained, other)
-        beside = _Sweep.of(untrained, other, crew, progress)
-    results = add_baselines(sweep.results(), run, prepared)
+        same: Target | str = own.target if own.is_side else sweep.target
+        beside = Sweep.of(untrained, same, own.categories, crew, progress, **options)
+        check_untrained(run, untrained, sweep.samples, beside.samples, own.is_side, call)
+        beside.check()
+    results = add_controls(sweep.results(), sweep.problems, sweep.widths, prepared)
     if beside is not None:
         others = beside.results()
         results = add_untrained(results, others)
@@ -193,15 +119,15 @@ def train_probes(
     return sweep.keep(results, asked=True)
 
 
-def _check_options(
+def check_options(
     views: Sequence[str],
     permutations: int,
-    token_permutations: int,
-    jobs: int | None,
-    device: str | None,
-    ray: str | None,
+    token_permutations: int = 0,
+    jobs: int | None = None,
+    device: str | None = None,
+    ray: str | None = None,
 ) -> None:
-    """Raise UsageError for what can be seen to be wrong without looking at the run."""
+    """Raise UsageError for options that are wrong whatever the run."""
     check_device(device)
     if device is not None and ((jobs or 1) > 1 or ray is not None):
         raise UsageError(
@@ -217,44 +143,140 @@ def _check_options(
         raise UsageError(f"views {', '.join(views) or 'none'}; expected one or more, each once, such as mean")
 
 
-def _check_label_options(target: Target, folds: FoldUnit, incomplete: Incomplete, device: str | None) -> None:
-    """Raise UsageError for options that probes of a label do not have."""
-    given = {
-        "target": target != "correct",
-        "folds": folds != "groups",
-        "incomplete": incomplete != "keep",
-        "device": device is not None,
-    }
-    if wrong := [name for name, other in given.items() if other]:
-        raise UsageError(f"{' and '.join(wrong)} with labels; expected neither. Leave out {' and '.join(wrong)}")
+def _check_device_of(target: Target, device: str | None) -> None:
+    if device is not None and target.task != "binary":
+        raise UsageError(
+            f"device {device!r} with {target.described}; ridge is solved by numpy, a device solves logistic "
+            "probes. Leave device out"
+        )
+
+
+def check_run(run: RunReader, categories: Sequence[str] | None) -> None:
+    """Raise for a run without episodes, activations or the categories, and for one in several wordings."""
+    if len(run.episodes) == 0:
+        raise RunIncompleteError(f"{run.location} has no finished episode to probe. Finish it first")
+    if not run.streams:
+        raise NoProbesError(f"{run.location} has no activations to probe: of {run.model!r} no stream was stored.")
+    names = list(dict.fromkeys(run.episodes["category"]))
+    for category in categories or ():
+        if category not in (*names, EVERYWHERE):
+            raise UnknownCategoryError(f"{run.location} has no category {category!r}; it has: {', '.join(names)}")
+    check_several_wordings(run.episodes)
+
+
+def probe_settings(
+    run: RunReader, *, views: Sequence[str], permutations: int, target: str, seed: int
+) -> ProbeSettings:
+    """Return the settings of the probes that `train_probes` fits with these options, others at their default.
+
+    Their key is that of the stored results. Nothing is fitted. Raises NoProbesError for a run without activations.
+    """
+    crew = ExecutionSettings()
+    return Sweep.of(run, target, None, crew, None, views=views, permutations=permutations, seed=seed).settings
 
 
 @dataclass(frozen=True)
-class _Sweep:
-    """What is to be probed in one run. stored: its results, if the same was probed before."""
+class Sweep:
+    """The probes of a target in one run that are to be fitted, or are stored."""
 
     run: RunReader
+    target: Target
+    samples: TargetSamples
     settings: ProbeSettings
-    stored: ProbeResults | None
-    problems: Mapping[str, CategoryProblem]
-    keys: tuple[Key, ...]
     crew: ExecutionSettings
     progress: Progress | None
 
     @classmethod
     def of(
-        cls, run: RunReader, settings: ProbeSettings, crew: ExecutionSettings, progress: Progress | None
-    ) -> "_Sweep":
-        """Nothing is probed yet, but what can be wrong is found."""
-        if is_stored(run.location, settings.key):
-            return cls(run, settings, load_results(run, settings.key), {}, (), crew, progress)
-        problems = {name: category_problem(run.episodes, name, settings) for name in settings.categories}
-        keys = tuple((view, site) for view in settings.views for site in sites_of(run, view))
-        return cls(run, settings, None, problems, keys, crew, progress)
+        cls,
+        run: RunReader,
+        target: Target | str,
+        categories: Sequence[str] | None,
+        crew: ExecutionSettings,
+        progress: Progress | None,
+        *,
+        views: Sequence[str],
+        permutations: int,
+        seed: int,
+        token_permutations: int = TOKEN_PERMUTATIONS,
+        folds: FoldUnit = "groups",
+        incomplete: Incomplete = "keep",
+        call: int = 0,
+        window: int | None = None,
+        align_to: Target | None = None,
+    ) -> "Sweep":
+        """Read labels and samples; nothing is probed yet."""
+        if isinstance(target, str) and target in SIDES:  # refuses a run of recordings first
+            target = Target.of_run(run, target, seed=seed)
+        check_run(run, categories)
+        target = Target.of_run(run, target, seed=seed) if isinstance(target, str) else target
+        if categories is None:
+            categories = tuple(dict.fromkeys(run.episodes["category"])) if target.is_side else (EVERYWHERE,)
+        _check_groups_named_once(target, folds)
+        _check_windows(target, window, align_to)
+        samples = target_samples(run, target, categories, call, window, align_to, incomplete)
+        target, _ = target.on(run)  # frames that it does not show are counted among the samples
+        settings = ProbeSettings(
+            model=run.model,
+            random_weights=run.random_weights,
+            weights=run.weights_sha256,
+            suite=run.suite,
+            seed_text=seed_text_of(run),
+            run_settings=run.settings_sha256,
+            episodes=episodes_sha256(run),
+            categories=tuple(categories),
+            views=tuple(views),
+            target=target.name,
+            permutations=permutations,
+            seed=seed,
+            token_permutations=min(token_permutations, permutations) if any(map(is_token_view, views)) else 0,
+            folds=folds,
+            incomplete=incomplete,
+            call=call,
+            task=target.task,
+            label=target.sha256,
+            group_by=target.group_by or "group_id",
+            exchange_within=target.exchange_within or "",
+            grouping="" if target.is_side else _grouping(run, target),
+            window=samples.window,
+            align_to="" if align_to is None else f"{align_to.name}#{align_to.on(run)[0].sha256[:12]}",
+        )
+        return cls(run, target, samples, settings, crew, progress)
+
+    @cached_property
+    def stored(self) -> ProbeResults | None:
+        """The results, if the same was probed before."""
+        key = self.settings.key
+        return load_results(self.run, key) if is_stored(self.run.location, key) else None
+
+    @cached_property
+    def problems(self) -> dict[str, Problem]:
+        """The probing problem of every category."""
+        return {
+            name: make_problem(self.run, self.target, self.samples, name, self.settings)
+            for name in self.settings.categories
+        }
+
+    @cached_property
+    def keys(self) -> tuple[Key, ...]:
+        """Views and sites, in order."""
+        return tuple((view, site) for view in self.settings.views for site in sites_of(self.run, view))
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Width of every stream, of a target that is no side of those that are probed."""
+        streams = self.run.streams
+        names = streams if self.target.is_side else dict.fromkeys(site.stream for _, site in self.keys)
+        return {name: streams[name].width for name in names}
+
+    def check(self) -> None:
+        """Raise for everything that can be wrong before anything is probed."""
+        if self.stored is None:
+            _ = self.keys, self.problems
 
     def results(self) -> ProbeResults:
-        """Those that are stored, or new ones that are not stored yet."""
-        return _fit(self) if self.stored is None else self.stored
+        """Return those that are stored, or new ones that are not stored yet."""
+        return self._fit() if self.stored is None else self.stored
 
     def keep(self, results: ProbeResults, *, asked: bool) -> ProbeResults:
         """Store `results` and return them as loaded from the store."""
@@ -262,110 +284,63 @@ class _Sweep:
         SweepCheckpoint.of(self.run.location, self.settings.key).discard()
         return load_results(self.run, self.settings.key)
 
+    def _fit(self) -> ProbeResults:
+        probes = self._probe_all()
+        curves = {}
+        for category, problem in self.problems.items():
+            for view in self.settings.views:
+                of_view: dict[Site, SiteProbe] = {
+                    site: probe[category] for (name, site), probe in probes.items() if name == view
+                }
+                parts = tuple(str(self.run.streams[site.stream].part) for site in of_view)
+                curves[category, view] = problem.curve(of_view, parts)
+        directions = {
+            (category, view, site): Direction(probe.weights, probe.intercepts, probe.spreads)
+            for (view, site), of_site in probes.items()
+            for category, probe in of_site.items()
+            if self.target.is_side
+        }
+        return ProbeResults(
+            self.settings,
+            curves,
+            directions,
+            stamp=stamp_of_run(self.run),
+            label=self.run.label,
+            left_out=self.samples.left_out,
+        )
 
-def _categories(run: RunReader, asked: Sequence[str] | None) -> Sequence[str]:
-    """What was asked, or all of the run, whichever of its episodes got as far as the call that is probed."""
-    known = list(dict.fromkeys(run.episodes["category"]))
-    for category in asked or ():
-        if category not in (*known, POOLED):
-            raise UnknownCategoryError(f"{run.location} has no category {category!r}; it has: {', '.join(known)}")
-    return asked or known
-
-
-def probe_settings(
-    run: RunReader, *, views: Sequence[str], permutations: int, target: Target, seed: int
-) -> ProbeSettings:
-    """The settings of the probes that `train_probes` fits with these options and all others at their default.
-
-    Their key is that of the stored results. Nothing is fitted. Raises NoProbesError for a run without activations.
-    """
-    categories = _categories(run, None)
-    return _settings(run, categories, views, target, "groups", "keep", permutations, TOKEN_PERMUTATIONS, seed, 0)
-
-
-def _settings(
-    run: RunReader,
-    categories: Sequence[str],
-    views: Sequence[str],
-    target: Target,
-    folds: FoldUnit,
-    incomplete: Incomplete,
-    permutations: int,
-    token_permutations: int,
-    seed: int,
-    call: int,
-) -> ProbeSettings:
-    if not run.streams:
-        raise NoProbesError(f"{run.location} has no activations to probe: of {run.model!r} no stream was stored.")
-    return ProbeSettings(
-        model=run.model,
-        random_weights=run.random_weights,
-        weights=run.weights_sha256,
-        suite=run.suite,
-        seed_text=seed_text_of(run),
-        run_settings=run.settings_sha256,
-        episodes=episodes_sha256(run),
-        categories=tuple(categories),
-        views=tuple(views),
-        target=target,
-        permutations=permutations,
-        seed=seed,
-        token_permutations=min(token_permutations, permutations) if any(map(is_token_view, views)) else 0,
-        call=call,
-        folds=folds,
-        incomplete=incomplete,
-    )
+    def _probe_all(self) -> dict[Key, dict[str, SiteProbe]]:
+        """Return every view and site, in order, for every category; columns of an interrupted sweep are loaded."""
+        unfinished = SweepCheckpoint.of(self.run.location, self.settings.key, stamp_of_run(self.run))
+        probes = {key: stored for key in self.keys if (stored := unfinished.read(*key)) is not None}
+        progress = self.progress or notebook_progress("sites probed")
+        rows, inferences = self.samples.rows, self.samples.inferences
+        columns = ((key, read_samples(self.run, *key, rows, inferences)) for key in self.keys if key not in probes)
+        for key, of_site in probe_columns(columns, self.problems, self.crew):
+            unfinished.keep(*key, of_site)
+            probes[key] = of_site
+            if progress is not None:
+                progress(len(probes), len(self.keys), f"{key[1]} {key[0]}")
+        return {key: probes[key] for key in self.keys}
 
 
-def _fit(sweep: _Sweep) -> ProbeResults:
-    probes = _probe_all(sweep)
-    curves = {
-        (category, view): _curve(sweep.run, problem, category, view, probes)
-        for category, problem in sweep.problems.items()
-        for view in sweep.settings.views
-    }
-    directions = {
-        (category, view, site): Direction(probe.weights, probe.intercepts, probe.spreads)
-        for (view, site), found in probes.items()
-        for category, probe in found.items()
-    }
-    stamp, label = stamp_of_run(sweep.run), sweep.run.label
-    return ProbeResults(sweep.settings, curves, directions, stamp=stamp, label=label)
+def _check_windows(target: Target, window: int | None, align_to: Target | None) -> None:
+    if target.is_side and (window is not None or align_to is not None):
+        given = f"window={window}" if window is not None else "align_to"
+        raise UsageError(f"{given} with the side {target.name!r}; it needs labels of single inferences")
 
 
-def _probe_all(sweep: _Sweep) -> dict[Key, Probed]:
-    """Every view and site, in order, for every category; columns of an interrupted sweep are loaded."""
-    keys, unfinished = (
-        sweep.keys,
-        SweepCheckpoint.of(sweep.run.location, sweep.settings.key, stamp_of_run(sweep.run)),
-    )
-    probes = {key: stored for key in keys if (stored := unfinished.read(*key)) is not None}
-    progress = sweep.progress or notebook_progress("sites probed")
-    columns = ((key, read_samples(sweep.run, *key)) for key in keys if key not in probes)
-    for key, found in probe_columns(columns, sweep.problems, sweep.crew):
-        unfinished.keep(*key, found)
-        probes[key] = found
-        if progress is not None:
-            progress(len(probes), len(keys), f"{key[1]} {key[0]}")
-    return {key: probes[key] for key in keys}
+def _check_groups_named_once(target: Target, folds: FoldUnit) -> None:
+    """Raise UsageError for folds of concepts beside columns that name groups or strata."""
+    if folds != "groups" and (target.group_by or target.exchange_within):
+        raise UsageError(
+            f"folds={folds!r} with columns of groups ({target.group_by or target.exchange_within}); expected one "
+            "of both. Leave --folds, or --group-by and --exchange-within, out"
+        )
 
 
-def _curve(
-    run: RunReader, problem: CategoryProblem, category: str, view: str, probes: Mapping[Key, Probed]
-) -> ProbeCurve:
-    found = {site: probe[category] for (name, site), probe in probes.items() if name == view}
-    return ProbeCurve(
-        sites=tuple(found),
-        labels=problem.labels,
-        episodes=problem.episodes,
-        items=problem.items,
-        groups=problem.groups,
-        fold_of=problem.fold_of,
-        decisions=np.stack([probe.decisions for probe in found.values()]),
-        strengths=np.stack([probe.strengths for probe in found.values()]),
-        null=np.stack([probe.null for probe in found.values()]),
-        inner=np.stack([sums_by_group(probe.inner, problem.groups) for probe in found.values()]).astype(
-            np.float32
-        ),
-        parts=tuple(str(run.streams[site.stream].part) for site in found),
-    )
+def _grouping(run: RunReader, target: Target) -> str:
+    """Return the sha256 of group and stratum of every episode."""
+    groups, strata = groups_of(run, target)
+    names = run.episodes["episode_id"].astype(str).tolist()
+    return sha256_json(sorted(zip(names, groups.tolist(), strata.tolist(), strict=True)))

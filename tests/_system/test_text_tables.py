@@ -15,7 +15,7 @@ from probe_kit.suite.converters.benchmarks import mmbench
 from probe_kit.suite.converters.curation import read_curation
 from probe_kit.suite.converters.options import MmbenchOptions
 from probe_kit.suite.custom.from_csv import read_rows
-from probe_kit.train import Labels
+from probe_kit.train import Target
 from tests.support.parsed import package_nodes
 
 ROOT = Path(__file__).parents[2]
@@ -23,7 +23,7 @@ Rows = Sequence[Sequence[str]]
 
 
 def labels(file: Path) -> list[str]:
-    read = Labels.read(file, "tone")
+    read = Target.read(file, "tone")
     return [read.coded.classes[int(code)] for code in read.coded.values]
 
 
@@ -216,7 +216,7 @@ def test_the_separator_that_gives_the_keys_is_meant_where_a_heading_has_two(tmp_
 def test_a_missing_cell_is_missing_to_each_reader(word: str, tmp_path: Path) -> None:
     table = f"episode_id,tone\na,warm\nb, {word} \nc,cold\n"
     (tmp_path / "labels.csv").write_text(table, encoding="utf-8")
-    read_labels = Labels.read(tmp_path / "labels.csv", "tone")
+    read_labels = Target.read(tmp_path / "labels.csv", "tone")
     assert read_labels.coded.classes == ("cold", "warm")
     assert read_labels.contents == "tone (binary), 2 classes: cold 1, warm 1; 1 missing"
     table = f"instruction,correct,wrong,group\nPut it on red,a.png,b.png,{word}\nPut it on blue,c.png,d.png,7\n"
@@ -238,12 +238,12 @@ def test_a_missing_cell_is_missing_to_each_reader(word: str, tmp_path: Path) -> 
 def test_a_cell_that_may_be_missing_is_never_a_class(word: str, tmp_path: Path) -> None:
     (tmp_path / "labels.csv").write_text(f"episode_id,tone\na,warm\nb,{word}\nc,cold\n", encoding="utf-8")
     if plain_cell(word) in MISSING:
-        assert Labels.read(tmp_path / "labels.csv", "tone").coded.classes == ("cold", "warm")
+        assert Target.read(tmp_path / "labels.csv", "tone").coded.classes == ("cold", "warm")
     else:
         with pytest.raises(
             UsageError, match=r"labels\.csv, line 3, column 'tone'.*(missing value|failed formula)"
         ):
-            Labels.read(tmp_path / "labels.csv", "tone")
+            Target.read(tmp_path / "labels.csv", "tone")
 
 
 @pytest.mark.parametrize(

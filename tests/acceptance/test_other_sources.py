@@ -232,7 +232,7 @@ def test_a_policy_acts_in_an_environment_and_its_facts_become_labels(acted: Path
         column = run.column(LAST, "mean", call)
         assert column.shape == (PLAYED, 96)
         assert np.isfinite(column).all()
-    left = pk.Labels.of_run(run, "env.left")
+    left = pk.Target.of_run(run, "env.left")
     assert left.task == "binary"
     table = probe_kit("labels", acted, "--out", acted.parent / "labels.csv").text
     assert "env.left" in table + (acted.parent / "labels.csv").read_text(encoding="utf-8")
@@ -252,5 +252,5 @@ def test_a_fact_of_the_environment_is_decoded(acted: Path) -> None:
         "train", acted, "--target", "env.left", "--permutations", "5", "--controls", "instruction,step,state"
     )
     run = pk.open_run(acted)
-    results = pk.train_probes(run, labels=pk.Labels.of_run(run, "env.left"), permutations=5)
+    results = pk.train_probes(run, target=pk.Target.of_run(run, "env.left"), permutations=5)
     assert results.scores["score"].max() <= 1

@@ -102,8 +102,8 @@ def test_every_control_of_the_side_is_stored_and_the_untrained_network_is_compar
 ) -> None:
     run = pk.open_run(trained)
     controls = pk.load_results(run).controls
-    assert {score.name for score in controls.baselines} == SIDE_CONTROLS
-    assert all(0 <= score.accuracy <= 1 for score in controls.baselines)
+    assert {score.name for score in controls.scores} == SIDE_CONTROLS
+    assert all(0 <= score.score <= 1 for score in controls.scores)
     results = pk.train_probes(run, permutations=5, controls=("random-features",), untrained=pk.open_run(untrained))
     assert results.scores["exceeds_untrained"].isin([True, False]).all()
     assert results.scores["exceeds_random_features"].isin([True, False]).all()
@@ -153,7 +153,7 @@ def test_a_label_of_a_users_table_is_decoded_by_its_task(
     assert target in probe_kit("train", trained, *typed).text
     run = pk.open_run(trained)
     scores = pk.train_probes(
-        run, labels=pk.Labels.read(table, target=target), permutations=5, controls=("instruction",)
+        run, target=pk.Target.read(table, target), permutations=5, controls=("instruction",)
     ).scores
     assert set(scores["task"]) == {task}
     assert scores["metric"].str.contains(metric).all()
@@ -171,7 +171,7 @@ def test_a_built_in_label_by_inference_is_decoded_beside_its_controls(trained: P
         assert control in text
     run = pk.open_run(trained)
     results = pk.train_probes(
-        run, labels=pk.Labels.of_run(run, "sim.tool_y"), permutations=3, controls=("step", "state")
+        run, target=pk.Target.of_run(run, "sim.tool_y"), permutations=3, controls=("step", "state")
     )
     best = results.scores["score"].max()
     assert best > 0.5

@@ -72,7 +72,7 @@ def test_the_written_family_goes_all_the_way_without_naming_a_folder_twice(
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     ran(elsewhere, "probe_kit", "train", "../run", "--permutations", "20")
-    assert load_results(open_run(tmp_path / "run")).controls.excess
+    assert load_results(open_run(tmp_path / "run")).controls.comparisons
     ran(elsewhere, "probe_kit", "intervene", "../run", "--items", "2")
     assert "not used" in ran(elsewhere, "probe_kit", "retention", "../run", "--details", "all")
     ran(elsewhere, "probe_kit", "view", "../run", "--export", "page")

@@ -29,7 +29,7 @@ from probe_kit.statistics.estimates.retention import retention, retention_differ
 from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.train import ArrayRun, ProbeCurve, load_results
-from probe_kit.train.controls.fit_controls import add_untrained
+from probe_kit.train.controls.untrained import add_untrained
 from tests.retention.conftest import runs_in
 from tests.support.inner_qualities import stream_of
 

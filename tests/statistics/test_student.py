@@ -13,7 +13,7 @@ GROUPS = np.repeat(np.arange(12), 5)
 
 
 def drawn(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Labels, predictions and scores of 12 groups of five."""
+    """Target, predictions and scores of 12 groups of five."""
     generator = np.random.default_rng(seed)
     labels = generator.standard_normal(60) + generator.standard_normal(12)[GROUPS]
     predicted = 0.7 * labels + 0.5 * generator.standard_normal(60)

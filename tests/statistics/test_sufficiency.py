@@ -22,8 +22,7 @@ from probe_kit.statistics.sufficiency import (
     groups_for_signal,
     least_probe_p,
 )
-from probe_kit.train.crossval.category_problem import category_problem
-from probe_kit.train.settings import ProbeSettings
+from tests.train.conftest import problem_of
 
 
 def episodes(groups: int) -> pd.DataFrame:
@@ -51,19 +50,15 @@ def test_possible_flips_are_those_that_are_made(groups: int) -> None:
 
 @pytest.mark.parametrize("groups", range(3, 9))
 def test_train_refuses_and_warns_where_the_plan_says_so(groups: int) -> None:
-    settings = ProbeSettings(
-        model="little", random_weights=True, weights=None, suite="", seed_text="", run_settings="", episodes="",
-        categories=("color",), views=("mean",), target="correct", permutations=1000, seed=0,
-    )  # fmt: skip
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         if groups < GROUPS_FOR_PROBES:
             with pytest.raises(
                 TooFewGroupsError, match=f"{groups} independent groups .* {GROUPS_FOR_PROBES} folds"
             ):
-                category_problem(episodes(groups), "color", settings)
+                problem_of(episodes(groups), permutations=1000)
             return
-        category_problem(episodes(groups), "color", settings)
+        problem_of(episodes(groups), permutations=1000)
     assert any("the smallest possible p" in str(one.message) for one in said) == (groups < groups_for_signal())
 
 

@@ -5,9 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from probe_kit.hooks import Site
-from probe_kit.train import LabelResults
-from probe_kit.train.labels.label_results import LabelCurve
-from probe_kit.train.labels.label_settings import LabelSettings
+from probe_kit.train import ProbeCurve, ProbeResults, ProbeSettings
 from tests.support.inner_qualities import inner_of
 
 _PARTS = {"backbone": "backbone", "expert": "action"}
@@ -24,7 +22,7 @@ def label_results(
     noise: float = 0.0,
     null_spread: float = 0.0,
     suite: str = "some@1#0",
-) -> LabelResults:
+) -> ProbeResults:
     """Probes whose site has a mean score and a chance, of `each` samples in every group.
 
     noise: deviation of scores between groups. null_spread: half width of the metrics under permutation.
@@ -40,22 +38,16 @@ def label_results(
     labels = np.tile(np.arange(each) % 2, groups).astype(float)
     names = np.repeat([f"group-{number:03d}" for number in range(groups)], each)
     folds = np.repeat(np.arange(groups) % 5, each)
-    curve = LabelCurve(
-        tuple(sites), tuple(_PARTS[site.stream] for site in sites), np.tile(labels, (len(sites), 1)), scores, null,
-        np.ones((len(sites), 5)), inner_of(scores - chances, folds, names),
+    curve = ProbeCurve(
+        sites=tuple(sites), labels=labels, episodes=np.array([f"episode-{number:04d}" for number in range(n)]),
+        items=names, groups=names, fold_of=folds, decisions=np.tile(labels, (len(sites), 1)),
+        strengths=np.ones((len(sites), 5)), null=null, inner=inner_of(scores - chances, folds, names),
+        parts=tuple(_PARTS[site.stream] for site in sites), task=task, is_side=False,  # type: ignore[arg-type]
+        classes=() if task == "continuous" else ("no", "yes"), sample_scores=scores,
+        inferences=np.zeros(n, np.int64), smallest_p=1 / (1 + permutations),
     )  # fmt: skip
-    settings = LabelSettings(
-        "made", False, None, suite, suite, "0" * 64, "0" * 64, (), ("mean",), "drawer", task,  # type: ignore[arg-type]
-        "1" * 64, "group_id", "all", "2" * 64, window, 0, permutations, 0,
+    settings = ProbeSettings(
+        "made", False, None, suite, suite, "0" * 64, "0" * 64, ("all",), ("mean",), "drawer", permutations, 0,
+        task=task, label="1" * 64, grouping="2" * 64, window=window,  # type: ignore[arg-type]
     )  # fmt: skip
-    return LabelResults(
-        settings=settings,
-        classes=() if task == "continuous" else ("no", "yes"),
-        labels=labels,
-        episodes=np.array([f"episode-{number:04d}" for number in range(n)]),
-        inferences=np.zeros(n, np.int64),
-        groups=names,
-        fold_of=folds,
-        curves={"mean": curve},
-        smallest_p=1 / (1 + permutations),
-    )
+    return ProbeResults(settings, {("all", "mean"): curve})

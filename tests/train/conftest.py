@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,7 +11,10 @@ from threadpoolctl import threadpool_limits
 
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Site, Stream
-from probe_kit.train import ArrayRun
+from probe_kit.train import ArrayRun, ProbeSettings, Target
+from probe_kit.train.execution import ExecutionSettings
+from probe_kit.train.probe_sweep import Sweep
+from probe_kit.train.problem import Problem
 
 PlantedRun = Callable[..., ArrayRun]
 
@@ -70,3 +74,20 @@ def planted_run(tmp_path: Path) -> PlantedRun:
         return ArrayRun(tmp_path / "run", "planted", "noise@1#0123456789ab", episodes, features)
 
     return make
+
+
+def problem_of(
+    run: ArrayRun | pd.DataFrame, category: str = "color", target: Target | str = "correct", **options: Any
+) -> Problem:
+    """Return the problem of a category that `train_probes` would probe; of a table the features are zeros."""
+    if isinstance(run, pd.DataFrame):
+        episodes = run.reset_index(drop=True)
+        blank = np.zeros((len(episodes), 1), np.float32)
+        run = ArrayRun(Path("nowhere"), "m", "s@1#0", episodes, {(Site("backbone", 0), "mean"): blank})
+    options = {"views": ("mean",), "permutations": 30, "seed": 0, **options}
+    return Sweep.of(run, target, (category,), ExecutionSettings(), None, **options).problems[category]
+
+
+def settings_of(permutations: int, seed: int = 0) -> ProbeSettings:
+    """Return settings of which only the label permutations and the seed decide the problem of a label."""
+    return ProbeSettings("m", False, None, "", "", "", "", ("all",), ("mean",), "y", permutations, seed)

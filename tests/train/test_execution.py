@@ -16,19 +16,24 @@ from probe_kit._system.installing import install_command
 from probe_kit.errors import MissingExtraError, TooFewGroupsError, UsageError, WorkerDiedError
 from probe_kit.hooks import Site
 from probe_kit.statistics.label_permutations import flip_items
-from probe_kit.train.crossval.category_problem import CategoryProblem
-from probe_kit.train.crossval.site_probe import nested_folds
+from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.execution import ExecutionSettings, Key, Probed, probe_columns
+from probe_kit.train.problem import Problem
+from probe_kit.train.target_samples import TargetSamples
 
 ITEMS = np.repeat(np.arange(10), 2)
 LABELS = np.tile([True, False], 10)
-PROBLEM = CategoryProblem(
-    rows=np.arange(20),
+ROWS, NAMES = np.arange(20), ITEMS.astype(str)
+PROBLEM = Problem(
+    task="binary",
+    is_side=True,
+    classes=("right", "left"),
+    positions=ROWS,
+    samples=TargetSamples(ROWS, 0 * ROWS, LABELS.astype(float), NAMES, NAMES, 1, {}),
     labels=LABELS,
-    items=ITEMS.astype(str),
-    groups=ITEMS.astype(str),
-    episodes=np.arange(20).astype(str),
+    items=NAMES,
+    episodes=ROWS.astype(str),
     folds=nested_folds(LABELS, ITEMS, 0),
     permuted_labels=flip_items(LABELS, ITEMS, 3, 0),
     token_permutations=0,

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from probe_kit.train.crossval.site_probe import STRENGTHS
+from probe_kit.train.crossval.nested_folds import STRENGTHS
 from probe_kit.train.solver.logistic import LogisticSolver
 from probe_kit.train.solver.projection import Projection
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from probe_kit.train.choices import TARGETS
+from probe_kit.train.choices import SIDES
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.settings import ProbeSettings
@@ -55,7 +55,7 @@ def mixed_settings(results: Mapping[str, ProbeResults], views: Sequence[str] | N
             parts = (f"{setting} ({', '.join(names)})" for setting, names in runs.items())
             found.append(f"{name} {' against '.join(parts)}")
     labels = {one.settings.target for one in results.values()} - {"correct"}
-    notes = [f"Probes were asked for the target {label!r}: {TARGETS[label]}." for label in sorted(labels)]
+    notes = [f"Probes were asked for the target {label!r}: {SIDES[label]}." for label in sorted(labels)]
     calls = {one.settings.call for one in results.values()} - {0}
     notes += [f"Probes are of captured inference {call}, counted from 0." for call in sorted(calls)]
     if not found:

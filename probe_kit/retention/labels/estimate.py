@@ -11,13 +11,13 @@ from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.estimators.retention import Iterations, known_iteration
 from probe_kit.retention.estimators.stream_scores import ACTION, BACKBONE, Limits, limits
-from probe_kit.statistics.estimates.balanced import GroupSums
-from probe_kit.statistics.estimates.crossfit import Stream, crossfit
+from probe_kit.statistics.estimates.crossfit import crossfit
 from probe_kit.statistics.estimates.retention import Ratio, retention
 from probe_kit.statistics.estimates.scores import Scores, t_quantile
-from probe_kit.statistics.folds import fold_of_groups, sums_by_group
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.labels.label_results import METRICS, LabelCurve, LabelResults
+from probe_kit.train.crossval.task_scores import METRICS
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_results import ProbeResults
 
 LEAST_EXCESS = 0.05
 """R² above chance that the backbone must have; a ratio of less is the ratio of two errors."""
@@ -69,6 +69,7 @@ class LabelRetention:
     """
 
     view: str
+    category: str
     target: str
     task: str
     metric: str
@@ -88,58 +89,62 @@ class LabelRetention:
 
 
 def measure_label_retention(
-    results: LabelResults, view: str | None = None, iterations: Iterations = "all"
+    results: ProbeResults,
+    view: str | None = None,
+    iterations: Iterations = "all",
+    category: str | None = None,
 ) -> LabelRetention:
     """Retention of the label that `results` are of.
 
-    view: the first probed one by default. From every sample's score the chance of its site is subtracted, which
-    is the mean score of the label permutations there. In every outer fold sites are chosen by the inner folds, as
-    for sides; see `probe_kit.statistics.estimates`.
-    Raises UnknownSiteError for a view that was not probed, NoProbesError for a run without backbone or action, and
-    UsageError for an iteration that the action does not have.
+    view, category: the first probed one by default. From every sample's score the chance of its site is
+    subtracted, which is the mean score of the label permutations there. In every outer fold sites are chosen by
+    the inner folds, as for sides; see `probe_kit.statistics.estimates`. Raises UnknownSiteError for a view that
+    was not probed, NoProbesError for a run without backbone or action, and UsageError for an iteration that the
+    action does not have.
     """
     own = results.settings
-    view = view or own.views[0]
-    if view not in results.curves:
+    view, category = view or own.views[0], category or own.categories[0]
+    if (category, view) not in results.curves:
         raise UnknownSiteError(f"view {view!r} was not probed; probed: {', '.join(own.views)}")
-    curve = results.curves[view]
+    curve = results.curves[category, view]
     rows = {ACTION: _rows(curve, ACTION, iterations), BACKBONE: _rows(curve, BACKBONE, "all")}
-    above = [_above_chance(curve, found, results) for found in rows.values()]
-    scores = Scores.of(crossfit(above, np.unique(results.groups).tolist(), own.seed_text, chance=0.0))
+    above = [curve.fit_stream(of_part) for of_part in rows.values()]
+    scores = Scores.of(crossfit(above, list(curve.group_names), own.seed_text, chance=0.0))
     action, backbone = (
-        _peak(results, view, found, scores, place) for place, found in enumerate(rows.values())
-    )  # fmt: skip
-    found: Ratio = retention(scores)
-    note, reason = _refusal(results, backbone)
+        _peak(results, (category, view), of_part, scores, place) for place, of_part in enumerate(rows.values())
+    )
+    ratio: Ratio = retention(scores)
+    note, reason = _refusal(results, category, backbone)
     return LabelRetention(
         view=view,
+        category=category,
         target=own.target,
         task=own.task,
         metric=METRICS[own.task],
         backbone=backbone,
         action=action,
-        value=found.value,
-        ci=limits(found.interval),
-        n_groups=int(np.unique(results.groups).size),
-        n_samples=int(results.labels.size),
+        value=ratio.value,
+        ci=limits(ratio.interval),
+        n_groups=curve.n_groups,
+        n_samples=int(curve.labels.size),
         note=note,
         reason=reason,
     )
 
 
 def with_corrected_p(
-    found: LabelRetention, results: LabelResults, backbone: float | None, action: float | None
+    found: LabelRetention, results: ProbeResults, backbone: float | None, action: float | None
 ) -> LabelRetention:
     """The same with p of both streams corrected for further tests; None for no p. results: what it is made of."""
     peaks = [
         one if p is None else replace(one, p_fwe=p)
         for one, p in ((found.backbone, backbone), (found.action, action))
     ]
-    note, reason = _refusal(results, peaks[0])
+    note, reason = _refusal(results, found.category, peaks[0])
     return replace(found, backbone=peaks[0], action=peaks[1], note=note, reason=reason)
 
 
-def _rows(curve: LabelCurve, part: str, iterations: Iterations) -> NDArray[np.intp]:
+def _rows(curve: ProbeCurve, part: str, iterations: Iterations) -> NDArray[np.intp]:
     """Positions of the sites of a part of the model. Raises NoProbesError without any."""
     stream = curve.of_part(part)
     if stream is None:
@@ -153,23 +158,10 @@ def _rows(curve: LabelCurve, part: str, iterations: Iterations) -> NDArray[np.in
     return rows if step is None else rows[[curve.sites[row].iteration == step for row in rows]]
 
 
-def _above_chance(curve: LabelCurve, rows: NDArray[np.intp], results: LabelResults) -> Stream:
-    """Scores of every sample minus the chance of its site, summed by group."""
-    groups = results.groups
-    chance = np.nan_to_num(curve.chance[rows])  # without permutations nothing is defined, and nothing is NaN
-    above = sums_by_group(curve.scores[rows] - chance[:, None], groups)
-    sites = [curve.sites[row] for row in rows]
-    return Stream.of(
-        GroupSums(above, sums_by_group(np.ones(groups.size), groups)),
-        curve.inner[rows],
-        fold_of_groups(results.fold_of, groups),
-        [site.layer for site in sites],
-        [site.iteration or 0 for site in sites],
-    )
-
-
-def _peak(results: LabelResults, view: str, rows: NDArray[np.intp], scores: Scores, place: int) -> LabelPeak:
-    curve = results.curves[view]
+def _peak(
+    results: ProbeResults, curve_of: tuple[str, str], rows: NDArray[np.intp], scores: Scores, place: int
+) -> LabelPeak:
+    curve = results.curves[curve_of]
     best = curve.largest_excess(rows)
     above = float(scores.above[place])
     spread = t_quantile(scores.df) * sqrt(scores.covariance[place, place])
@@ -180,13 +172,13 @@ def _peak(results: LabelResults, view: str, rows: NDArray[np.intp], scores: Scor
         score=float(curve.metric[best]),
         chance=float(curve.chance[best]),
         p_fwe=float(curve.p_fwe()[best]),
-        exceeds=results.controls.exceeded(view, site),
+        exceeds=results.controls.exceeded(*curve_of, site),
         above=above,
         ci=(above - spread, above + spread),
     )
 
 
-def _refusal(results: LabelResults, backbone: LabelPeak) -> tuple[str, str]:
+def _refusal(results: ProbeResults, category: str, backbone: LabelPeak) -> tuple[str, str]:
     """Why there is nothing to retain, in few words and in full; two empty texts where there is."""
     own, score = results.settings, METRICS[results.settings.task]
     found = f"the backbone's best site {backbone.site} has {score} {backbone.score:.2f}"
@@ -201,7 +193,11 @@ def _refusal(results: LabelResults, backbone: LabelPeak) -> tuple[str, str]:
             f"step: `--controls {','.join([STEP, *results.controls.names])}`"
         )
     if missed := backbone.missed:
-        scores = {one.name: one.score for one in results.controls.scores if one.stream in ("", backbone.stream)}
+        scores = {
+            one.name: one.score
+            for one in results.controls.scores
+            if one.category == category and one.stream in ("", backbone.stream)
+        }
         facts = [f"chance {backbone.chance:.2f}, p {backbone.p_fwe:.3f}"]
         facts += [f"{name} {scores[name]:.2f}" for name in missed if name in scores]
         return f"n/a (backbone not shown to exceed {_listed(missed)})", (
@@ -221,7 +217,7 @@ def _listed(names: tuple[str, ...]) -> str:
     return f"{', '.join(others)} and {last}" if others else last
 
 
-def check_same_label(results: Sequence[LabelResults], places: Sequence[str]) -> None:
+def check_same_label(results: Sequence[ProbeResults], places: Sequence[str]) -> None:
     """Raise UsageError where results at two places are of labels that differ in any value or sample."""
     first = results[0]
     for one, place in zip(results, places, strict=True):

@@ -26,9 +26,10 @@ from probe_kit.retention.labels.estimate import (
 )
 from probe_kit.statistics.paired_tests import holm
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.choices import SIDES
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.labels.label_results import LabelResults
-from probe_kit.train.labels.label_store import load_label_results, stored_versions
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.store import load_results, stored_targets
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -64,7 +65,7 @@ class LabelRetentionTable:
     """
 
     rows: tuple[LabelRow, ...]
-    results: Mapping[tuple[str, str], LabelResults] = field(default_factory=dict)
+    results: Mapping[tuple[str, str], ProbeResults] = field(default_factory=dict)
     iterations: Iterations = "all"
     tried: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     family: Family = "label"
@@ -73,6 +74,11 @@ class LabelRetentionTable:
     def targets(self) -> tuple[str, ...]:
         """The label columns, in order."""
         return tuple(dict.fromkeys(row.retention.target for row in self.rows))
+
+    @property
+    def has_categories(self) -> bool:
+        """Whether any label was probed by category."""
+        return any(row.retention.category != "all" for row in self.rows)
 
     def __repr__(self) -> str:
         names = ", ".join(dict.fromkeys(f"{row.retention.target} of {row.run}" for row in self.rows))
@@ -87,33 +93,26 @@ class LabelRetentionTable:
     @property
     def text(self) -> Table:
         """The table as text."""
-        one, several = self.rows[0].retention, len(self.targets) > 1
+        one, several, each = self.rows[0].retention, len(self.targets) > 1, self.has_categories
         return Table.of(
             "Labels, and what reaches the action"
             if several
             else f"{one.target}: {one.metric}, and what reaches the action",
             (
-                *map(Heading, (*(("label", "metric") if several else ()), "run", "view")),
-                *grouped(
-                    ("backbone", ("backbone site", "score", "chance", "above chance")),
-                    ("action", ("action site", "score", "chance", "above chance")),
-                ),
-                Heading("retention"),
-            ),
-            [
-                (*((row.retention.target, row.retention.metric) if several else ()), row.run, row.retention.view,
-                 *_peak(row.retention.backbone), *_peak(row.retention.action), _value(row.retention))
-                for row in self.rows
-            ],
-            names=2 + 2 * several,
-            notes=[_NOTE],
-        )  # fmt: skip
+                *map(Heading, (*(("label", "metric") if several else ()), *(("category",) if each else ()), "run",
+                "view")), *grouped( ("backbone", ("backbone site", "score", "chance", "above chance")), ("action",
+                ("action site", "score", "chance", "above chance")), ), Heading("retention"), ), [
+                (*((row.retention.target, row.retention.metric) if several else ()), *((row.retention.category,) if
+                each else ()), row.run, row.retention.view, *_peak(row.retention.backbone),
+                *_peak(row.retention.action), _value(row.retention)) for row in self.rows ], names=2 + 2 * several
+                + each, notes=[_NOTE], )  # fmt: skip
 
     @property
     def summary(self) -> Table:
         """The table without sites and chance; runs and views where there are several."""
         named = {
             "label": [row.retention.target for row in self.rows],
+            "category": [row.retention.category for row in self.rows],
             "run": [row.run for row in self.rows],
             "view": [row.retention.view for row in self.rows],
         }
@@ -216,6 +215,10 @@ def label_retention_table(
     named = [targets] if isinstance(targets, str) else list(targets)
     if not runs or not named:
         raise UsageError("retention of a label needs at least one run and one target")
+    if sides := [name for name in named if name in SIDES]:
+        raise UsageError(
+            f"the target {sides[0]!r} is the name of a side. Leave --target out for the retention of sides"
+        )
     if doubles := [name for at, name in enumerate(named) if name in named[:at]]:
         raise UsageError(f"the target {doubles[0]!r} is given twice; leave one out")
     chosen = list(keys or [None] * len(runs))
@@ -227,27 +230,28 @@ def label_retention_table(
             "Show one target at a time, or leave the keys out"
         )
     places = [str(run.location) for run in runs]
-    results: dict[tuple[str, str], LabelResults] = {}
+    results: dict[tuple[str, str], ProbeResults] = {}
     for target in named:
-        own = [load_label_results(run, key, target) for run, key in zip(runs, chosen, strict=True)]
+        own = [load_results(run, key, target) for run, key in zip(runs, chosen, strict=True)]
         check_same_label(own, places)
         results |= {(place, target): one for place, one in zip(places, own, strict=True)}
     names = dict(zip(places, full_names(runs), strict=True))
     rows = [
-        LabelRow(names[place], place, one.key, measure_label_retention(one, view, iterations))
+        LabelRow(names[place], place, one.key, measure_label_retention(one, view, iterations, category))
         for (place, _), one in results.items()
+        for category in one.settings.categories
         for view in views or one.settings.views
     ]
-    tried = {place: stored_versions(run) for place, run in zip(places, runs, strict=True)}
+    tried = {place: stored_targets(run) for place, run in zip(places, runs, strict=True)}
     corrected = rows if family == "label" else _corrected(rows, results)
     return LabelRetentionTable(tuple(corrected), results, iterations, tried, family)
 
 
-def _corrected(rows: Sequence[LabelRow], results: Mapping[tuple[str, str], LabelResults]) -> list[LabelRow]:
+def _corrected(rows: Sequence[LabelRow], results: Mapping[tuple[str, str], ProbeResults]) -> list[LabelRow]:
     """The rows with p of both streams corrected for the targets, within each run and view."""
-    families: dict[tuple[str, str], list[int]] = {}
+    families: dict[tuple[str, str, str], list[int]] = {}
     for place, row in enumerate(rows):
-        families.setdefault((row.location, row.retention.view), []).append(place)
+        families.setdefault((row.location, row.retention.category, row.retention.view), []).append(place)
     found = list(rows)
     for members in families.values():
         own = [rows[place].retention for place in members]
@@ -281,6 +285,7 @@ def _value(found: LabelRetention) -> str:
 def _sentence(row: LabelRow, several: bool) -> str:
     found = row.retention
     where = f"{found.target}, view {found.view}" + (f", {row.run}" if several else "")
+    where += "" if found.category == "all" else f", category {found.category}"
     if not found.defined:
         return f"{where}: retention is not defined: {found.reason}."
     action = label_of(found.action.stream)
@@ -297,7 +302,7 @@ def _flat(row: LabelRow) -> dict[str, Any]:
     """Fields of a row; nested names are joined by a dot."""
     own = row.retention
     line: dict[str, Any] = {"run": row.run, "target": own.target, "task": own.task, "metric": own.metric}
-    line["view"] = own.view
+    line |= {"category": own.category, "view": own.view}
     for name, peak in (("backbone", own.backbone), ("action", own.action)):
         low, high = peak.ci
         line |= {

@@ -9,10 +9,11 @@ from probe_kit.retention.displays.labels import label_figures
 from probe_kit.retention.labels.table import LabelRetentionTable, label_retention_table
 from probe_kit.retention.report.pictures import Picture, arranged
 from probe_kit.train.choices import Task
+from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.labels.label_results import METRICS, LabelResults
-from probe_kit.train.labels.label_store import load_label_results, stored_targets
-from probe_kit.train.labels.label_summary import label_sentences, label_table
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.store import load_results, stored_targets
+from probe_kit.train.results.summary import best_sites_sentences, best_sites_table
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ def label_sections(
                 tuple(
                     f"{name}: {sentence}" if several else sentence
                     for name, one in probes.items()
-                    for sentence in label_sentences(one)
+                    for sentence in best_sites_sentences(one)
                 ),
             )
         )
@@ -86,30 +87,31 @@ def stored_label_sections(
             try:
                 table = label_retention_table([run], target)
             except NoProbesError as error:
-                found.append(_without_retention(load_label_results(run, target=target), of_one, str(error)))
+                found.append(_without_retention(load_results(run, target=target), of_one, str(error)))
             else:
                 found += label_sections([run], replace(table, tried={}), [name], places, of_one)
     return found
 
 
-def _without_retention(results: LabelResults, of_one: str, reason: str) -> LabelSection:
+def _without_retention(results: ProbeResults, of_one: str, reason: str) -> LabelSection:
     return LabelSection(
         results.settings.target, of_one, _measured(results), None, (f"{reason}.",), [],
-        (_probes_table(results, "Best sites and controls"),), tuple(label_sentences(results)),
+        (_probes_table(results, "Best sites and controls"),), tuple(best_sites_sentences(results)),
     )  # fmt: skip
 
 
-def _measured(results: LabelResults) -> str:
+def _measured(results: ProbeResults) -> str:
     own = results.settings
-    classes = f" of {len(results.classes)} classes" if own.task == "classes" else ""
+    curve = next(iter(results.curves.values()))
+    classes = f" of {len(curve.classes)} classes" if own.task == "classes" else ""
     return f"A {_TASKS[own.task]} label{classes}; the score is {METRICS[own.task]}."
 
 
 _TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "continuous": "continuous"}
 
 
-def _probes_table(results: LabelResults, title: str) -> Table:
-    shown = label_table(results)
+def _probes_table(results: ProbeResults, title: str) -> Table:
+    shown = best_sites_table([results])
     (part,) = shown.parts
     cells = tuple((name, *(cell.text for cell in row)) for name, row in zip(shown.names, part.rows, strict=True))
     return Table.of(title, ("stream", *part.headings), cells, notes=[shown.caption])

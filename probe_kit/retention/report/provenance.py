@@ -8,7 +8,6 @@ from typing import Any
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.labels.label_results import LabelResults
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.version import __version__
 
@@ -26,7 +25,7 @@ class Provenance:
 
 
 def provenance(
-    name: str, run: RunReader, results: ProbeResults | None, labels: Sequence[LabelResults] = ()
+    name: str, run: RunReader, results: ProbeResults | None, labels: Sequence[ProbeResults] = ()
 ) -> Provenance:
     """What a run says about itself and its probes; runs that were not made by probe_kit say less.
 
@@ -112,7 +111,7 @@ def _stream(run: RunReader, name: str) -> str:
     return f"{name} {stream.layers} layers{steps}, width {stream.width}"
 
 
-def _probe_settings(results: ProbeResults | LabelResults | None) -> dict[str, Any]:
+def _probe_settings(results: ProbeResults | None) -> dict[str, Any]:
     if results is None:
         return {}
     return {"key": results.key, "created": results.created, **asdict(results.settings)}

@@ -298,7 +298,7 @@ class _ProbedCategory:
             n_groups=self.curve.n_groups,
             missing=missing_episodes(self.curve),
             probe_minus_sr=None if score is None or success.sr is None else score - success.sr,
-            baselines={name: score.accuracy for name, score in baselines.items()},
+            baselines={name: score.score for name, score in baselines.items()},
             leaks=tuple(name for name, score in baselines.items() if score.above_chance),
             untrained=next((one.untrained for one in untrained if one is not None), None),
         )

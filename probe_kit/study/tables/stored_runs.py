@@ -22,7 +22,7 @@ from probe_kit.study.reading import LoadedStudy, load_study, shipped_studies
 from probe_kit.study.schema import ProbesTable
 from probe_kit.train.probe_sweep import probe_settings
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.results.store import is_ours, is_stored, load_results, read_probes
+from probe_kit.train.results.store import is_stored, load_results, read_probes, settings_of
 
 if TYPE_CHECKING:
     from probe_kit.runs import Run
@@ -210,7 +210,7 @@ def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool)
         return stored_keys[-1]
     if partial or _stored_keys(tables, stored.probed.in_wording()):  # then other items are shown than were fitted
         return ""
-    others = [key for key, bundle in read_probes(run.location).items() if is_ours(bundle)]
+    others = [key for key, bundle in read_probes(run.location).items() if settings_of(bundle).is_side]
     also = f" It has those of other settings: {', '.join(others)}." if others else ""
     names = ", ".join(f"[probes.{name}]" for name, _ in tables)
     raise RunIncompleteError(

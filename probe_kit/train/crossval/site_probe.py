@@ -6,57 +6,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NonFiniteActivationError
-from probe_kit.statistics.folds import Fold
-from probe_kit.train.crossval.batched_folds import cross_validate_together, is_small
-from probe_kit.train.crossval.joint import can_be_joint, cross_validate_jointly
-from probe_kit.train.crossval.joint_design import JointSite
-from probe_kit.train.crossval.metrics import correctness, log_loss, log_losses
-from probe_kit.train.crossval.nested_folds import (
-    STRENGTHS,
-    FittedFold,
-    InnerQuality,
-    Matrix,
-    NestedFold,
-    nested_folds,
-    select_c,
-)
+from probe_kit.train.choices import Task
+from probe_kit.train.crossval.logistic_folds import cross_validate
+from probe_kit.train.crossval.metrics import correctness
+from probe_kit.train.crossval.nested_folds import FittedFold, InnerQuality, Matrix, NestedFold
+from probe_kit.train.crossval.ridge_folds import predict_classes, predict_quantities
+from probe_kit.train.crossval.task_scores import balanced_scores, explained_scores
 from probe_kit.train.data.samples import Samples
-from probe_kit.train.solver.backend import to_numpy
-from probe_kit.train.solver.logistic import LogisticSolver
-from probe_kit.train.solver.projection import Projection
-
-__all__ = [
-    "STRENGTHS",
-    "FittedFold",
-    "NestedFold",
-    "SiteProbe",
-    "check_non_finite",
-    "cross_validate",
-    "nested_folds",
-    "probe_site",
-]
 
 
 @dataclass(frozen=True)
 class SiteProbe:
-    """What is kept of a site's probe.
+    """The results of a site's probe on E samples, with F outer folds and P label permutations.
 
-    decisions: (E,) out-of-fold decision values; positive means label 1.
-    strengths: (F,) the C chosen in each outer fold.
-    weights, intercepts: (F, D) float32 and (F,) of each outer fold's probe, on raw features.
-    spreads: (F,) deviation of the fold's training samples along its weights, in units of the features.
-    null: (P,) accuracies under the label permutations.
-    inner: (F, E) float32 log-likelihood of each episode's label in the inner folds of each outer fold, at its C; 0
-    for the episodes that the outer fold tests.
+    decisions: (E,) out-of-fold decision values of a side (positive: left), else predicted class numbers or
+    quantities. scores: (E,) their mean is the metric; of a side whether the decision is right. strengths: (F,) the
+    C or λ chosen in each outer fold. weights, intercepts: (F, D) float32 and (F,) of each outer fold's probe of a
+    side, on raw features; D is 0 for other targets. spreads: (F,) deviation of the fold's training samples along
+    its weights, in units of the features. null: (P,) metric under the label permutations. inner: (F, E) quality of
+    each sample's prediction in the inner folds of each outer fold, by which penalties are chosen, the larger the
+    better; 0 for the samples that the outer fold tests. Of a side the log-likelihood of its label, else minus the
+    mean of the permutations'.
     """
 
     decisions: Matrix
+    scores: Matrix
     strengths: Matrix
     weights: NDArray[np.float32]
     intercepts: Matrix
     spreads: Matrix
     null: Matrix
-    inner: NDArray[np.float32]
+    inner: NDArray[np.floating]
 
 
 def probe_site(
@@ -65,7 +45,7 @@ def probe_site(
     permuted_labels: NDArray[np.bool_],
     folds: list[NestedFold],
 ) -> SiteProbe:
-    """Probe the samples of E episodes for (E,) labels, and again for every column of (E, P) label permutations.
+    """Probe the samples of E episodes for (E,) sides, and again for every column of (E, P) label permutations.
 
     Raises ProbeNotConvergedError, and NonFiniteActivationError for NaN or infinity.
     """
@@ -73,15 +53,53 @@ def probe_site(
     columns = np.column_stack([labels, permuted_labels])
     fitted = cross_validate(samples, columns, folds)
     decisions = _out_of_fold(fitted, folds)
+    right = correctness(decisions, columns)
     return SiteProbe(
         decisions=decisions[:, 0],
+        scores=right[:, 0].astype(np.float64),
         strengths=np.array([fold.strengths[0] for fold in fitted]),
         weights=np.stack([fold.weights for fold in fitted]).astype(np.float32),
         intercepts=np.array([fold.intercept for fold in fitted]),
         spreads=np.array([fold.spread for fold in fitted]),
-        null=correctness(decisions, columns)[:, 1:].mean(axis=0),
+        null=right[:, 1:].mean(axis=0),
         inner=np.stack([fold.inner.first for fold in fitted]).astype(np.float32),
     )
+
+
+def probe_labels(samples: Samples, labels: Matrix, task: Task, folds: list[NestedFold]) -> SiteProbe:
+    """Probe samples for the first of (E, 1 + P) columns of coded labels, and for the permutations behind it.
+
+    Raises ProbeNotConvergedError for a binary label, and NonFiniteActivationError for NaN or infinity.
+    """
+    check_non_finite(samples)
+    labels, place = _distinct(labels)
+    predictions, strengths, inner = _predict(samples, labels, task, folds)
+    if task == "continuous":
+        scores = explained_scores(predictions, labels, [fold.outer for fold in folds])
+    else:
+        scores = balanced_scores(predictions, labels)
+    none = np.zeros(len(folds))
+    return SiteProbe(
+        decisions=predictions[:, 0],
+        scores=scores[:, 0],
+        strengths=strengths,
+        weights=np.zeros((len(folds), 0), np.float32),
+        intercepts=none,
+        spreads=none,
+        null=scores.mean(axis=0)[place[1:]],
+        inner=np.stack([
+            _above_permutations(one, place[1:], fold.outer.train) for one, fold in zip(inner, folds, strict=True)
+        ]),
+    )  # fmt: skip
+
+
+def predict_once(samples: Samples, labels: Matrix, task: Task, fold: NestedFold) -> tuple[Matrix, float]:
+    """Return predictions (m,) for the test samples of one outer fold, and its C or λ.
+
+    labels: (E,); those of test samples have no effect. Raises ProbeNotConvergedError.
+    """
+    predictions, strengths, _ = _predict(samples, labels[:, None], task, [fold])
+    return predictions[fold.outer.test, 0], float(strengths[0])
 
 
 def check_non_finite(samples: Samples) -> None:
@@ -94,57 +112,47 @@ def check_non_finite(samples: Samples) -> None:
         )
 
 
-def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[NestedFold]) -> list[FittedFold]:
-    """The probes of every outer fold, each column of (E, K) labels on its own.
+def _predict(
+    samples: Samples, labels: Matrix, task: Task, folds: list[NestedFold]
+) -> tuple[Matrix, Matrix, list[InnerQuality]]:
+    """(E, K) held-out class numbers or quantities, (F,) C or λ of the first column, and the inner quality."""
+    if task == "binary":
+        return _predict_binary(samples, labels, folds)
+    return (predict_classes if task == "classes" else predict_quantities)(samples, labels, folds)
 
-    Wide tokens with few columns are solved for all training sets together, where these have the same features, and
-    so are small problems.
-    Raises ProbeNotConvergedError, and TooFewGroupsError for a training set with a single class.
+
+def _predict_binary(
+    samples: Samples, labels: Matrix, folds: list[NestedFold]
+) -> tuple[Matrix, Matrix, list[InnerQuality]]:
+    """The side probes' logistic regression, without what its intercept learns from unequal classes."""
+    truth = labels == 1
+    predictions, fitted = np.empty_like(labels), cross_validate(samples, truth, folds)
+    for fold, probe in zip(folds, fitted, strict=True):
+        share = truth[fold.outer.train].mean(axis=0)
+        predictions[fold.outer.test] = probe.decisions > np.log(share / (1 - share))
+    return predictions, np.array([probe.strengths[0] for probe in fitted]), [probe.inner for probe in fitted]
+
+
+def _above_permutations(inner: InnerQuality, columns: NDArray[np.intp], train: NDArray[np.intp]) -> Matrix:
+    """(E,) of the first column minus the mean over `columns`, of which every training sample bears a share.
+
+    Sites differ in what they reach with exchanged labels. Without permutations nothing is subtracted.
     """
-    if can_be_joint(samples, labels.shape[1]) and (site := JointSite.of(samples, folds)).alike:
-        return cross_validate_jointly(site, samples, labels, folds)
-    if is_small(samples, labels):
-        return cross_validate_together(samples, labels, folds)
-    return [_fit_fold(samples, labels, f.outer, *choose_strengths(samples, labels, f.inner)) for f in folds]
+    above = inner.first.copy()
+    if columns.size:
+        above[train] -= inner.total[columns].mean() / train.size
+    return above
 
 
-def choose_strengths(
-    samples: Samples, labels: NDArray[np.bool_], folds: list[Fold]
-) -> tuple[Matrix, InnerQuality]:
-    """For each label column the C of the grid with the lowest held-out log-loss, and the quality there.
+def _distinct(labels: Matrix) -> tuple[Matrix, NDArray[np.intp]]:
+    """The different columns of (E, K) labels, the first one first, and the place of every column among them.
 
-    The smaller C on ties.
+    Labels that are constant in a group have few different permutations.
     """
-    loss = np.zeros((STRENGTHS.size, labels.shape[1]))
-    by_episode = np.zeros((STRENGTHS.size, len(labels)))
-    for fold in folds:
-        train = samples.of(fold.train)
-        coordinates = Projection.fit(train.features)
-        held_out, truth = coordinates(samples.of(fold.test).means), labels[fold.test]
-        solver = LogisticSolver(coordinates.train)
-        for step, weights in enumerate(solver.path(train.repeat(labels[fold.train]), STRENGTHS)):
-            decisions = to_numpy(held_out @ weights)
-            loss[step] += log_loss(decisions, truth) * fold.test.size
-            by_episode[step, fold.test] = log_losses(decisions[:, 0], truth[:, 0])
-    chosen = select_c(loss)
-    return STRENGTHS[chosen], InnerQuality.of(-loss, -by_episode, chosen)
-
-
-def _fit_fold(
-    samples: Samples, labels: NDArray[np.bool_], fold: Fold, strengths: Matrix, inner: InnerQuality
-) -> FittedFold:
-    train = samples.of(fold.train)
-    coordinates = Projection.fit(train.features)
-    solver = LogisticSolver(coordinates.train)
-    held_out, training_labels = coordinates(samples.of(fold.test).means), train.repeat(labels[fold.train])
-    decisions = np.empty((fold.test.size, labels.shape[1]))
-    for strength in np.unique(strengths):
-        columns = np.flatnonzero(strengths == strength)
-        (weights,) = solver.path(training_labels[:, columns], np.array([strength]))
-        decisions[:, columns] = to_numpy(held_out @ weights)
-        if columns[0] == 0:
-            first = weights
-    return FittedFold.of(coordinates, first, decisions, strengths, inner)
+    first: dict[bytes, int] = {}
+    place = [first.setdefault(column.tobytes(), len(first)) for column in labels.T.copy()]
+    different = [place.index(number) for number in range(len(first))]
+    return labels[:, different], np.array(place, np.intp)
 
 
 def _out_of_fold(fitted: list[FittedFold], folds: list[NestedFold]) -> Matrix:

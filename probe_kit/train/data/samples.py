@@ -1,6 +1,6 @@
 """Samples of a probe: one per episode (pooled views), or one per token."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.runs.rows import TokenBlock
 from probe_kit.train.data.run_reader import RunReader, Tokens
 from probe_kit.train.solver.backend import Array, to_device, to_numpy
 from probe_kit.train.solver.row_subset import Features, RowSubset
@@ -54,6 +55,14 @@ class Samples:
         sums = np.add.reduceat(features, _starts(counts), axis=0, dtype=np.float64)
         return cls(RowSubset.all(features), counts, sums / counts[:, None])
 
+    @classmethod
+    def joined(cls, parts: Sequence["Samples"]) -> "Samples":
+        """Return the samples of several parts, one part behind the other."""
+        pools = all(part.pools for part in parts)
+        features = np.concatenate([np.asarray(part.features) for part in parts])
+        counts, means = (np.concatenate([getattr(part, name) for part in parts]) for name in ("counts", "means"))
+        return cls(features if pools else RowSubset.all(features), counts, means)
+
     @property
     def pools(self) -> bool:
         """Whether every episode is a single sample."""
@@ -70,6 +79,11 @@ class Samples:
         shift = _starts(self.counts)[episodes] - _starts(counts)
         rows = np.repeat(shift, counts) + np.arange(counts.sum())
         return Samples(self.features[rows], counts, self.means[episodes])
+
+    def read(self) -> NDArray[np.floating]:
+        """(M, D) features in memory."""
+        features = self.features.read() if isinstance(self.features, RowSubset) else self.features
+        return to_numpy(features)
 
     def repeat(self, of_episodes: NDArray[Any]) -> NDArray[Any]:
         """(M, K): what is true of each episode (E, K), for each of its samples."""
@@ -109,21 +123,40 @@ def role_of(view: str) -> str | None:
     return view.partition(":")[2] or None
 
 
-def read_samples(run: RunReader, view: str, site: Site) -> Samples:
-    """All samples of one site. Raises NonFiniteActivationError naming the first broken episode."""
-    if is_token_view(view):
-        role = role_of(view)
-        samples = Samples.tokens(run.iter_token_blocks(site, role), run.token_mask(site, role))
-    else:
-        samples = Samples.pooled(run.column(site, view))
-    broken = samples.broken()
-    if broken.size:
+def read_samples(
+    run: RunReader, view: str, site: Site, rows: NDArray[np.intp], inferences: NDArray[np.intp]
+) -> Samples:
+    """Return the samples of one site, in order: episode `rows` (n,) of the run at captured `inferences` (n,).
+
+    Raises NonFiniteActivationError naming the first broken one.
+    """
+    parts, order = [], []
+    for call in np.unique(inferences).tolist():
+        places = np.flatnonzero(inferences == call)
+        parts.append(_read_call(run, view, site, rows[places], call))
+        order.append(places)
+    samples = parts[0] if len(parts) == 1 else Samples.joined(parts).of(np.argsort(np.concatenate(order)))
+    if (broken := samples.broken()).size:
+        first, names = int(broken[0]), run.episodes["episode_id"]
         raise NonFiniteActivationError(
-            f"{site}, view {view!r}, of {run.location} holds NaN or infinity in {broken.size} of "
-            f"{len(samples.counts)} episodes, the first {run.episodes['episode_id'].iloc[broken[0]]!r}; expected "
-            "finite features. Extract these episodes again."
+            f"{site}, view {view!r}, of {run.location} holds NaN or infinity in {broken.size} of {rows.size} "
+            f"samples, the first inference {inferences[first]} of {names.iloc[int(rows[first])]!r}; expected "
+            "finite features. Extract these episodes again"
         )
     return samples
+
+
+def _read_call(run: RunReader, view: str, site: Site, rows: NDArray[np.intp], call: int) -> Samples:
+    """Return one captured inference of some episodes. A reader without several inferences is asked for none."""
+    at = (call,) if call else ()
+    if not is_token_view(view):
+        return Samples.pooled(run.column(site, view, *at)[rows])
+    role = role_of(view)
+    blocks, mask = run.iter_token_blocks(site, role, *at), run.token_mask(site, role, *at)
+    if np.array_equal(rows, np.arange(len(mask))):
+        return Samples.tokens(blocks, mask)
+    some = (TokenBlock(block.start, block.values[rows], block.mask[rows]) for block in blocks)
+    return Samples.tokens(some, mask[rows])
 
 
 def _starts(counts: NDArray[np.intp]) -> NDArray[np.intp]:

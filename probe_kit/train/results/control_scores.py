@@ -1,11 +1,12 @@
-"""Scores of the controls that probes are compared with: baselines, and an untrained network."""
+"""Scores of the controls that probes are compared with: features without a model, an untrained network."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from math import isnan
 from typing import Any
 
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 RANDOM_FEATURES, UNTRAINED = "random-features", "untrained"
@@ -13,29 +14,35 @@ RANDOM_FEATURES, UNTRAINED = "random-features", "untrained"
 
 
 @dataclass(frozen=True)
-class BaselineScore:
-    """Held-out accuracy of the same nested probe on features that never saw the model.
+class ControlScore:
+    """Held-out score of the same nested probe on features that never saw the model, or of an untrained network.
 
-    95 % interval over groups; p by the label permutations of the category's probes (None without any).
+    ci: 95 % interval over groups. chance, p: by the label permutations of the category's probes; chance is 1/2
+    for a side, None without permutations, and p is None without any. stream: whose width `random-features` have,
+    or whose best site that of `untrained` is; empty for others. view: of `untrained`. by_step: metric at each of
+    `ProbeCurve.steps`, in order.
     """
 
     name: str
     category: str
-    accuracy: float
+    score: float
     ci: tuple[float, float]
     p: float | None
-    chance: float
+    chance: float | None
     n: int
+    stream: str = ""
+    view: str = ""
+    by_step: tuple[float, ...] = ()
 
     @property
     def above_chance(self) -> bool:
-        """Whether the suite gives the answer away without a model."""
+        """Whether the target is given away without a model."""
         return self.p is not None and self.p < SIGNIFICANCE
 
 
 @dataclass(frozen=True)
 class UntrainedScore:
-    """How much more accurate a probe is than the untrained network's, on the same episodes.
+    """How much more accurate a probe of a side is than the untrained network's, on the same episodes.
 
     ci: 95 % interval over groups.
 
@@ -56,10 +63,10 @@ class UntrainedScore:
 
 @dataclass(frozen=True)
 class ControlComparison:
-    """Whether a site's probe is more accurate than a control: paired by group, family-wise over its stream.
+    """Whether a site's probe scores more than a control: paired by group, family-wise over its stream.
 
-    control: `random-features`, or `untrained` for the best site of that stream in the untrained network.
-    reference: the control's accuracy.
+    control: of a side `random-features`, or `untrained` for the best site of that stream in the untrained network;
+    of other targets every control that was run. reference: the control's score.
     """
 
     control: str
@@ -71,7 +78,7 @@ class ControlComparison:
 
 
 Exceeds = dict[str, bool | None]
-"""Whether a site is better than `chance`, `random-features` and `untrained`; None for what was not run."""
+"""Whether a site is better than `chance` and than controls, by name; None for what was not run."""
 
 
 def has_signal(exceeds: Exceeds) -> bool:
@@ -81,58 +88,105 @@ def has_signal(exceeds: Exceeds) -> bool:
 
 @dataclass(frozen=True)
 class Controls:
-    """Scores of the controls so far. excess: every site compared with random-features and untrained."""
+    """Scores of the controls so far.
 
-    baselines: tuple[BaselineScore, ...] = ()
+    comparisons: every site compared with controls. left_out: why a default control was not run, by name.
+    """
+
+    scores: tuple[ControlScore, ...] = ()
     untrained: tuple[UntrainedScore, ...] = ()
-    excess: tuple[ControlComparison, ...] = ()
+    comparisons: tuple[ControlComparison, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
-    def exceeds(self, category: str, view: str, site: str, p_fwe: float) -> Exceeds:
-        """What a site with this family-wise p is better than."""
-        found = self._beaten.get((category, view, site), {})
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The controls that were run."""
+        return tuple(dict.fromkeys(score.name for score in self.scores))
+
+    def exceeds(self, category: str, view: str, site: Site | str, p_fwe: float) -> Exceeds:
+        """Return what a site with this family-wise p is better than.
+
+        `random-features` and `untrained` are always listed, other controls where sites were compared with them.
+        """
         chance = None if isnan(p_fwe) else bool(p_fwe < SIGNIFICANCE)
-        return {"chance": chance, RANDOM_FEATURES: found.get(RANDOM_FEATURES), UNTRAINED: found.get(UNTRAINED)}
+        absent: Exceeds = {RANDOM_FEATURES: None, UNTRAINED: None}
+        return {"chance": chance, **absent, **self.exceeded(category, view, site)}
+
+    def exceeded(self, category: str, view: str, site: Site | str) -> dict[str, bool]:
+        """Return whether a site exceeds each control that it was compared with, by name."""
+        return {name: one.p < SIGNIFICANCE for name, one in self._of_site(category, view, site).items()}
+
+    def reference(self, category: str, view: str, site: Site | str) -> float:
+        """Return the score of the best control of a site; NaN without any."""
+        return max((one.reference for one in self._of_site(category, view, site).values()), default=float("nan"))
+
+    def _of_site(self, category: str, view: str, site: Site | str) -> dict[str, ControlComparison]:
+        return self._compared.get((category, view, str(site)), {})
 
     @cached_property
-    def _beaten(self) -> dict[tuple[str, str, str], dict[str, bool]]:
-        """By category, view and site: the controls it was compared with, and whether it is better."""
-        beaten: dict[tuple[str, str, str], dict[str, bool]] = {}
-        for one in self.excess:
-            beaten.setdefault((one.category, one.view, one.site), {})[one.control] = one.p < SIGNIFICANCE
-        return beaten
+    def _compared(self) -> dict[tuple[str, str, str], dict[str, ControlComparison]]:
+        """Comparisons by category, view and site, then by control."""
+        by_site: dict[tuple[str, str, str], dict[str, ControlComparison]] = {}
+        for one in self.comparisons:
+            by_site.setdefault((one.category, one.view, one.site), {})[one.control] = one
+        return by_site
 
-    def of_category(self, category: str) -> dict[str, BaselineScore]:
-        """Baselines of a category by name."""
-        return {score.name: score for score in self.baselines if score.category == category}
+    def of_category(self, category: str) -> dict[str, ControlScore]:
+        """Return the scores of a category by name, those of an untrained network left out."""
+        own = (score for score in self.scores if score.category == category and score.name != UNTRAINED)
+        return {score.name: score for score in own}
+
+    def of_stream(self, category: str, view: str, stream: str) -> tuple[ControlScore, ...]:
+        """Return the scores that sites of a stream are compared with in a view, the best first."""
+        own = [one for one in self.scores if one.category == category]
+        own = [one for one in own if one.stream in ("", stream) and one.view in ("", view)]
+        return tuple(sorted(own, key=lambda one: -one.score))
 
     def untrained_peak(self, category: str, view: str, stream: str) -> UntrainedScore | None:
-        """The best site of a stream against the untrained network's best, None without one."""
-        found = (s for s in self.untrained if s.peak and (s.category, s.view) == (category, view))
-        return next((score for score in found if score.site.startswith(f"{stream}.")), None)
+        """Return the best site of a stream against the untrained network's best, None without one."""
+        peaks = (s for s in self.untrained if s.peak and (s.category, s.view) == (category, view))
+        return next((score for score in peaks if score.site.startswith(f"{stream}.")), None)
 
-    def with_baselines(self, scores: Iterable[BaselineScore]) -> "Controls":
-        """These and more; a newer score replaces one of the same name and category."""
-        merged = {(score.name, score.category): score for score in (*self.baselines, *scores)}
-        return replace(self, baselines=tuple(merged.values()))
+    def has(self, name: str, categories: Iterable[str]) -> bool:
+        """Return whether a control was run for all of some categories."""
+        return set(categories) <= {score.category for score in self.scores if score.name == name}
+
+    def with_scores(
+        self, scores: Iterable[ControlScore], comparisons: Iterable[ControlComparison] = ()
+    ) -> "Controls":
+        """Return these and more; what is new replaces what is of the same control and place."""
+        by_place = {(one.name, one.category, one.stream, one.view): one for one in (*self.scores, *scores)}
+        by_site = {(o.control, o.category, o.view, o.site): o for o in (*self.comparisons, *comparisons)}
+        names = {place[0] for place in by_place}
+        missing = {name: why for name, why in self.left_out.items() if name not in names}
+        return replace(
+            self, scores=tuple(by_place.values()), comparisons=tuple(by_site.values()), left_out=missing
+        )
 
     def with_untrained(self, scores: Sequence[UntrainedScore]) -> "Controls":
-        """The same baselines with another untrained network."""
-        return replace(self, untrained=tuple(scores))
-
-    def with_excess(self, found: Sequence[ControlComparison]) -> "Controls":
-        """These, with all sites held anew against the controls that are in `found`."""
-        renewed = {one.control for one in found}
-        return replace(self, excess=(*(one for one in self.excess if one.control not in renewed), *found))
+        """Return the same with another untrained network, with which nothing is compared yet."""
+        return replace(
+            self,
+            untrained=tuple(scores),
+            scores=tuple(one for one in self.scores if one.name != UNTRAINED),
+            comparisons=tuple(one for one in self.comparisons if one.control != UNTRAINED),
+        )
 
     def to_json(self) -> dict[str, Any]:
-        """As stored in `controls.json`."""
+        """Return the content of `controls.json`."""
         return asdict(self)
 
     @classmethod
     def from_json(cls, stored: dict[str, Any]) -> "Controls":
-        """The controls that `to_json` gave."""
+        """Return the controls that `to_json` gave."""
+        lists = {"ci": tuple, "by_step": tuple}
+
+        def read(one: dict[str, Any]) -> dict[str, Any]:
+            return {name: lists[name](value) if name in lists else value for name, value in one.items()}
+
         return cls(
-            tuple(BaselineScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["baselines"]),
-            tuple(UntrainedScore(**{**score, "ci": tuple(score["ci"])}) for score in stored["untrained"]),
-            tuple(ControlComparison(**one) for one in stored["excess"]),
+            tuple(ControlScore(**read(score)) for score in stored["scores"]),
+            tuple(UntrainedScore(**read(score)) for score in stored["untrained"]),
+            tuple(ControlComparison(**one) for one in stored["comparisons"]),
+            dict(stored["left_out"]),
         )

@@ -7,11 +7,10 @@ from typing import Any
 from probe_kit.errors import NoProbesError
 from probe_kit.runs.results import Bundle
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.results.probe_results import episodes_sha256
+from probe_kit.train.results.control_scores import UNTRAINED
 from probe_kit.train.results.resume import unfinished_sweeps
 from probe_kit.train.results.store import (
     is_current,
-    is_ours,
     load_results,
     read_controls,
     read_probes,
@@ -97,11 +96,11 @@ def _in_wordings(run: Any) -> list[Any]:
 
 
 def stored_probes(run: Any) -> list[StoredProbes]:
-    """Every set of probe results of a run, oldest first."""
+    """Return every set of probe results of a run, oldest first."""
     readers = _in_wordings(run)
-    used = {_used(one) for one in readers}
-    found = [_probes(readers, bundle, used) for bundle in read_probes(run.location).values()]
-    return sorted(found, key=lambda probes: (probes.created, probes.key))
+    used = {_used(reader) for reader in readers}
+    probes = [_probes(readers, bundle, used) for bundle in read_probes(run.location).values()]
+    return sorted(probes, key=lambda stored: (stored.created, stored.key))
 
 
 def _used(run: RunReader) -> str | None:
@@ -112,18 +111,14 @@ def _used(run: RunReader) -> str | None:
 
 
 def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str | None]) -> StoredProbes:
-    key, created = bundle.key, bundle.times.get("created", "")
-    if not is_ours(bundle):
-        return _of_label(readers, bundle, created)
     settings = settings_of(bundle)
     current = [run for run in readers if is_current(settings, run)]
-    state = "used" if key in used else "other" if current else "other episodes"
-    wording = getattr(current[0], "wording", None) if current else None
+    state = "other episodes" if not current else "other" if settings.is_side else "label"
     return StoredProbes(
-        key=key,
-        state=state,
-        created=created,
-        target=settings.target,
+        key=bundle.key,
+        state="used" if bundle.key in used else state,
+        created=bundle.times.get("created", ""),
+        target=settings.target if settings.is_side else f"{settings.target} ({settings.task})",
         views=settings.views,
         categories=settings.categories,
         permutations=settings.permutations,
@@ -131,32 +126,17 @@ def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str |
         seed=settings.seed,
         call=settings.call,
         controls=_controls(bundle),
-        wording=wording or "",
-    )
-
-
-def _of_label(readers: Sequence[RunReader], bundle: Bundle, created: str) -> StoredProbes:
-    """Probes of a label of one's own, of which no settings are read but those that are listed."""
-    own = bundle.head["settings"]
-    of = [(run.settings_sha256, episodes_sha256(run)) for run in readers]
-    current = (own.get("run_settings"), own.get("episodes")) in of
-    return StoredProbes(
-        key=bundle.key,
-        state="label" if current else "other episodes",
-        created=created,
-        target=f"{own['target']} ({own['task']})",
-        views=tuple(own["views"]),
-        permutations=own["permutations"],
-        seed=own["seed"],
-        call=own["call"],
+        wording=(getattr(current[0], "wording", None) or "") if current else "",
     )
 
 
 def _controls(bundle: Bundle) -> tuple[str, ...]:
     controls = read_controls(bundle)
-    names = dict.fromkeys(score.name for score in controls.baselines)
-    untrained = dict.fromkeys(f"untrained: {score.untrained}" for score in controls.untrained)
-    return (*names, *untrained)
+    names = dict.fromkeys(name for name in controls.names if name != UNTRAINED)
+    networks = dict.fromkeys(f"untrained: {score.untrained}" for score in controls.untrained)
+    if UNTRAINED in controls.names and not networks:
+        networks = {UNTRAINED: None}
+    return (*names, *networks)
 
 
 def _words(run: RunReader, name: str) -> str:

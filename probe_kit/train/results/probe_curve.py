@@ -2,49 +2,98 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.sites import Site, part_of
-from probe_kit.statistics.estimates.balanced import GroupSums, balanced_sums
+from probe_kit.statistics.estimates.balanced import CHANCE, GroupSums, balanced_sums
 from probe_kit.statistics.estimates.crossfit import Stream
-from probe_kit.statistics.folds import Fold, fold_of_groups, split_by_fold
-from probe_kit.statistics.label_permutations import max_statistic_p
+from probe_kit.statistics.estimates.shares import Accuracy
+from probe_kit.statistics.folds import Fold, fold_of_groups, split_by_fold, sums_by_group
+from probe_kit.statistics.label_permutations import max_statistic_p, smallest_p
+from probe_kit.statistics.paired_bootstrap import SHARED_PROBE
+from probe_kit.train.choices import Task
 from probe_kit.train.crossval.metrics import correctness
+from probe_kit.train.crossval.task_scores import class_weights, score_interval, squared_deviations
+
+Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class ProbeCurve:
-    """All sites of one category in one view, on the same episodes (E), folds (F) and label permutations (P).
+    """All sites of one category in one view, on the same samples (E), folds (F) and label permutations (P).
 
-    sites: S of them. labels: (E,) bool. episodes, items, groups: (E,) identities. fold_of: (E,) outer fold.
-    parts: S times what the site's stream is part of, see `Stream.part`; default by the stream's name.
-    decisions: (S, E) out-of-fold. strengths: (S, F) chosen C. null: (S, P) accuracies under label permutation.
-    inner: (S, F, G) log-likelihood of every group in the inner folds of each outer fold, the groups in the order
-    of their names; 0 for the groups that the outer fold tests.
+    A sample is an episode, or one captured inference of it.
+
+    sites: S of them. labels: (E,) bool of a side (true: left), else coded: class numbers or quantities. episodes,
+    items, groups: (E,) identities. fold_of: (E,) outer fold. decisions: (S, E) out-of-fold decision values of a
+    side, else predicted class numbers or quantities. strengths: (S, F) chosen C of a logistic probe, λ of ridge.
+    null: (S, P) metric under label permutation. inner: (S, F, G) quality of every group in the inner folds of each
+    outer fold, the groups in the order of their names, 0 for the groups that the outer fold tests: of a side its
+    log-likelihood, else what the penalty is chosen by, above its mean over the permutations. parts: S times what
+    the site's stream is part of, see `Stream.part`; default by the stream's name. sample_scores: (S, E) held out,
+    None for a side, see `scores`. classes: their names, empty for a quantity. inferences: (E,) captured inference.
+    aligned: (E,) place behind the event where windows begin, None where they begin at the first inference.
+    smallest_p: no p can be lower.
     """
 
     sites: tuple[Site, ...]
-    labels: NDArray[np.bool_]
+    labels: NDArray[Any]
     episodes: NDArray[np.str_]
     items: NDArray[np.str_]
     groups: NDArray[np.str_]
     fold_of: NDArray[np.int64]
-    decisions: NDArray[np.float64]
-    strengths: NDArray[np.float64]
-    null: NDArray[np.float64]
+    decisions: Matrix
+    strengths: Matrix
+    null: Matrix
     inner: NDArray[np.float32]
     parts: tuple[str, ...] = ()
+    task: Task = "binary"
+    is_side: bool = True
+    classes: tuple[str, ...] = ("right", "left")
+    sample_scores: Matrix | None = None
+    inferences: NDArray[np.int64] | None = None
+    aligned: NDArray[np.int64] | None = None
+    smallest_p: float | None = None
 
     def __post_init__(self) -> None:
         if not self.parts:
             object.__setattr__(self, "parts", tuple(part_of(site.stream) for site in self.sites))
 
+    # -- scores -----------------------------------------------------------------------------------------------
+
     @property
     def correct(self) -> NDArray[np.bool_]:
-        """(S, E) whether each episode's held-out decision is right."""
+        """(S, E) whether each episode's held-out decision about its side is right."""
         return correctness(self.decisions, self.labels[None, :])
+
+    @cached_property
+    def scores(self) -> Matrix:
+        """(S, E) held-out scores, whose mean is the metric; of a side whether the decision is right."""
+        return self.correct.astype(np.float64) if self.sample_scores is None else self.sample_scores
+
+    @cached_property
+    def metric(self) -> Matrix:
+        """(S,) the metric that label permutations are compared with: of a side the accuracy, not balanced."""
+        metric: Matrix = self.scores.mean(axis=1)
+        return metric
+
+    @property
+    def null_mean(self) -> Matrix:
+        """(S,) mean metric under label permutation; NaN without any."""
+        return self.null.mean(axis=1) if self.null.shape[1] else np.full(len(self.sites), np.nan)
+
+    @property
+    def control_accuracy(self) -> Matrix:
+        """(S,) mean accuracy on the control task: random labels, consistent within an item. NaN without any."""
+        return self.null_mean
+
+    @property
+    def chance(self) -> Matrix:
+        """(S,) one half for a side, else the mean metric of the label permutations; NaN without any."""
+        return np.full(len(self.sites), CHANCE) if self.is_side else self.null_mean
 
     @cached_property
     def sums(self) -> GroupSums:
@@ -53,6 +102,85 @@ class ProbeCurve:
         Raises UnbalancedEpisodesError where a fold was trained on one side only.
         """
         return balanced_sums(self.decisions, self.labels, self.fold_of, self.groups)
+
+    @cached_property
+    def deviations(self) -> Matrix:
+        """(E,) squared deviations of quantities from the mean of their fold's training labels."""
+        return squared_deviations(self.labels, self.folds())
+
+    def estimate(self, rows: NDArray[np.intp]) -> tuple[float, tuple[float, float]]:
+        """Return the mean score of the sites at `rows` with its 95 % interval over groups.
+
+        Balanced between the sides of a picture.
+        """
+        if self.is_side:
+            sums = self.sums.only(rows)
+            accuracy = Accuracy(np.unique(self.groups), sums.sums.mean(axis=0), sums.sizes)
+            interval = accuracy.interval()
+            return accuracy.value, (interval.low, interval.high)
+        scores = self.scores[rows].mean(axis=0)
+        deviations = self.deviations if self.task == "continuous" else None
+        return float(scores.mean()), score_interval(scores, self.labels, self.groups, self.task, deviations)
+
+    @property
+    def widening(self) -> float:
+        """Factor of differences of scores under exchange: R² of groups that share a probe is not independent."""
+        return SHARED_PROBE if self.task == "continuous" else 1.0
+
+    def p_fwe(self) -> Matrix:
+        """(S,) family-wise p: each stream's sites are one family.
+
+        Chance of a target that is no side differs between sites, so the largest excess over a site's own mean
+        counts. The real labels take part in that mean, as each permutation does; only so is the p exact.
+        """
+        p = np.empty(len(self.sites))
+        for name in self.streams:
+            rows = self.stream(name)
+            every = np.column_stack([self.metric[rows], self.null[rows]])
+            if not self.is_side:
+                every -= every.mean(axis=1, keepdims=True)
+            p[rows] = max_statistic_p(every[:, 0], every[:, 1:])
+        return p
+
+    @property
+    def least_p(self) -> float:
+        """No p can be lower."""
+        return smallest_p(self.null.shape[1]) if self.smallest_p is None else self.smallest_p
+
+    # -- steps of an episode ----------------------------------------------------------------------------------
+
+    @property
+    def places(self) -> NDArray[np.int64]:
+        """(E,) the inference of each sample, or its place behind the event where windows begin."""
+        if self.aligned is not None:
+            return self.aligned
+        return np.zeros(self.labels.size, np.int64) if self.inferences is None else self.inferences
+
+    @property
+    def steps(self) -> NDArray[np.int64]:
+        """(W,) the different places, in order."""
+        return np.unique(self.places)
+
+    def step_scores(self, scores: Matrix) -> Matrix:
+        """Return (E,) scores whose mean over the samples of a step is the metric at that step.
+
+        scores: (E,) of one site. Classes are balanced within each step, over those that occur there. Weights of
+        the whole window would lift a step of rare classes above 1. Scores of a quantity stay.
+        """
+        if not self.classes:
+            return scores
+        balanced: Matrix = np.empty(scores.size)
+        for step in self.steps:
+            at_step = self.places == step
+            balanced[at_step] = (scores[at_step] > 0) * class_weights(self.labels[at_step])
+        return balanced
+
+    def by_step(self, scores: Matrix) -> Matrix:
+        """Return the (W,) metric of (E,) scores at each of the steps, see `step_scores`."""
+        balanced = self.step_scores(scores)
+        return np.array([balanced[self.places == step].mean() for step in self.steps])
+
+    # -- groups and folds -------------------------------------------------------------------------------------
 
     @property
     def n_groups(self) -> int:
@@ -64,71 +192,72 @@ class ProbeCurve:
         """The G names of the groups, in order."""
         return tuple(np.unique(self.groups).tolist())
 
-    def fit_stream(self, rows: NDArray[np.intp]) -> Stream:
-        """The sites at `rows`, which are one stream or a part of it, for cross-fitted scores.
+    def folds(self) -> list[Fold]:
+        """Return the outer folds."""
+        return split_by_fold(self.fold_of, [int(fold) for fold in np.unique(self.fold_of)])
 
-        Raises as `sums`, and as `Stream.of`.
-        """
-        sites = [self.sites[row] for row in rows]
-        return Stream.of(
-            self.sums.only(rows),
-            self.inner[rows],
-            fold_of_groups(self.fold_of, self.groups),
-            [site.layer for site in sites],
-            [site.iteration or 0 for site in sites],
-        )
+    # -- sites ------------------------------------------------------------------------------------------------
 
-    def nested_correct(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """(E,) whether decisions are right at the site of `rows` that is best in each outer fold's inner folds."""
-        best: NDArray[np.intp] = rows[self.fit_stream(rows).best]
-        right: NDArray[np.bool_] = self.correct[best[self.fold_of], np.arange(self.labels.size)]
-        return right
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """The streams that were probed, in order."""
+        return tuple(dict.fromkeys(site.stream for site in self.sites))
 
     def stream(self, name: str) -> NDArray[np.intp]:
-        """Positions of the sites of one stream."""
+        """Return the positions of the sites of one stream."""
         return np.flatnonzero([site.stream == name for site in self.sites])
+
+    def of_part(self, part: str) -> str | None:
+        """Return the first stream of a part of the model, `backbone` or `action`; None if none was probed."""
+        return next((site.stream for site, own in zip(self.sites, self.parts, strict=True) if own == part), None)
 
     @property
     def action_stream(self) -> str | None:
         """The stream the action is made in, None if none was probed."""
-        return self._first("action")
+        return self.of_part("action")
 
     @property
     def backbone_stream(self) -> str | None:
         """The stream of the vision-language model, None if none was probed."""
-        return self._first("backbone")
-
-    def _first(self, part: str) -> str | None:
-        return next((site.stream for site, own in zip(self.sites, self.parts, strict=True) if own == part), None)
+        return self.of_part("backbone")
 
     def best(self, stream: str) -> int:
-        """Position of the most accurate site of a stream, the first one on ties."""
+        """Return the position of the site of a stream with the largest metric, the first one on ties."""
         rows = self.stream(stream)
-        return int(rows[self.correct[rows].mean(axis=1).argmax()])
+        return int(rows[self.metric[rows].argmax()])
+
+    def largest_excess(self, rows: NDArray[np.intp]) -> int:
+        """Return which of some positions has the largest metric above its own chance, if it is known."""
+        chance = 0.0 if self.is_side else np.nan_to_num(self.chance[rows])
+        return int(rows[np.argmax(self.metric[rows] - chance)])
 
     def depth(self, site: Site) -> float:
         """Layer of `site` as a fraction of its stream: 0 enters the first block, 1 leaves the last."""
         last = max(other.layer for other in self.sites if other.stream == site.stream)
         return site.layer / max(1, last)
 
-    def p_fwe(self) -> NDArray[np.float64]:
-        """(S,) family-wise p: each stream's sites are one family."""
-        p = np.empty(len(self.sites))
-        accuracy = self.correct.mean(axis=1)
-        for name in {site.stream for site in self.sites}:
-            rows = self.stream(name)
-            p[rows] = max_statistic_p(accuracy[rows], self.null[rows])
-        return p
+    def fit_stream(self, rows: NDArray[np.intp]) -> Stream:
+        """Return the sites at `rows`, which are one stream or a part of it, for cross-fitted scores.
 
-    @property
-    def control_accuracy(self) -> NDArray[np.float64]:
-        """(S,) mean accuracy on the control task: random labels, consistent within an item. NaN without any."""
-        return self.null.mean(axis=1) if self.null.shape[1] else np.full(len(self.sites), np.nan)
+        Of a side their balanced accuracies, else their scores above the chance of each site. Raises as `sums`, and
+        as `Stream.of`.
+        """
+        sites = [self.sites[row] for row in rows]
+        return Stream.of(
+            self.sums.only(rows) if self.is_side else self._above_chance(rows),
+            self.inner[rows],
+            fold_of_groups(self.fold_of, self.groups),
+            [site.layer for site in sites],
+            [site.iteration or 0 for site in sites],
+        )
 
-    def folds(self) -> list[Fold]:
-        """The outer folds."""
-        return split_by_fold(self.fold_of, self._fold_names)
+    def _above_chance(self, rows: NDArray[np.intp]) -> GroupSums:
+        chance = np.nan_to_num(self.chance[rows])  # without permutations nothing is defined, and nothing is NaN
+        above = sums_by_group(self.scores[rows] - chance[:, None], self.groups)
+        return GroupSums(above, sums_by_group(np.ones(self.groups.size), self.groups))
 
-    @property
-    def _fold_names(self) -> list[int]:
-        return [int(fold) for fold in np.unique(self.fold_of)]
+    def nested_correct(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """(E,) whether decisions are right at the site of `rows` that is best in each outer fold's inner folds."""
+        best: NDArray[np.intp] = rows[self.fit_stream(rows).best]
+        right: NDArray[np.bool_] = self.correct[best[self.fold_of], np.arange(self.labels.size)]
+        return right

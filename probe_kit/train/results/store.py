@@ -4,6 +4,7 @@ Results are there when their settings are, which are written last, with the hash
 """
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from datetime import UTC, datetime
@@ -15,7 +16,8 @@ import numpy as np
 
 from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
 from probe_kit._system.csv_text import csv_of_frame
-from probe_kit.errors import NoProbesError, RunDamagedError
+from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
+from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.layout import PROBE_DIRECTIONS, PROBES
 from probe_kit.runs.results import (
@@ -28,17 +30,18 @@ from probe_kit.runs.results import (
 )
 from probe_kit.runs.store import Location, locate
 from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
-from probe_kit.train.choices import Target
-from probe_kit.train.data.captured_call import captured_calls, restrict_to_call
+from probe_kit.train.choices import SIDES
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_directions import StoredDirections, save_directions
 from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
-from probe_kit.train.settings import FORMAT, LABEL_FORMAT, ProbeSettings, key_of
+from probe_kit.train.settings import FORMAT, ProbeSettings
 
 SCORES, DECISIONS = "scores.csv", "decisions.npz"
 DIRECTIONS, CONTROLS = PROBE_DIRECTIONS, "controls.json"
+_TEXTS, _FACTS = ("parts", "classes"), ("task", "is_side", "smallest_p")
+"""Members of a curve that are tuples of texts, and those that are single values."""
 
 
 def save_results(results: ProbeResults, run: Path | Location, *, asked: bool = True) -> None:
@@ -50,18 +53,18 @@ def save_results(results: ProbeResults, run: Path | Location, *, asked: bool = T
     location = locate(run)
     if not is_stored(location, results.key):
         files = {SCORES: _scores(results), DECISIONS: _decisions(results), DIRECTIONS: _directions(results)}
-        head = {"settings": asdict(results.settings), "stamp": results.stamp}
+        head = {"settings": asdict(results.settings), "stamp": results.stamp, "left_out": dict(results.left_out)}
         times = {"created": results.created, "asked": _now() if asked else ""}
         write_bundle(location, PROBES, results.key, head, files | _controls(results), times)
         return
     stored = read_probes(location)
-    own, found = stored[results.key], _controls(results)
-    times = dict(own.times)
-    if asked and own.key != max(_ours(stored).values(), key=_rank).key:
+    bundle, controls = stored[results.key], _controls(results)
+    times = dict(bundle.times)
+    if asked and bundle.key != max(stored.values(), key=_rank).key:
         times["asked"] = _now()
-    if found or times != own.times:
-        files = {**found, SCORES: _scores(results)} if found else {}
-        write_bundle(location, PROBES, results.key, own.head, files, times)
+    if controls or times != bundle.times:
+        files = {**controls, SCORES: _scores(results)} if controls else {}
+        write_bundle(location, PROBES, results.key, bundle.head, files, times)
     else:
         tidy_bundle(location, PROBES, results.key)
 
@@ -83,7 +86,7 @@ def _directions(results: ProbeResults) -> bytes:
 
 
 def _controls(results: ProbeResults) -> dict[str, bytes]:
-    """The controls of the probes, as a file; nothing without controls."""
+    """Return the controls of the probes, as a file; nothing without controls."""
     if results.controls == Controls():
         return {}
     return {CONTROLS: json.dumps(results.controls.to_json(), indent=2).encode()}
@@ -94,41 +97,66 @@ def is_stored(run: Location, key: str) -> bool:
     return run.exists(f"{PROBES}/{key}/{HEAD}")
 
 
-def load_results(run: RunReader, key: str | None = None, target: Target = "correct") -> ProbeResults:
-    """The stored results called `key`, or else the newest for `target` on the episodes the run has now.
+def load_results(run: RunReader, key: str | None = None, target: str | None = None) -> ProbeResults:
+    """Return the stored results called `key`, or else the newest for `target` on the episodes the run has now.
 
-    The newest are of the first captured inference; those of later ones are read by their key.
+    target: a side, a built-in column, or one of a table; by default the correct side. The newest of a side are of
+    the first captured inference; those of later ones are read by their key.
 
     key: as `probe-kit run show` lists it; its beginning will do. Newest: those that were asked for last, whether
     they were fitted then or loaded. Raises NoProbesError if there are none, UsageError for a key that is not
-    there, and RunDamagedError if any results of the run were changed, lost their settings, have another format, or
-    are of other activations.
+    there or of another target, and RunDamagedError if any results of the run were changed, lost their settings,
+    have another format, or are of other activations.
     """
-    location = run.location
-    probes = read_probes(location)
-    stored = _ours(probes)
+    location, stored = run.location, read_probes(run.location)
     if key is not None:
-        return _read(run, probes[complete_key(key, stored, location, "probe results")])
-    asked = [(bundle, settings_of(bundle)) for bundle in stored.values()]
-    fitting = [(bundle, own) for bundle, own in asked if (own.target, own.call) == (target, 0)]
-    current = [bundle for bundle, own in fitting if is_current(own, run)]
-    if not current:
-        raise NoProbesError(_why_none(run, target, len(probes)))
-    return _read(run, max(current, key=_rank))
+        bundle = stored[complete_key(key, stored, location, "probe results")]
+        if target not in (None, probed := settings_of(bundle).target):
+            raise UsageError(
+                f"{location}: the probes {bundle.key} are of {probed!r}, not of {target!r}. Give their key with "
+                f"--target {probed}, or leave it out"
+            )
+        return _read(run, bundle)
+    target = target or "correct"
+    newest = {name: bundle for name, bundle in _current(run, stored).items() if _is_default(bundle, target)}
+    if not newest:
+        raise NoProbesError(_why_none(run, target, len(stored)))
+    return _read(run, max(newest.values(), key=_rank))
+
+
+def _is_default(bundle: Bundle, target: str) -> bool:
+    """Whether results are of a target, and of a side at its first captured inference."""
+    settings = settings_of(bundle)
+    return settings.target == target and not (settings.is_side and settings.call)
+
+
+def stored_targets(run: RunReader) -> dict[str, int]:
+    """Return the targets but sides that the run has probes of on its present episodes, in alphabetical order.
+
+    With each the number of different values that it had: every one of them was a test.
+    """
+    settings = [settings_of(bundle) for bundle in _current(run, read_probes(run.location)).values()]
+    versions = {(own.target, own.label) for own in settings if not own.is_side}
+    return dict(sorted(Counter(target for target, _ in versions).items()))
+
+
+def _current(run: RunReader, stored: Mapping[str, Bundle]) -> dict[str, Bundle]:
+    episodes = run.settings_sha256, episodes_sha256(run)
+    settings = {name: settings_of(bundle) for name, bundle in stored.items()}
+    return {name: stored[name] for name, own in settings.items() if (own.run_settings, own.episodes) == episodes}
 
 
 def is_current(settings: ProbeSettings, run: RunReader) -> bool:
     """Whether probes of these settings are of the episodes that the run has now."""
-    if settings.run_settings != run.settings_sha256 or settings.call >= max(captured_calls(run), 1):
-        return False
-    return settings.episodes == episodes_sha256(restrict_to_call(run, settings.call))
+    return (settings.run_settings, settings.episodes) == (run.settings_sha256, episodes_sha256(run))
 
 
-def _why_none(run: RunReader, target: Target, stored: int) -> str:
+def _why_none(run: RunReader, target: str, stored: int) -> str:
     if not run.streams:
         return f"{run.location} has no activations to probe: of {run.model!r} no stream was stored."
     others = f" (of {stored} stored, none: other episodes or another target)" if stored else ""
-    return f"{run.location} has no probes for target {target!r} on its episodes{others}. {how_to_probe(run)}"
+    advice = how_to_probe(run) if target in SIDES else f"Run `probe-kit train {run.location} --target {target}`."
+    return f"{run.location} has no probes for target {target!r} on its episodes{others}. {advice}"
 
 
 def how_to_probe(run: RunReader) -> str:
@@ -149,17 +177,8 @@ def how_to_probe(run: RunReader) -> str:
 
 
 def _rank(bundle: Bundle) -> tuple[str, str, str]:
-    """A key to sort by: the newest results have the highest."""
+    """Return a key to sort by: the newest results have the highest."""
     return bundle.times.get("asked", ""), bundle.times.get("created", ""), bundle.key
-
-
-def _ours(probes: Mapping[str, Bundle]) -> dict[str, Bundle]:
-    return {name: bundle for name, bundle in probes.items() if is_ours(bundle)}
-
-
-def is_ours(bundle: Bundle) -> bool:
-    """Whether stored probes are of sides, not of a label of one's own."""
-    return bool(bundle.head["settings"].get("format") == FORMAT)
 
 
 def _now() -> str:
@@ -167,16 +186,17 @@ def _now() -> str:
 
 
 def _pack(curves: Mapping[tuple[str, str], ProbeCurve]) -> dict[str, Any]:
-    """Arrays by `category/view/member`; views hold no slash."""
+    """Return arrays by `category/view/member`; views hold no slash."""
     return {
-        f"{category}/{view}/{member.name}": _as_array(getattr(curve, member.name))
+        f"{category}/{view}/{member.name}": _as_array(value)
         for (category, view), curve in curves.items()
         for member in fields(curve)
+        if (value := getattr(curve, member.name)) is not None
     }
 
 
 def _as_array(value: Any) -> Any:
-    return np.array([str(own) for own in value]) if isinstance(value, tuple) else value
+    return np.array([str(own) for own in value], str) if isinstance(value, tuple) else value
 
 
 def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
@@ -184,33 +204,29 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
     for name, value in arrays.items():
         category, view, member = name.rsplit("/", 2)
         members.setdefault((category, view), {})[member] = value
-    return {
-        pair: ProbeCurve(
-            **{
-                **found,
-                "sites": tuple(Site.parse(str(name)) for name in found["sites"]),
-                "parts": tuple(str(part) for part in found["parts"]),
-            }
-        )
-        for pair, found in members.items()
-    }
+    return {place: ProbeCurve(**_members(stored)) for place, stored in members.items()}
+
+
+def _members(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the members of a curve from their arrays."""
+    members = dict(stored)
+    members["sites"] = tuple(Site.parse(str(name)) for name in stored["sites"])
+    members |= {name: tuple(map(str, stored[name])) for name in _TEXTS}
+    return members | {name: stored[name].item() for name in _FACTS if name in stored}
 
 
 def read_probes(run: Location) -> dict[str, Bundle]:
-    """Every complete result by key, those of labels too.
-
-    Raises RunDamagedError for one that was changed or has another format.
-    """
-    found = read_bundles(run, PROBES)
-    for key, bundle in found.items():
-        if (own := key_of(bundle.head["settings"])) != key:
+    """Return every complete result by key. Raises RunDamagedError for a changed one or another format."""
+    bundles = read_bundles(run, PROBES)
+    for key, bundle in bundles.items():
+        if (own := sha256_json(bundle.head["settings"])[:12]) != key:
             raise bundle.head_damaged(f"has the settings of {own}")
-        bundle.check_format(FORMAT, LABEL_FORMAT)
-    return found
+        bundle.check_format(FORMAT)
+    return bundles
 
 
 def settings_of(bundle: Bundle) -> ProbeSettings:
-    """The settings of results of sides. Raises RunDamagedError."""
+    """Return the settings of stored results. Raises RunDamagedError."""
     stored = bundle.head["settings"]
     try:
         lists = {name: tuple(stored[name]) for name in ("categories", "views")}
@@ -220,7 +236,7 @@ def settings_of(bundle: Bundle) -> ProbeSettings:
 
 
 def read_controls(bundle: Bundle) -> Controls:
-    """The controls that results were compared with so far. Raises RunDamagedError."""
+    """Return the controls that results were compared with so far. Raises RunDamagedError."""
     if not bundle.has(CONTROLS):
         return Controls()
     try:
@@ -248,6 +264,7 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
         bundle.times.get("created", ""),
         _stamp(bundle),
         run.label,
+        dict(bundle.head.get("left_out", {})),
     )
 
 
@@ -264,10 +281,10 @@ def _check_foreign(run: RunReader, bundle: Bundle, settings: ProbeSettings) -> N
 
 
 def _stamp(bundle: Bundle) -> str:
-    """Hash of the commits that probes were fitted to; empty for arrays in memory."""
+    """Return the hash of the commits that probes were fitted to; empty for arrays in memory."""
     return str(bundle.head.get("stamp", ""))
 
 
 def stamp_of_run(run: RunReader) -> str:
-    """Hash of the commits of a run; empty for one whose settings are the hash of all its numbers."""
+    """Return the hash of the commits of a run; empty for one whose settings are the hash of all its numbers."""
     return str(getattr(run, "stamp", ""))

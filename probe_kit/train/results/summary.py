@@ -1,67 +1,170 @@
-"""Probe results in one line and as a notebook table."""
+"""Probe results for a terminal: the best site of each stream as a table, and in sentences."""
 
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit._terminal.notebook import rows_html
-from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.settings import ProbeSettings
+from probe_kit._system.counting import counted
+from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
+from probe_kit.hooks.contract.sites import label_of
+from probe_kit.suite.categories import category_of
+from probe_kit.train.crossval.task_scores import METRICS
+from probe_kit.train.results.best_sites import best_sites, score_text, site_cells
+from probe_kit.train.results.control_scores import ControlScore
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     import pandas as pd
 
-
-def results_text(settings: ProbeSettings, label: str) -> str:
-    """One line: what was probed, with how many label permutations, and the key."""
-    random = ", RANDOM WEIGHTS" if settings.random_weights else ""
-    return (
-        f"<ProbeResults {settings.key} of {label}{random}: {', '.join(settings.categories)}; "
-        f"views {', '.join(settings.views)}; target {settings.target}; call {settings.call}; "
-        f"{settings.permutations} label permutations>"
-    )
-
-
-def results_html(settings: ProbeSettings, label: str, scores: "pd.DataFrame") -> str:
-    """The best site of every category, view and stream."""
-    random = " (RANDOM WEIGHTS)" if settings.random_weights else ""
-    title = (
-        f"Probes of {label}{random}, target {settings.target}, call {settings.call}: the best site of "
-        "each stream, + as many others that tie"
-    )
-    columns = ("category", "view", "stream", *SITE_HEADINGS, "n")
-    note = (
-        f"{settings.permutations} label permutations, key {settings.key}; only p < {SIGNIFICANCE} is evidence. "
-        "results.scores has every site"
-    )
-    return rows_html(title, columns, [_cells(row) for _, row in best_sites(scores).iterrows()], note)
+_LEGEND = "+: as many other sites tie with it. The score of a chosen site is too high"
+_OF_SIDE = "; `retention` corrects it"
+_OF_LABEL = ". Chance: mean score of this site with exchanged labels"
+_SIDES = {
+    "correct": "the side of the correct picture",
+    "chosen": "the chosen side",
+    "shuffled": "the shuffled side",
+}
 
 
-def best_sites(scores: "pd.DataFrame") -> "pd.DataFrame":
-    """The first of the best sites of every category, view and stream, in order.
+# -- the table of a terminal -----------------------------------------------------------------------------------
 
-    Besides the columns of `scores`: `ties`, how many other sites are as good, and `first`, the best accuracy at
-    the stream's first iteration, NaN where it runs once.
+
+def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> ResponsiveTable:
+    """Return a row per category, stream, view and captured inference, and per control of a target that is no side.
+
+    fitted: probes of one target in a run, one per inference. Controls of a side are in the table with `splits`.
     """
-    names = ["category", "view", "stream"]
-    by_stream = scores.groupby(names, sort=False)
-    best = by_stream["accuracy"].transform("max")
-    begins = scores["iteration"].eq(by_stream["iteration"].transform("min")).fillna(False).astype(bool)
-    found = scores.assign(ties=scores["accuracy"] == best, first=scores["accuracy"].where(begins))
-    by_stream = found.groupby(names, sort=False)
-    found = found.assign(ties=by_stream["ties"].transform("sum") - 1, first=by_stream["first"].transform("max"))
-    return found.loc[by_stream["accuracy"].idxmax()]
+    first, several_calls = fitted[0].settings, len(fitted) > 1
+    several_views, metric = len(first.views) > 1, "accuracy %" if first.is_side else METRICS[first.task]
+    names, cells = [], []
+    for results in fitted:
+        call = [f"call {results.settings.call}"] * several_calls
+        for row in _best(results):
+            view = [str(row["view"])] * several_views
+            names.append(" · ".join([_name(results, row["category"], row["stream"]), *view, *call]))
+            cells.append(_cells(results, row))
+        for control in results.controls.scores if splits or not first.is_side else ():
+            view = [control.view] * (several_views and bool(control.view))
+            where = _name(results, control.category, control.stream)
+            names.append(" · ".join(filter(None, [f"control {control.name}", where, *view, *call])))
+            cells.append(_control_cells(control, first.is_side))
+    headings = ("best site", f"{metric} [95 %]", "chance", "family-wise p", "exceeds", "n", "first iteration")
+    return ResponsiveTable(
+        title=", ".join(_title(fitted, several_views)),
+        caption=_LEGEND + (_OF_SIDE if first.is_side else _OF_LABEL),
+        name="category" if first.is_side else "stream",
+        names=tuple(names),
+        styles=("",) * len(names),
+        parts=(Part("Best sites", headings, tuple(tuple(map(Cell, row)) for row in cells)),),
+        splits=splits,
+    )
 
 
-def site_cells(row: "pd.Series") -> tuple[str, str, str, str]:
-    """A row of `best_sites` as text: the site with its ties, accuracy, first iteration, p; a dash for none."""
-    accuracy, low, high = (f"{100 * row[name]:.1f}" for name in ("accuracy", "ci_low", "ci_high"))
-    site = f"{row['site']} +{row['ties']}" if row["ties"] else str(row["site"])
-    first = "–" if row["first"] != row["first"] else f"{100 * row['first']:.1f}"
-    p = "–" if row["p_fwe"] != row["p_fwe"] else f"{row['p_fwe']:.3f}"
-    return site, f"{accuracy} [{low}, {high}]", first, p
+def _title(fitted: Sequence[ProbeResults], several_views: bool) -> Iterator[str]:
+    own = fitted[0].settings
+    yield f"{own.target}: best site per stream" if not own.is_side else "Best site per stream"
+    if not own.is_side:
+        yield own.task
+    if not several_views:
+        yield f"view {own.views[0]}"
+    if len(fitted) == 1 and own.window == 1:
+        yield f"call {own.call}"
+    if own.align_to:
+        yield f"from {own.align_to.partition('#')[0]} on"
+    if own.random_weights:
+        yield "RANDOM WEIGHTS"
 
 
-SITE_HEADINGS = ("best site", "accuracy % [95 %]", "first iteration %", "family-wise p")
+def _name(results: ProbeResults, category: str, stream: str) -> str:
+    """Return the category, and for a target that is no side the stream."""
+    if results.settings.is_side:
+        return str(category)
+    pooled = results.settings.categories == ("all",)
+    return " · ".join(filter(None, ["" if pooled else str(category), label_of(stream) if stream else ""]))
 
 
-def _cells(row: "pd.Series") -> tuple[str, ...]:
-    return row["category"], row["view"], row["stream"], *site_cells(row), str(row["n"])
+def _cells(results: ProbeResults, row: "pd.Series") -> tuple[str, ...]:
+    met, missed = _exceeded(results, row)
+    exceeds = "; ".join([", ".join(met)] * bool(met) + [f"not shown: {', '.join(missed)}"] * bool(missed))
+    return *site_cells(row, results.settings.is_side), exceeds or "–", str(row["n"]), _first(results, row)
+
+
+def _best(results: ProbeResults) -> "list[pd.Series]":
+    return best_sites(results.scores, results.settings.is_side)
+
+
+def _first(results: ProbeResults, row: "pd.Series") -> str:
+    return score_text(row["first"], results.settings.is_side)
+
+
+def _control_cells(control: ControlScore, is_side: bool) -> tuple[str, ...]:
+    score, low, high, chance = (
+        score_text(value, is_side) for value in (control.score, *control.ci, control.chance)
+    )
+    p = "–" if control.p is None else f"{control.p:.3f} (this control alone)"
+    return "", f"{score} [{low}, {high}]", chance, p, "", str(control.n), ""
+
+
+def _exceeded(results: ProbeResults, row: "pd.Series") -> tuple[list[str], list[str]]:
+    """The controls that a site is shown to exceed, and those that it is not shown to exceed; chance among them."""
+    exceeds = results.controls.exceeds(row["category"], row["view"], row["site"], row["p_fwe"])
+    return [name for name in exceeds if exceeds[name]], [name for name in exceeds if exceeds[name] is False]
+
+
+# -- sentences -------------------------------------------------------------------------------------------------
+
+
+def best_sites_sentences(results: ProbeResults) -> list[str]:
+    """Return what was left out, then where the target can be decoded: a sentence per category and view.
+
+    Of a side the first view alone, and whether the pictures alone decode it.
+    """
+    own = results.settings
+    sentences = [f"left out: {count} {reason}" for reason, count in results.left_out.items()]
+    sentences += [f"control {name} was not run: {reason}" for name, reason in results.controls.left_out.items()]
+    rows = _best(results)
+    for view in own.views[:1] if own.is_side else own.views:
+        for category in dict.fromkeys(str(row["category"]) for row in rows):
+            of_place = [row for row in rows if (row["category"], row["view"]) == (category, view)]
+            parts = "; ".join(_in_stream(results, row) for row in of_place)
+            pictures = _from_pictures(results, category) if own.is_side else ""
+            sentences.append(f"{_subject(results, category, view, of_place[0])} is {parts}.{pictures}")
+    return sentences
+
+
+def _subject(results: ProbeResults, category: str, view: str, row: "pd.Series") -> str:
+    own = results.settings
+    if own.is_side:
+        return f"{category_of(category).title} ({counted(row['n'], 'episode')}): {_SIDES[own.target]}"
+    facts = [counted(row["groups"], "group"), counted(row["n"], "sample")]
+    facts += [f"category {category}"] * (own.categories != ("all",)) + [f"view {view}"] * (len(own.views) > 1)
+    return f"{own.target} ({', '.join(facts)})"
+
+
+def _in_stream(results: ProbeResults, row: "pd.Series") -> str:
+    where, numbers = f"in the {label_of(row['stream'])}", _numbers(results, row)
+    met, missed = _exceeded(results, row)
+    if "chance" not in (*met, *missed):
+        return f"not tested {where} {numbers}" + (": fit with permutations" if results.settings.is_side else "")
+    if missed:
+        beyond = " and ".join(filter(None, [", ".join(missed[:-1]), missed[-1]]))
+        return f"not shown {where} beyond {beyond} {numbers}"
+    return f"decodable {where} at {row['site']} {numbers}"
+
+
+def _numbers(results: ProbeResults, row: "pd.Series") -> str:
+    limits = (row["score"], row["ci_low"], row["ci_high"])
+    if results.settings.is_side:
+        accuracy, low, high = (f"{100 * value:.0f}" for value in limits)
+        return f"({accuracy} %, {low} to {high})"
+    score, low, high = (f"{value:.2f}" for value in limits)
+    chance = "" if row["chance"] != row["chance"] else f"; chance {row['chance']:.2f}"
+    return f"({row['metric']} {score}, {low} to {high}{chance})"
+
+
+def _from_pictures(results: ProbeResults, category: str) -> str:
+    """Return a sentence where the control `pixels` decodes the target, for no model has to know it then."""
+    pixels = results.controls.of_category(category).get("pixels")
+    if pixels is None or not pixels.above_chance:
+        return ""
+    accuracy, low, high = (f"{100 * share:.0f}" for share in (pixels.score, *pixels.ci))
+    return f" The pictures alone decode it too ({accuracy} %, {low} to {high})."

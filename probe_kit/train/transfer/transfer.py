@@ -1,6 +1,6 @@
 """Probes fitted on all of one run and scored on another: `transfer_probes`."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,19 +11,21 @@ from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import SettingsMismatchError, TooFewGroupsError, UsageError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.statistics.folds import OUTER_FOLDS, Fold
+from probe_kit.train.choices import Task
 from probe_kit.train.crossval.nested_folds import NestedFold
+from probe_kit.train.crossval.site_probe import predict_once, probe_labels
+from probe_kit.train.crossval.task_scores import balanced_scores
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.data.samples import sites_of
-from probe_kit.train.labels.label_probe import predict_once
-from probe_kit.train.labels.label_problem import LabelProblem, label_problem
-from probe_kit.train.labels.label_results import LabelCurve
-from probe_kit.train.labels.label_sweep import check_label_run
-from probe_kit.train.labels.labelled_samples import LabelledSamples, labelled_samples
-from probe_kit.train.labels.labels import Labels
-from probe_kit.train.labels.task_scores import balanced_scores
+from probe_kit.train.data.samples import Samples, read_samples, sites_of
+from probe_kit.train.execution import ExecutionSettings
+from probe_kit.train.probe_sweep import TOKEN_PERMUTATIONS, Progress, Sweep, check_options
+from probe_kit.train.problem import Problem, least_p, make_problem
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.solver.row_subset import RowSubset
+from probe_kit.train.target import Target
+from probe_kit.train.target_samples import EVERYWHERE, TargetSamples
 from probe_kit.train.transfer.transfer_results import TransferCurve, TransferResults
 
-Progress = Callable[[int, int, str], None]
 Matrix = NDArray[np.float64]
 _DIGITS = 12
 """Of a suite's hash, in its identity."""
@@ -32,13 +34,14 @@ _DIGITS = 12
 def transfer_probes(
     run: RunReader,
     other: RunReader,
-    labels: Labels,
-    other_labels: Labels,
+    target: Target | str,
+    other_target: Target | str | None = None,
     categories: Sequence[str] | None = None,
     views: Sequence[str] = ("mean",),
     *,
     window: int | None = None,
     permutations: int = 200,
+    token_permutations: int = TOKEN_PERMUTATIONS,
     call: int = 0,
     seed: int = 0,
     across_weights: bool = False,
@@ -46,59 +49,66 @@ def transfer_probes(
 ) -> TransferResults:
     """Fit every site's probe on all of `run`, and score it on `other`; nothing is stored.
 
-    λ or C is chosen by five folds of the groups of `run`; no label of `other` takes part in a fit. Groups of
-    `other` that `run` has too are left out, see `shared_groups`. The null exchanges labels between groups of
-    `other`. Besides: the same probe after the features of `other` are moved to the mean of `run`, and the
-    cross-validated score of `other` itself on the same samples.
-    labels, other_labels: of either run, of one `Labels.definition`. across_weights: allow two networks; sites and
-    widths must still be equal. Others: as in `train_label_probes`, for both runs.
-    Raises SettingsMismatchError for other weights, sites or label definitions, TooFewGroupsError where too few
-    groups are not shared, and what `train_label_probes` raises.
+    C or λ is chosen by five folds of the groups of `run`; no label of `other` takes part in a fit. Groups of
+    `other` that `run` has too are left out, see `shared_groups`. The null permutes the labels of `other`. Besides:
+    the same probe after the features of `other` are moved to the mean of `run`, and the cross-validated score of
+    `other` itself on the same samples.
+    target, other_target: of either run, of one `Target.definition`; other_target: by default the same side or
+    built-in column. categories: pooled, by default all. across_weights: allow two networks; sites and widths must
+    still be equal. Others: as in `train_probes`, for both runs.
+    Raises SettingsMismatchError for other weights, sites or definitions, TooFewGroupsError where too few
+    groups are not shared, and what `train_probes` raises.
     """
-    for one in (run, other):
-        check_label_run(one, categories, views, permutations)
+    check_options(views, permutations, token_permutations)
+    options: dict[str, Any] = {"views": views, "seed": seed, "call": call}
+    pooled = categories or (EVERYWHERE,)
+    of_other = target if other_target is None else other_target
+    side = Sweep.of(run, target, pooled, ExecutionSettings(), None, window=window, permutations=0, **options)
+    own_window = side.samples.window if side.target.per_step else None
+    options |= {"permutations": permutations, "token_permutations": token_permutations, "window": own_window}
+    other_side = Sweep.of(other, of_other, pooled, ExecutionSettings(), None, **options)
     _check_alike(run, other, views, across_weights)
-    train = _fitted_side(run, labels, categories, call, window, seed)
-    if labels.definition != other_labels.definition:
+    train = make_problem(run, side.target, side.samples, EVERYWHERE, side.settings)
+    if side.target.definition != other_side.target.definition:
         raise SettingsMismatchError(
-            f"the label of {run.location} is {labels.described}, that of {other.location} is "
-            f"{other_labels.described}; expected one definition. Give both the same column and task"
+            f"the label of {run.location} is {side.target.described}, that of {other.location} is "
+            f"{other_side.target.described}; expected one definition. Give both the same column and task"
         )
-    own_window = train.samples.window if labels.per_step else None
-    samples = labelled_samples(other, other_labels, categories, call, own_window)
-    other_labels, _ = other_labels.on(other)
-    samples, shared = _unshared(run, train.samples, other, samples, labels.group_by)
-    test = label_problem(other, other_labels, samples, permutations, seed)
+    samples, shared = _unshared(run, train.samples, other, other_side.samples, side.target.group_by)
+    test = make_problem(other, other_side.target, samples, EVERYWHERE, other_side.settings)
     code = _codes(train.classes, test.classes)
     keys = [(view, site) for view in views for site in sites_of(other, view)]
     progress = progress or notebook_progress("sites")
-    found: dict[tuple[str, Site], _Transferred] = {}
+    transferred: dict[tuple[str, Site], _Transferred] = {}
     for view, site in keys:
-        here, there = train.samples.features(run, view, site), samples.features(other, view, site)
-        found[view, site] = _transfer(train, here, test, there, code)
+        own, others = (
+            read_samples(source, view, site, rows.rows, rows.inferences)
+            for source, rows in ((run, train.samples), (other, samples))
+        )
+        transferred[view, site] = _transfer(train, own, test, others, code)
         if progress is not None:
-            progress(len(found), len(keys), f"{site} {view}")
+            progress(len(transferred), len(keys), f"{site} {view}")
     return TransferResults(
         model=run.label,
         other_model=other.label,
         same_weights=_same_weights(run, other),
-        target=labels.target,
-        task=labels.task,
-        definition=labels.definition,
+        target=side.target.name,
+        task=side.target.task,
+        definition=side.target.definition,
         classes=test.classes,
         labels=samples.values,
-        episodes=other.episodes["episode_id"].to_numpy(dtype=str)[samples.rows],
+        episodes=test.episodes,
         inferences=samples.inferences.astype(np.int64),
         groups=samples.groups,
-        curves={view: _curve(other, [site for own, site in keys if own == view], view, found) for view in views},
-        smallest_p=test.smallest_p,
+        curves={view: _curve(other, test, view, transferred) for view in views},
+        smallest_p=least_p(test.labels, test.permuted_labels),
         trained_on={"samples": train.samples.rows.size, "groups": np.unique(train.samples.groups).size},
         left_out={**samples.left_out, **({"groups that both runs have": shared} if shared else {})},
     )
 
 
 def shared_groups(
-    run: RunReader, samples: LabelledSamples, other: RunReader, others: LabelledSamples, group_by: str | None
+    run: RunReader, samples: TargetSamples, other: RunReader, others: TargetSamples, group_by: str | None
 ) -> NDArray[np.str_]:
     """Names of the groups of `others` that `samples` has too.
 
@@ -106,14 +116,14 @@ def shared_groups(
     or of selections of one suite. Also those with an item whose id and content are in both.
     """
     names = np.unique(others.groups)
-    found = np.zeros(names.size, bool)
+    in_both = np.zeros(names.size, bool)
     if group_by is not None or _sources(run) & _sources(other):
-        found |= np.isin(names, samples.groups)
-    here, there = _contents(run, samples), _contents(other, others)
-    both = set(here.values()) & set(there.values())
+        in_both |= np.isin(names, samples.groups)
+    contents, other_contents = _contents(run, samples), _contents(other, others)
+    both = set(contents.values()) & set(other_contents.values())
     group_of = dict(zip(others.rows.tolist(), others.groups.tolist(), strict=True))
-    found |= np.isin(names, [group_of[row] for row, content in there.items() if content in both])
-    shared: NDArray[np.str_] = names[found]
+    in_both |= np.isin(names, [group_of[row] for row, content in other_contents.items() if content in both])
+    shared: NDArray[np.str_] = names[in_both]
     return shared
 
 
@@ -124,7 +134,7 @@ def _sources(run: RunReader) -> set[str]:
     return {name for name in (run.suite, digest[:_DIGITS], (parent or "")[:_DIGITS]) if name}
 
 
-def _contents(run: RunReader, samples: LabelledSamples) -> dict[int, tuple[str, str]]:
+def _contents(run: RunReader, samples: TargetSamples) -> dict[int, tuple[str, str]]:
     """Item id and content hash by row of the episodes; empty where the run has no items."""
     items = getattr(run, "items", None)
     if items is None or "item_id" not in run.episodes or "content_sha256" not in items:
@@ -162,28 +172,20 @@ def _same_weights(run: RunReader, other: RunReader) -> bool:
     return run.weights_sha256 is not None and run.weights_sha256 == other.weights_sha256
 
 
-def _fitted_side(
-    run: RunReader, labels: Labels, categories: Sequence[str] | None, call: int, window: int | None, seed: int
-) -> LabelProblem:
-    samples = labelled_samples(run, labels, categories, call, window)
-    labels, _ = labels.on(run)
-    return label_problem(run, labels, samples, 0, seed)
-
-
 def _unshared(
-    run: RunReader, here: LabelledSamples, other: RunReader, there: LabelledSamples, group_by: str | None
-) -> tuple[LabelledSamples, int]:
+    run: RunReader, samples: TargetSamples, other: RunReader, others: TargetSamples, group_by: str | None
+) -> tuple[TargetSamples, int]:
     """The samples in groups that `run` does not have, and how many groups are left out."""
-    shared = shared_groups(run, here, other, there, group_by)
-    kept = ~np.isin(there.groups, shared)
-    left = np.unique(there.groups[kept]).size
+    shared = shared_groups(run, samples, other, others, group_by)
+    unshared = ~np.isin(others.groups, shared)
+    left = np.unique(others.groups[unshared]).size
     if left < OUTER_FOLDS:
         raise TooFewGroupsError(
-            f"{shared.size} of the {np.unique(there.groups).size} groups of {other.location} are in "
+            f"{shared.size} of the {np.unique(others.groups).size} groups of {other.location} are in "
             f"{run.location} too, which leaves {left}; expected at least {OUTER_FOLDS} to score "
             "on. Give a run of other items or episodes"
         )
-    return there.of(kept), int(shared.size)
+    return others.of(unshared), int(shared.size)
 
 
 def _codes(classes: Sequence[str], others: Sequence[str]) -> Matrix | None:
@@ -200,42 +202,54 @@ def _codes(classes: Sequence[str], others: Sequence[str]) -> Matrix | None:
 
 @dataclass(frozen=True)
 class _Transferred:
-    """Of one site. plain, moved: (m,) predictions as fitted, and on recentred features. own: (m,) scores."""
+    """One site. plain, moved: (m,) predictions as fitted, and on recentred features. own: (m,) scores."""
 
     plain: Matrix
     moved: Matrix
     scores: tuple[Matrix, Matrix]
     null: tuple[Matrix, Matrix]
     own: Matrix
-    penalty: float
+    strength: float
 
 
-def _transfer(
-    train: LabelProblem, here: NDArray[Any], test: LabelProblem, there: NDArray[Any], code: Matrix | None
-) -> _Transferred:
-    shift = here.mean(axis=0, dtype=np.float64) - there.mean(axis=0, dtype=np.float64)
-    features = np.concatenate([here, there, (there + shift).astype(here.dtype)])
+def _transfer(train: Problem, own: Samples, test: Problem, others: Samples, code: Matrix | None) -> _Transferred:
+    count, other_count = own.counts.size, others.counts.size
+    samples = Samples.joined([own, others, _recentred(others, own)])
     fold = NestedFold(
-        Fold(np.arange(len(here)), np.arange(len(here), len(features))), [fold.outer for fold in train.folds]
+        Fold(np.arange(count), np.arange(count, count + 2 * other_count)), [fold.outer for fold in train.folds]
     )
-    blank = np.zeros(len(features))  # in place of the other run's labels, which no fit may see
-    blank[: len(here)] = train.samples.values
-    predicted, penalty = predict_once(features, blank, train.task, fold)
+    blank = np.zeros(count + 2 * other_count)  # in place of the other run's labels, which no fit may see
+    blank[:count] = train.labels
+    predicted, strength = predict_once(samples, blank, train.task, fold)
     if code is not None:
         predicted = code[predicted.astype(np.intp)]
-    plain, moved = predicted[: len(there)], predicted[len(there) :]
-    of_plain, of_moved = (_scores(one, test) for one in (plain, moved))
-    own = test.score(there).scores
-    return _Transferred(plain, moved, (of_plain[0], of_moved[0]), (of_plain[1], of_moved[1]), own, penalty)
+    plain, moved = predicted[:other_count], predicted[other_count:]
+    permuted = test.permuted_labels if others.pools else test.permuted_labels[:, : test.token_permutations]
+    truth = np.column_stack([test.labels, permuted]).astype(np.float64)
+    of_plain, of_moved = (_scores(one, truth, test.task) for one in (plain, moved))
+    scores = probe_labels(others, truth[:, :1], test.task, test.folds).scores
+    return _Transferred(
+        plain, moved, (of_plain[0], of_moved[0]), (of_plain[1], of_moved[1]), scores, strength
+    )  # fmt: skip
 
 
-def _scores(predicted: Matrix, test: LabelProblem) -> tuple[Matrix, Matrix]:
-    """(m,) scores of the real labels, and (P,) the metric of every exchange.
+def _recentred(others: Samples, own: Samples) -> Samples:
+    """Return the samples of the other run, moved to the mean of the first run's."""
+    means, own_means = (np.asarray(samples.means) for samples in (others, own))
+    shift = own_means.mean(axis=0, dtype=np.float64) - means.mean(axis=0, dtype=np.float64)
+    features = others.read()
+    moved = (features + shift).astype(features.dtype)
+    if others.pools:
+        return Samples.pooled(moved)
+    return Samples(RowSubset.all(moved), others.counts, means + shift)
+
+
+def _scores(predicted: Matrix, truth: Matrix, task: Task) -> tuple[Matrix, Matrix]:
+    """(m,) scores of the real labels, and (P,) the metric of every permutation, from (m, 1 + P) labels.
 
     R² compares with the mean of the other run's labels, as scikit-learn's `r2_score` does.
     """
-    truth = test.columns
-    if test.task == "continuous":
+    if task == "continuous":
         scores = 1 - (truth - predicted[:, None]) ** 2 / truth.var(axis=0)
     else:
         scores = balanced_scores(np.repeat(predicted[:, None], truth.shape[1], axis=1), truth)
@@ -243,20 +257,27 @@ def _scores(predicted: Matrix, test: LabelProblem) -> tuple[Matrix, Matrix]:
 
 
 def _curve(
-    run: RunReader, sites: Sequence[Site], view: str, found: dict[tuple[str, Site], _Transferred]
+    run: RunReader, test: Problem, view: str, transferred: dict[tuple[str, Site], _Transferred]
 ) -> TransferCurve:
-    own = [found[view, site] for site in sites]
-    parts = tuple(str(run.streams[site.stream].part) for site in sites)
-    penalties = np.array([[one.penalty] for one in own])
+    of_view = {site: one for (name, site), one in transferred.items() if name == view}
+    own = list(of_view.values())
     plain, moved = (
-        LabelCurve(
-            tuple(sites),
-            parts,
-            np.stack([(one.plain, one.moved)[at] for one in own]),
-            np.stack([one.scores[at] for one in own]),
-            np.stack([one.null[at] for one in own]),
-            penalties,
-            np.zeros((len(own), 0, 0), np.float32),
+        ProbeCurve(
+            sites=tuple(of_view),
+            labels=test.labels,
+            episodes=test.episodes,
+            items=test.items,
+            groups=test.groups,
+            fold_of=test.fold_of,
+            decisions=np.stack([(one.plain, one.moved)[at] for one in own]),
+            strengths=np.array([[one.strength] for one in own]),
+            null=np.stack([one.null[at] for one in own]),
+            inner=np.zeros((len(own), 0, 0), np.float32),
+            parts=tuple(str(run.streams[site.stream].part) for site in of_view),
+            task=test.task,
+            is_side=False,
+            classes=test.classes,
+            sample_scores=np.stack([one.scores[at] for one in own]),
         )
         for at in (0, 1)
     )

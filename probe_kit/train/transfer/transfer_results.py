@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.train.choices import Task
-from probe_kit.train.labels.label_results import METRICS, LabelCurve, score_interval
+from probe_kit.train.crossval.task_scores import METRICS, score_interval
+from probe_kit.train.results.probe_curve import ProbeCurve
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,8 +27,8 @@ class TransferCurve:
     mean of the first. own: (S, m) held-out scores of probes of the other run itself.
     """
 
-    fitted: LabelCurve
-    recentred: LabelCurve
+    fitted: ProbeCurve
+    recentred: ProbeCurve
     own: Matrix
 
 
@@ -66,7 +67,7 @@ class TransferResults:
     def scores(self) -> "pd.DataFrame":
         """One row per view and site.
 
-        `score`, `ci_low`, `ci_high`, `chance`, `p`, `p_fwe`: as in `LabelResults.scores`, on the other run.
+        `score`, `ci_low`, `ci_high`, `chance`, `p`, `p_fwe`: as in `ProbeResults.scores`, on the other run.
         `recentred`, `recentred_chance`, `recentred_p_fwe`: the same on features moved to the first run's mean.
         `own`, `own_ci_low`, `own_ci_high`: cross-validated score of the other run itself. `penalty`: λ, or 1 / C.
         """
@@ -108,7 +109,9 @@ class TransferResults:
                     "own": float(curve.own[row].mean()),
                     "own_ci_low": own_low,
                     "own_ci_high": own_high,
-                    "penalty": float(fitted.penalties[row, 0]),
+                    "penalty": float(
+                        (1 / fitted.strengths if self.task == "binary" else fitted.strengths)[row, 0]
+                    ),
                     "n": self.labels.size,
                     "groups": np.unique(self.groups).size,
                 }

@@ -6,7 +6,7 @@ from probe_kit._system.counting import counted
 from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.labels.label_results import METRICS
+from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.transfer.transfer_results import TransferResults
 
 if TYPE_CHECKING:

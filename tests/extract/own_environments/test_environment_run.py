@@ -13,8 +13,8 @@ from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.runs.store import locate
-from probe_kit.train import Labels, train_probes
-from probe_kit.train.labels.builtin_columns import label_frame
+from probe_kit.train import Target, train_probes
+from probe_kit.train.columns.builtin import label_frame
 from tests.support.made_once import made_once
 
 HOME = "reach_env:"
@@ -59,18 +59,18 @@ def test_facts_are_labels_and_a_run_without_sides_refuses_them(played: Run, tmp_
     assert not [name for name in table if str(name).startswith(("sim.", "item.", "dataset."))]
     file = tmp_path / "labels.csv"
     table.assign(away=table["env.block"] - table["env.state.1"]).to_csv(file, index=False)
-    labels = Labels.read(file, "away")
-    results = train_probes(played, labels=labels, permutations=9, controls=("state", "instruction"))
+    labels = Target.read(file, "away")
+    results = train_probes(played, target=labels, permutations=9, controls=("state", "instruction"))
     assert results.settings.task == "continuous"
-    assert len(set(results.groups)) == 6
+    assert len(set(results.curves["all", "mean"].groups)) == 6
     assert np.isfinite(results.scores["score"]).all()
-    assert Labels.of_run(played, "env.block").task == "continuous"
-    for own in (Labels.of_run(played, "env.left"), Labels.read(file, "env.left")):
+    assert Target.of_run(played, "env.block").task == "continuous"
+    for own in (Target.of_run(played, "env.left"), Target.read(file, "env.left")):
         assert (own.task, own.coded.classes) == ("binary", ("False", "True")), "a fact that is true or false"
     with pytest.raises(UsageError, match=r"plays an environment of your own .* a retention table is not possible"):
         retention_table([played])
     with pytest.raises(UsageError, match=r"no column env\.absent; there are: env\.block"):
-        Labels.of_run(played, "env.absent")
+        Target.of_run(played, "env.absent")
 
 
 def check_equal(some: Run, played: Run, rows: list[int]) -> None:

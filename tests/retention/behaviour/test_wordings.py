@@ -12,7 +12,7 @@ from probe_kit.retention.columns.comparisons import wording_tables
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.pairing import compare_wordings
 from probe_kit.train import ArrayRun
-from probe_kit.train.data.labels import target_labels
+from probe_kit.train.data.run_reader import check_several_wordings
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def test_several_categories_have_a_mean(ladder):
 
 
 def test_success_rates_and_probes_take_one_wording(ladder):
-    for measure in (success_rate, lambda episodes: target_labels(episodes, "correct", 0)):
+    for measure in (success_rate, check_several_wordings):
         with pytest.raises(UsageError, match=r"several wordings \(knowledge, named, side\)"):
             measure(ladder)
         measure(ladder[ladder["wording"] == "side"])

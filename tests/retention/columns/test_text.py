@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from probe_kit.retention import RetentionTable, retention_table
-from probe_kit.train import ArrayRun, BaselineScore, Controls, UntrainedScore, load_results, save_results
+from probe_kit.train import ArrayRun, Controls, ControlScore, UntrainedScore, load_results, save_results
 
 
 @pytest.fixture
@@ -17,8 +17,8 @@ def table(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
     sites = ("backbone.01.residual", "expert.01.residual@0")
     controls = Controls(
         (
-            BaselineScore("pixels", "color", 0.75, (0.7, 0.8), 0.005, 0.5, 200),
-            BaselineScore("instruction", "color", 0.51, (0.45, 0.57), 0.4, 0.5, 200),
+            ControlScore("pixels", "color", 0.75, (0.7, 0.8), 0.005, 0.5, 200),
+            ControlScore("instruction", "color", 0.51, (0.45, 0.57), 0.4, 0.5, 200),
         ),
         tuple(
             UntrainedScore(

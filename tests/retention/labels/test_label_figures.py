@@ -28,7 +28,7 @@ from probe_kit.retention.displays.labels import (
 from probe_kit.retention.displays.labels.figures import file_names
 from probe_kit.retention.report import report_html
 from probe_kit.runs import Run, open_run
-from probe_kit.train import LabelResults, Labels, load_label_results, train_probes
+from probe_kit.train import ProbeResults, Target, load_results, train_probes
 from tests.support.recorded_run import write_recorded_run
 
 
@@ -45,22 +45,22 @@ def run(labelled_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     shutil.copytree(labelled_run, folder)
     run = open_run(folder)
     for target, permutations in (("sim.tool_y", 39), ("sim.phase", 0)):  # every episode has the same phases
-        labels = Labels.of_run(run, target)
-        train_probes(run, labels=labels, permutations=permutations, controls=("step", "state", "instruction"))
-    train_probes(run, labels=kinds(run), permutations=39, controls=("instruction",))
+        labels = Target.of_run(run, target)
+        train_probes(run, target=labels, permutations=permutations, controls=("step", "state", "instruction"))
+    train_probes(run, target=kinds(run), permutations=39, controls=("instruction",))
     return run
 
 
-def kinds(run: Run) -> Labels:
+def kinds(run: Run) -> Target:
     """Three classes, the same for both layouts of an item."""
     frame = pd.DataFrame({"episode_id": run.episodes["episode_id"]})
     values = [f"kind {number // 2 % 3}" for number in range(len(frame))]
-    return Labels.read(frame.assign(**{"a/b: <i>": values}), "a/b: <i>")
+    return Target.read(frame.assign(**{"a/b: <i>": values}), "a/b: <i>")
 
 
 def test_the_layer_curve_has_the_best_site_of_a_layer_its_own_null_and_the_best_control(run: Run) -> None:
-    results = load_label_results(run, target="sim.tool_y")
-    curve = results.curves["mean"]
+    results = load_results(run, target="sim.tool_y")
+    curve = results.curves["all", "mean"]
     display = LabelCurveDisplay.from_results(results, "expert")
     excess = curve.metric - curve.null.mean(axis=1)
     rows = [row for row, site in enumerate(curve.sites) if site.stream == "expert"]
@@ -85,8 +85,8 @@ def test_the_layer_curve_has_the_best_site_of_a_layer_its_own_null_and_the_best_
 
 def test_without_enough_permutations_there_is_no_band_and_without_any_no_chance(run: Run) -> None:
     for permutations, chance in ((9, True), (0, False)):
-        train_probes(run, labels=Labels.of_run(run, "sim.tool_z"), permutations=permutations, controls=())
-        figure = label_curves(load_label_results(run, target="sim.tool_z"))
+        train_probes(run, target=Target.of_run(run, "sim.tool_z"), permutations=permutations, controls=())
+        figure = label_curves(load_results(run, target="sim.tool_z"))
         names = {name for axes in figure.axes for name in axes.get_legend_handles_labels()[1]}
         assert "95 % of permuted labels" not in names
         assert ("chance of the site" in names) == chance
@@ -94,37 +94,36 @@ def test_without_enough_permutations_there_is_no_band_and_without_any_no_chance(
 
 
 def test_scores_by_step_are_means_of_the_samples_and_their_mean_is_the_metric(run: Run) -> None:
-    results = load_label_results(run, target="sim.tool_y")
+    results = load_results(run, target="sim.tool_y")
+    curve = results.curves["all", "mean"]
     display = StepScoresDisplay.from_results(results, "backbone")
-    row = [str(site) for site in results.curves["mean"].sites].index(display.site)
-    frame = pd.DataFrame({"step": results.inferences, "score": results.curves["mean"].scores[row]})
+    row = [str(site) for site in curve.sites].index(display.site)
+    frame = pd.DataFrame({"step": curve.inferences, "score": curve.scores[row]})
     expected = frame.groupby("step")["score"].mean()
     assert display.steps.tolist() == expected.index.tolist() == [0, 1, 2, 3]
     assert display.score == pytest.approx(expected.to_numpy())
-    assert display.score.mean() == pytest.approx(results.curves["mean"].metric[row]), (
-        "as many samples at each step"
-    )
-    assert list(display.controls) == ["state", "step"], "the best one, and the step"
+    assert display.score.mean() == pytest.approx(curve.metric[row]), "as many samples at each step"
     table = results.scores[results.scores["view"] == "mean"].set_index("site")
     assert display.signal == table.loc[display.site, "signal"]
     for signal, colour in ((True, PARTS["backbone"].colour), (False, "white")):
         axes = replace(display, signal=signal).plot().ax_
         assert axes.get_lines()[0].get_markerfacecolor() == colour, "open markers where nothing is shown"
+    assert list(display.controls) == ["state", "step"], "the best one, and the step"
     for name, scores in display.controls.items():
         (control,) = [one for one in results.controls.scores if one.name == name]
         assert scores.mean() == pytest.approx(control.score)
     assert (display.low < display.score).all()
     with pytest.raises(UsageError, match="has one step"):
-        step_scores(load_label_results(run, target="a/b: <i>"))
+        step_scores(load_results(run, target="a/b: <i>"))
 
 
 def test_scores_of_classes_by_step_are_balanced_accuracies_of_the_step_and_within_their_interval(run: Run) -> None:
-    results = load_label_results(run, target="sim.phase")
+    results = load_results(run, target="sim.phase")
     display = StepScoresDisplay.from_results(results, "backbone")
-    curve = results.curves["mean"]
+    curve = results.curves["all", "mean"]
     row = [str(site) for site in curve.sites].index(display.site)
-    right = curve.predictions[row] == results.labels
-    frame = pd.DataFrame({"step": results.inferences, "phase": results.labels, "right": right})
+    right = curve.decisions[row] == curve.labels
+    frame = pd.DataFrame({"step": curve.inferences, "phase": curve.labels, "right": right})
     of_phases = frame.groupby(["step", "phase"])["right"].mean()
     assert display.score == pytest.approx(of_phases.groupby("step").mean().to_numpy())
     assert curve.scores[row].max() > 1, "weights of the whole window exceed 1 at a rare phase"
@@ -135,11 +134,12 @@ def test_scores_of_classes_by_step_are_balanced_accuracies_of_the_step_and_withi
 
 
 def test_places_behind_an_event_are_stored_and_shown_as_such(run: Run) -> None:
-    event = Labels.of_run(run, "sim.phase").equal_to("holding")
-    labels = Labels.of_run(run, "sim.cube_x")
-    results = train_probes(run, labels=labels, permutations=0, controls=("step",), align_to=event)
-    assert results.steps.tolist() == [0, 1]
-    assert results.inferences.min() == 2, "the grasp is seen at inference 2"
+    event = Target.of_run(run, "sim.phase").equal_to("holding")
+    labels = Target.of_run(run, "sim.cube_x")
+    results = train_probes(run, target=labels, permutations=0, controls=("step",), align_to=event)
+    curve = results.curves["all", "mean"]
+    assert curve.steps.tolist() == [0, 1]
+    assert curve.inferences.min() == 2, "the grasp is seen at inference 2"
     display = StepScoresDisplay.from_results(results, "expert")
     assert display.from_event
     assert display.steps.tolist() == [0, 1]
@@ -149,32 +149,34 @@ def test_places_behind_an_event_are_stored_and_shown_as_such(run: Run) -> None:
 
 
 def test_a_confusion_matrix_counts_held_out_predictions(run: Run) -> None:
-    results = load_label_results(run, target="a/b: <i>")
+    results = load_results(run, target="a/b: <i>")
+    curve = results.curves["all", "mean"]
     display = ClassConfusionDisplay.from_results(results, "backbone")
-    row = [str(site) for site in results.curves["mean"].sites].index(display.site)
-    predicted = results.curves["mean"].predictions[row]
-    expected = pd.crosstab(results.labels, predicted).reindex(index=range(3), columns=range(3), fill_value=0)
+    row = [str(site) for site in curve.sites].index(display.site)
+    predicted = curve.decisions[row]
+    expected = pd.crosstab(curve.labels, predicted).reindex(index=range(3), columns=range(3), fill_value=0)
     np.testing.assert_array_equal(display.counts, expected.to_numpy())
-    balanced = balanced_accuracy_score(results.labels, predicted)
+    balanced = balanced_accuracy_score(curve.labels, predicted)
     assert np.diag(display.shares).mean() == pytest.approx(balanced)
-    assert results.curves["mean"].metric[row] == pytest.approx(balanced)
+    assert curve.metric[row] == pytest.approx(balanced)
     axes = display.plot().ax_
     assert axes is not None
     assert [text.get_text() for text in axes.texts] == [f"{100 * share:.0f}" for share in display.shares.ravel()]
     with pytest.raises(UsageError, match="is continuous"):
-        ClassConfusionDisplay.from_results(load_label_results(run, target="sim.tool_y"))
+        ClassConfusionDisplay.from_results(load_results(run, target="sim.tool_y"))
 
 
 def test_predicted_values_are_held_out_and_coloured_by_group(run: Run) -> None:
-    results = load_label_results(run, target="sim.tool_y")
+    results = load_results(run, target="sim.tool_y")
+    curve = results.curves["all", "mean"]
     display = PredictedValuesDisplay.from_results(results, "backbone")
     assert display.site == "backbone.01.residual"
-    np.testing.assert_array_equal(display.true, results.labels)
+    np.testing.assert_array_equal(display.true, curve.labels)
     assert np.corrcoef(display.true, display.predicted)[0, 1] > 0.9
-    same = results.groups[:, None] == results.groups
+    same = curve.groups[:, None] == curve.groups
     np.testing.assert_array_equal(display.groups[:, None] == display.groups, same)
     with pytest.raises(UsageError, match="is of classes"):
-        PredictedValuesDisplay.from_results(load_label_results(run, target="sim.phase"))
+        PredictedValuesDisplay.from_results(load_results(run, target="sim.phase"))
 
 
 def test_every_figure_of_a_table_is_drawn_unclipped_and_says_what_it_is_of(run: Run) -> None:
@@ -239,8 +241,8 @@ def test_the_report_of_sides_has_a_section_of_stored_labels(run: Run) -> None:
 
 
 @pytest.fixture
-def results(run: Run) -> LabelResults:
-    return load_label_results(run, target="sim.tool_y")
+def results(run: Run) -> ProbeResults:
+    return load_results(run, target="sim.tool_y")
 
 
 def test_a_label_of_a_run_without_an_action_has_a_section_that_says_so(
@@ -257,6 +259,6 @@ def test_a_label_of_a_run_without_an_action_has_a_section_that_says_so(
 
 def test_a_run_of_recordings_without_an_action_stream_is_refused_by_name(tmp_path: Path) -> None:
     run = write_recorded_run(tmp_path / "run")
-    train_probes(run, labels=Labels.of_run(run, "dataset.state.y"), permutations=0, controls=())
+    train_probes(run, target=Target.of_run(run, "dataset.state.y"), permutations=0, controls=())
     with pytest.raises(NoProbesError, match="no site of the action"):
         label_retention_table([run], "dataset.state.y")

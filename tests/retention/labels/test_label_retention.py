@@ -19,8 +19,7 @@ from probe_kit.retention import label_retention_table, measure_label_retention, 
 from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.retention.labels.estimate import with_corrected_p
 from probe_kit.runs import Run, open_run
-from probe_kit.train import Labels, ProbeCurve, train_probes
-from probe_kit.train.labels.label_results import LabelComparison, LabelControl, LabelControls
+from probe_kit.train import ControlComparison, Controls, ControlScore, ProbeCurve, Target, train_probes
 from probe_kit.train.results.inventory import stored_probes
 from tests.support.label_results import label_results
 from tests.support.recorded_run import write_recorded_run
@@ -29,12 +28,12 @@ GROUPS, EACH = 20, 4
 BACKBONE, ACTION = (Site("backbone", 0), Site("backbone", 1)), (Site("expert", 0),)
 
 
-def controls(name: str, score: float, p: float, view: str = "mean") -> LabelControls:
+def controls(name: str, score: float, p: float, view: str = "mean") -> Controls:
     """One control against every site."""
     sites = [str(site) for site in (*BACKBONE, *ACTION)]
-    return LabelControls(
-        (LabelControl(name, score, (score, score), None, None),),
-        tuple(LabelComparison(name, view, site, score, p) for site in sites),
+    return Controls(
+        (ControlScore(name, "all", score, (score, score), None, None, 80),),
+        tuple(ControlComparison(name, "all", view, site, score, p) for site in sites),
     )
 
 
@@ -56,7 +55,7 @@ def test_its_variance_is_that_of_group_means_and_its_limits_are_fiellers() -> No
     """With one site per stream nothing is chosen: the variance is that of a mean over groups."""
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, 60, EACH, noise=0.3)
     found = measure_label_retention(results)
-    each = results.curves["mean"].scores.reshape(2, 60, EACH).mean(axis=2)
+    each = results.curves["all", "mean"].scores.reshape(2, 60, EACH).mean(axis=2)
     errors = each.std(axis=1, ddof=1) / np.sqrt(60)
     quantile = stats.t.ppf(0.975, 59)
     for peak, error in zip((found.backbone, found.action), errors, strict=True):
@@ -89,11 +88,12 @@ def test_with_chance_one_half_it_is_retention_of_sides(
     results = label_results(dict.fromkeys(curve.sites, (0.5, 0.5)), 100, 2, suite="")
     scores = curve.correct.astype(float)
     null = np.full((len(curve.sites), 59), 0.5)
-    own = replace(results.curves["mean"], scores=scores, null=null, inner=curve.inner)
+    own = replace(
+        results.curves["all", "mean"], sample_scores=scores, null=null, inner=curve.inner, groups=curve.groups,
+        fold_of=curve.fold_of,
+    )  # fmt: skip
     settings = replace(results.settings, seed_text="")
-    found = measure_label_retention(
-        replace(results, curves={"mean": own}, groups=curve.groups, fold_of=curve.fold_of, settings=settings)
-    )
+    found = measure_label_retention(replace(results, curves={("all", "mean"): own}, settings=settings))
     assert found.value == pytest.approx(sides.value)
     assert found.ci == pytest.approx((sides.interval.low, sides.interval.high))
     assert found.backbone.above == pytest.approx(0.4)
@@ -104,17 +104,17 @@ def test_with_chance_one_half_it_is_retention_of_sides(
     [
         (0.8, "binary", controls("state", 0.79, 0.4), "not shown to exceed state", "state 0.79"),
         (0.31, "binary", controls("state", 0.2, 0.001), "not shown to exceed chance", "chance 0.30, p "),
-        (0.34, "continuous", LabelControls(), "n/a (backbone 0.04 above chance)", "expected 0.05 or more"),
+        (0.34, "continuous", Controls(), "n/a (backbone 0.04 above chance)", "expected 0.05 or more"),
     ],
 )
 def test_without_signal_in_the_backbone_it_is_refused_by_what_is_missing(
-    planted: float, task: str, given: LabelControls, note: str, reason: str
+    planted: float, task: str, given: Controls, note: str, reason: str
 ) -> None:
     spread = 0.02 if note.startswith("not shown to exceed chance") else 0.0
     results = label_results(
         {BACKBONE[0]: (planted, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH, task=task, null_spread=spread
     )  # fmt: skip
-    found = measure_label_retention(results.with_controls(given))
+    found = measure_label_retention(replace(results, controls=given))
     assert not found.defined
     assert note in found.note
     assert reason in found.reason
@@ -124,10 +124,10 @@ def test_without_signal_in_the_backbone_it_is_refused_by_what_is_missing(
 
 def test_labels_that_change_within_episodes_need_the_control_step() -> None:
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH, window=EACH)
-    without = measure_label_retention(results.with_controls(controls("state", 0.1, 0.001)))
+    without = measure_label_retention(replace(results, controls=controls("state", 0.1, 0.001)))
     assert without.note == "n/a (control step was not run)"
     assert "--controls step,state" in without.reason
-    assert measure_label_retention(results.with_controls(controls("step", 0.1, 0.001))).defined
+    assert measure_label_retention(replace(results, controls=controls("step", 0.1, 0.001))).defined
 
 
 def test_without_permutations_there_is_no_chance_and_no_retention() -> None:
@@ -153,8 +153,8 @@ def trained(labelled_run: Path, tmp_path: Path) -> Run:
     """A run with stored probes of a quantity that was planted in the backbone alone."""
     shutil.copytree(labelled_run, tmp_path / "run")
     run = open_run(tmp_path / "run")
-    labels = Labels.of_run(run, "sim.tool_y")
-    train_probes(run, labels=labels, permutations=39, controls=("step", "instruction"))
+    labels = Target.of_run(run, "sim.tool_y")
+    train_probes(run, target=labels, permutations=39, controls=("step", "instruction"))
     return run
 
 
@@ -197,7 +197,7 @@ def test_runs_whose_labels_differ_are_not_put_into_one_table(trained: Run, tmp_p
     other = open_run(tmp_path / "other")
     frame = pd.DataFrame({"episode_id": other.episodes["episode_id"], "y": np.arange(len(other.episodes)) / 7})
     for run, values in ((trained, frame), (other, frame.assign(y=frame["y"] + 1))):
-        train_probes(run, labels=Labels.read(values, "y", task="continuous"), permutations=9, controls=())
+        train_probes(run, target=Target.read(values, "y", task="continuous"), permutations=9, controls=())
     with pytest.raises(UsageError, match=r"the labels .y. of .*other and .* differ \(sha256"):
         label_retention_table([trained, other], "y")
 
@@ -212,7 +212,7 @@ def three(trained: Run) -> Run:
     for name, count in (("even", 2), ("kind", 3)):
         drawn = np.random.default_rng(0).integers(count, size=len(frame) // 2).repeat(2)
         table = frame.assign(**{name: [f"{name} {number}" for number in drawn]})
-        train_probes(trained, labels=Labels.read(table, name), permutations=39, controls=("instruction",))
+        train_probes(trained, target=Target.read(table, name), permutations=39, controls=("instruction",))
     return trained
 
 
@@ -260,7 +260,7 @@ def test_trap_9_the_table_says_how_many_labels_were_tried_and_corrects_them_by_h
     )
     table = pd.DataFrame({"episode_id": three.episodes["episode_id"]})
     table["even"] = np.arange(len(table)) // 2 % 2
-    train_probes(three, labels=Labels.read(table, "even"), permutations=0, controls=())
+    train_probes(three, target=Target.read(table, "even"), permutations=0, controls=())
     tried = label_retention_table([three], "kind").sentences[-1]
     assert "has probes of 4 labels (even in 2 versions, kind, sim.tool_y)" in tried
 
@@ -283,8 +283,8 @@ def test_a_site_that_is_above_chance_alone_may_not_be_among_several_labels() -> 
 
 
 def test_stored_probes_are_chosen_by_key_for_one_target_that_they_are_of(three: Run) -> None:
-    labels = Labels.of_run(three, "sim.tool_y")
-    other = train_probes(three, labels=labels, permutations=19, controls=("step",))
+    labels = Target.of_run(three, "sim.tool_y")
+    other = train_probes(three, target=labels, permutations=19, controls=("step",))
     newest = label_retention_table([three], "sim.tool_y")
     assert newest.rows[0].settings == other.key
     first = next(one for one in stored_probes(three) if one.permutations == 39 and "tool_y" in str(one.target))
@@ -319,7 +319,7 @@ def test_stored_probes_are_chosen_by_key_for_one_target_that_they_are_of(three: 
 def test_recordings_have_a_table_and_a_page_though_they_have_no_success_rate(tmp_path: Path) -> None:
     run = write_recorded_run(tmp_path / "run", expert=True)
     train_probes(
-        run, labels=Labels.of_run(run, "dataset.state.x"), permutations=39, controls=("step", "instruction")
+        run, target=Target.of_run(run, "dataset.state.x"), permutations=39, controls=("step", "instruction")
     )
     found = label_retention_table([run], "dataset.state.x")
     assert found.rows[0].run == "shown (capture only)"

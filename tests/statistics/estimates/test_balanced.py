@@ -5,7 +5,8 @@ from hypothesis import strategies as st
 
 from probe_kit.errors import UnbalancedEpisodesError, UsageError
 from probe_kit.statistics.estimates.balanced import GroupSums, balanced_sums, remove_fold_priors
-from probe_kit.train.crossval.site_probe import nested_folds, probe_site
+from probe_kit.train.crossval.nested_folds import nested_folds
+from probe_kit.train.crossval.site_probe import probe_site
 from probe_kit.train.data.samples import Samples
 
 ITEMS = 20

@@ -8,8 +8,17 @@ from PIL import Image
 
 from probe_kit.errors import UsageError
 from probe_kit.suite import Suite, build_suite, load_picture
-from probe_kit.train import ArrayRun
-from probe_kit.train.controls.baselines import baseline_features
+from probe_kit.train import ArrayRun, train_probes
+from probe_kit.train.controls.features import ControlInputs
+from probe_kit.train.target_samples import TargetSamples
+
+
+def features_of(run: ArrayRun, name: str, suite: Suite | None) -> np.ndarray:
+    """Features of a control of a side, for every episode."""
+    rows = np.arange(len(run.episodes))
+    names = np.full(rows.size, "all")
+    samples = TargetSamples(rows, np.zeros_like(rows), np.zeros(rows.size), names, names, 1, {})
+    return ControlInputs(run, samples, True, suite).features(name)
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +38,7 @@ def run_of(suite: Suite, path: Path) -> ArrayRun:
 
 
 def test_pixels_are_the_left_and_the_right_picture_of_the_layout(suite: Suite, tmp_path: Path) -> None:
-    features = baseline_features(run_of(suite, tmp_path), "pixels", suite)
+    features = features_of(run_of(suite, tmp_path), "pixels", suite)
     left, right = features[:, :3072], features[:, 3072:]
     np.testing.assert_array_equal(left[0::2], right[1::2])  # swapping the layout swaps the pictures
     small = load_picture(suite.items[0].picture("left")).resize((32, 32), Image.Resampling.BOX)
@@ -38,7 +47,7 @@ def test_pixels_are_the_left_and_the_right_picture_of_the_layout(suite: Suite, t
 
 def test_words_are_counted_alone_and_with_the_sign_of_the_layout(planted_run: Callable[..., ArrayRun]) -> None:
     run = planted_run()
-    features = baseline_features(run, "instruction", None)
+    features = features_of(run, "instruction", None)
     alone, signed = np.split(features, 2, axis=1)
     words = sorted({word for text in run.episodes["instruction"] for word in text.split()})
     assert alone[:, words.index("cube")].tolist() == [1] * 80
@@ -46,9 +55,15 @@ def test_words_are_counted_alone_and_with_the_sign_of_the_layout(planted_run: Ca
     np.testing.assert_array_equal(signed, alone * np.tile([[1], [-1]], (40, 1)))
 
 
-def test_a_control_that_does_not_exist_lists_those_that_do(planted_run: Callable[..., ArrayRun]) -> None:
-    with pytest.raises(UsageError, match="position, instruction, pixels"):
-        baseline_features(planted_run(), "sound", None)  # type: ignore[arg-type]
-    silent = ArrayRun(Path("R"), "m", "s@1#0", planted_run().episodes.drop(columns="instruction"), {})
+def test_a_control_that_does_not_exist_or_is_not_possible_is_refused(
+    planted_run: Callable[..., ArrayRun],
+) -> None:
+    run = planted_run()
+    with pytest.raises(UsageError, match="unknown control 'sound'; expected some of position, step, state"):
+        train_probes(run, controls=("sound",))
+    for name, reason in (("step", "one inference"), ("state", "no trajectories"), ("action", "no actions")):
+        with pytest.raises(UsageError, match=f"control '{name}' is not possible: .*{reason}"):
+            train_probes(run, controls=(name,))
+    silent = ArrayRun(run.path, "m", "s@1#0", run.episodes.drop(columns="instruction"), run.features)
     with pytest.raises(UsageError, match="no column 'instruction'"):
-        baseline_features(silent, "instruction", None)
+        train_probes(silent, controls=("instruction",))

@@ -26,7 +26,7 @@ def test_baselines_of_a_fair_suite_are_at_chance_and_stored(planted_run: Planted
     assert set(found) == {"position", "instruction"}
     for score in found.values():
         assert not score.above_chance
-        assert score.ci[0] <= score.accuracy <= score.ci[1]
+        assert score.ci[0] <= score.score <= score.ci[1]
         assert (score.n, score.chance) == (80, 0.5)
 
 
@@ -35,7 +35,7 @@ def test_a_suite_that_keeps_the_answer_on_one_side_is_found_out(planted_run: Pla
     run = planted_run()
     run.episodes["side_correct"] = run.episodes["layout"].map({"original": "left", "swapped": "right"})
     score = train_probes(run, permutations=40, controls=("position",)).controls.of_category("color")["position"]
-    assert score.accuracy == 1.0
+    assert score.score == 1.0
     assert score.above_chance
 
 
@@ -149,7 +149,7 @@ def test_a_sweep_that_fails_late_leaves_finished_sites_and_no_probes(
         raise OSError("no space")
 
     with monkeypatch.context() as patch:
-        patch.setattr("probe_kit.train.probe_sweep.add_baselines", fail)
+        patch.setattr("probe_kit.train.probe_sweep.add_controls", fail)
         with pytest.raises(OSError, match="no space"):
             train_probes(run, permutations=2, controls=("position",))
     assert load_results(run).key == before.key

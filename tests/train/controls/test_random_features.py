@@ -11,9 +11,10 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Stream
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import ArrayRun, ProbeResults, train_probes
-from probe_kit.train.controls.random_features import RandomFeatureInputs, random_layer
-from probe_kit.train.crossval.category_problem import category_problem
+from probe_kit.train.controls.features import ControlInputs, random_layer
 from probe_kit.train.data.samples import Samples
+from probe_kit.train.target_samples import TargetSamples
+from tests.train.conftest import problem_of
 
 ITEMS, WIDTH = 100, 24
 
@@ -21,6 +22,12 @@ ITEMS, WIDTH = 100, 24
 @pytest.fixture(scope="module")
 def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
     return build_suite(tmp_path_factory.mktemp("suites") / "suite", ("color",), ITEMS)
+
+
+def inputs_of(run: ArrayRun, suite: Suite) -> ControlInputs:
+    rows = np.arange(len(run.episodes))
+    names = np.full(rows.size, "all")
+    return ControlInputs(run, TargetSamples(rows, 0 * rows, np.zeros(rows.size), names, names, 1, {}), True, suite)
 
 
 def run_of(suite: Suite, path: Path, knowledge: float = 0.0) -> ArrayRun:
@@ -35,7 +42,7 @@ def run_of(suite: Suite, path: Path, knowledge: float = 0.0) -> ArrayRun:
     )  # fmt: skip
     sites = list(Stream("backbone", 3, WIDTH).sites())
     run = ArrayRun(path, "random", suite.identity, episodes, {})
-    inputs = RandomFeatureInputs.of(run, suite)
+    inputs = inputs_of(run, suite)
     rows = np.arange(len(episodes))
     features = {(site, "mean"): inputs.layer(rows, WIDTH, 100 + site.layer) for site in sites}
     sign = np.where(episodes["side_correct"] == "left", 1.0, -1.0)
@@ -61,7 +68,7 @@ def test_a_network_that_knows_the_answer_exceeds_random_features(suite: Suite, t
     assert best["exceeds_random_features"]
     assert best["signal"]
     control = results.controls.of_category("color")["random-features"]
-    assert control.ci[0] < control.accuracy < control.ci[1]
+    assert control.ci[0] < control.score < control.ci[1]
     assert not control.above_chance  # what it has for free is no leak
 
 
@@ -74,7 +81,7 @@ def test_a_part_that_never_varies_gives_a_random_layer_nothing() -> None:
 
 
 def test_random_layers_repeat_and_differ_by_seed(suite: Suite, tmp_path: Path) -> None:
-    inputs, rows = RandomFeatureInputs.of(run_of(suite, tmp_path), suite), np.arange(20)
+    inputs, rows = inputs_of(run_of(suite, tmp_path), suite), np.arange(20)
     np.testing.assert_array_equal(inputs.layer(rows, 8, 0), inputs.layer(rows, 8, 0))
     assert (inputs.layer(rows, 8, 0) != inputs.layer(rows, 8, 1)).all()
     assert inputs.layer(rows, 8, 0).std() > 0.3  # neither dead nor saturated
@@ -84,15 +91,14 @@ def test_the_reference_is_the_mean_of_five_layers_by_scikit_learns_accuracy(suit
     """Every layer is probed by itself on the folds of the sites; none of them is chosen."""
     run = run_of(suite, tmp_path / "random")
     results = train_probes(run, permutations=0, controls=("random-features",), suite=suite.folder)
-    inputs = RandomFeatureInputs.of(run, suite)
-    problem = category_problem(run.episodes, "color", results.settings)
-    nothing = np.empty((problem.labels.size, 0), bool)
+    inputs = inputs_of(run, suite)
+    problem = problem_of(run)
     accuracies = []
     for number in range(5):
-        layer = inputs.layer(problem.rows, WIDTH, derive_seed("binding", 0, number))
-        decisions = problem.fit(Samples.pooled(layer), nothing).decisions
+        layer = inputs.layer(problem.positions, WIDTH, derive_seed("binding", 0, number))
+        decisions = problem.fit(Samples.pooled(layer)).decisions
         accuracies.append(accuracy_score(problem.labels, decisions > 0))
     assert len(set(accuracies)) > 1, "else the mean is the best"
     control = results.controls.of_category("color")["random-features"]
-    assert control.accuracy == pytest.approx(np.mean(accuracies))
-    assert [one.reference for one in results.controls.excess] == pytest.approx([np.mean(accuracies)] * 3)
+    assert control.score == pytest.approx(np.mean(accuracies))
+    assert [one.reference for one in results.controls.comparisons] == pytest.approx([np.mean(accuracies)] * 3)

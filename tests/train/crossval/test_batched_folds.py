@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.train.crossval import batched_folds as small_probe
+from probe_kit.train.crossval.logistic_folds import cross_validate
 from probe_kit.train.crossval.nested_folds import FittedFold, NestedFold, nested_folds
-from probe_kit.train.crossval.site_probe import cross_validate
 from probe_kit.train.data.samples import Samples
 
 KEEPING_THE_PATCH = [HealthCheck.function_scoped_fixture]

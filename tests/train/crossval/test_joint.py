@@ -14,12 +14,12 @@ from probe_kit.errors import ProbeNotConvergedError
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.crossval import joint as joint_probe
 from probe_kit.train.crossval import joint_design as joint_site
-from probe_kit.train.crossval import site_probe as probe
+from probe_kit.train.crossval import logistic_folds as probe
 from probe_kit.train.crossval.joint import can_be_joint, cross_validate_jointly, labels_at_once
 from probe_kit.train.crossval.joint_design import JointSite, training_sets
 from probe_kit.train.crossval.joint_objective import JointProblems
-from probe_kit.train.crossval.nested_folds import FittedFold
-from probe_kit.train.crossval.site_probe import STRENGTHS, cross_validate, nested_folds
+from probe_kit.train.crossval.logistic_folds import cross_validate
+from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, nested_folds
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver import mixed_precision as mixed
 from probe_kit.train.solver.backend import Array

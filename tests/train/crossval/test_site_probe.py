@@ -8,7 +8,8 @@ from probe_kit.errors import NonFiniteActivationError, TooFewGroupsError
 from probe_kit.runs.rows import TokenBlock
 from probe_kit.statistics.folds import Fold
 from probe_kit.statistics.label_permutations import flip_items
-from probe_kit.train.crossval.site_probe import STRENGTHS, NestedFold, nested_folds, probe_site
+from probe_kit.train.crossval.nested_folds import STRENGTHS, NestedFold, nested_folds
+from probe_kit.train.crossval.site_probe import probe_site
 from probe_kit.train.data.samples import Samples
 
 ITEMS = np.repeat(np.arange(30), 2)

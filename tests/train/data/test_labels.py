@@ -1,8 +1,6 @@
 import pandas as pd
-import pytest
 
-from probe_kit.errors import UsageError
-from probe_kit.train.data.labels import target_labels
+from probe_kit.train.target import side_labels
 
 EPISODES = pd.DataFrame(
     {
@@ -15,20 +13,15 @@ EPISODES["item_id"] += (EPISODES.index // 4).astype(str)
 
 
 def test_left_is_one() -> None:
-    assert target_labels(EPISODES, "correct", 0)[:4].tolist() == [1, 0, 0, 1]
+    assert side_labels(EPISODES, "correct", 0)[:4].tolist() == [1, 0, 0, 1]
 
 
 def test_an_episode_placed_nowhere_has_no_chosen_side() -> None:
-    assert target_labels(EPISODES, "chosen", 0)[:4].tolist() == [1, -1, 1, 0]
+    assert side_labels(EPISODES, "chosen", 0)[:4].tolist() == [1, -1, 1, 0]
 
 
 def test_the_control_flips_about_half_of_the_items_as_a_whole() -> None:
-    shuffled, correct = target_labels(EPISODES, "shuffled", 0), target_labels(EPISODES, "correct", 0)
+    shuffled, correct = side_labels(EPISODES, "shuffled", 0), side_labels(EPISODES, "correct", 0)
     flipped = (shuffled != correct).reshape(-1, 2)
     assert (flipped[:, 0] == flipped[:, 1]).all()
     assert 10 < flipped[:, 0].sum() < 30
-
-
-def test_an_unknown_target_lists_the_known_ones() -> None:
-    with pytest.raises(UsageError, match="correct, chosen, shuffled"):
-        target_labels(EPISODES, "wanted", 0)  # type: ignore[arg-type]

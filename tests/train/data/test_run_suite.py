@@ -24,7 +24,6 @@ from probe_kit.suite import Suite, build_suite
 from probe_kit.suite.build import default_folder
 from probe_kit.suite.ladder import Wording
 from probe_kit.train import ArrayRun, train_probes
-from probe_kit.train.data.captured_call import restrict_to_call
 from probe_kit.train.data.run_suite import suite_of
 from tests.support.changed_suites import CHANGES, other_name, save_changed
 from tests.support.little_run import STREAMS, certify, episode, little_settings, suite_record
@@ -117,15 +116,13 @@ def test_a_suite_of_fewer_items_that_was_built_elsewhere_is_drawn_again(tmp_path
 
 @pytest.mark.usefixtures("cache")
 def test_a_run_is_told_by_all_that_it_was_to_have_whatever_is_left_of_it(tmp_path: Path) -> None:
-    """Unfinished, at a later inference, and in a wording that not every item has."""
+    """Unfinished, and in a wording that not every item has."""
     suite = build_suite(tmp_path / "suite", ["state", "color"], 4)
     part = suite.select(["state", "color"], 2)
     unfinished = run_on(part, tmp_path / "unfinished", episodes=1)
-    later = restrict_to_call(run_on(part, tmp_path / "later", episodes=3, calls=2), 1)
     worded = run_on(part, tmp_path / "worded", wordings=("knowledge", "named")).in_wording("named")
-    assert len(later.episodes) == 0
     assert worded.episodes["item_id"].nunique() < len(part.items)
-    for run in (unfinished, later, worded):
+    for run in (unfinished, worded):
         assert suite_of(run, suite.folder) == suite
         assert suite_of(run).items == part.items
 

@@ -1,5 +1,6 @@
 import weakref
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,12 @@ from probe_kit.train import ArrayRun
 from probe_kit.train.data.samples import Samples, read_samples, role_of, sites_of
 
 PlantedRun = Callable[..., ArrayRun]
+
+
+def read_all(run: Any, view: str, site: Site, episodes: int = 80) -> Samples:
+    """The first inference of every episode."""
+    return read_samples(run, view, site, np.arange(episodes), np.zeros(episodes, int))
+
 
 MASK = np.array([[True, False, True], [False, True, False], [True, True, True]])
 VALUES = np.arange(18.0).reshape(3, 3, 2)
@@ -57,8 +64,8 @@ def test_a_broken_token_names_its_episode(planted_run: PlantedRun) -> None:
     values = np.zeros((80, 3, 20))
     values[5, 1, 0] = np.inf
     run.token_features[site, None] = (values, np.ones((80, 3), bool))  # type: ignore[index]
-    with pytest.raises(NonFiniteActivationError, match=r"view 'tokens'.*1 of 80 episodes, the first 'color-2:s'"):
-        read_samples(run, "tokens", site)
+    with pytest.raises(NonFiniteActivationError, match=r"1 of 80 samples, the first inference 0 of 'color-2:s'"):
+        read_all(run, "tokens", site)
 
 
 class _Blockwise:
@@ -84,6 +91,6 @@ class _Blockwise:
 
 def test_tokens_are_read_block_by_block_and_no_block_is_kept() -> None:
     run = _Blockwise()
-    samples = read_samples(run, "tokens", Site("backbone", 0))  # type: ignore[arg-type]
+    samples = read_all(run, "tokens", Site("backbone", 0), 4)
     assert np.asarray(samples.features)[:, 0].tolist() == [*range(40)] * 4
     assert run.alive <= 1

@@ -4,16 +4,16 @@ import pytest
 
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.train import ProbeResults, train_probes
-from probe_kit.train.results.best_sites import best_sites_sentences
-from probe_kit.train.results.control_scores import BaselineScore
+from probe_kit.train.results.control_scores import ControlScore
+from probe_kit.train.results.summary import best_sites_sentences
 from tests.train.conftest import PlantedRun
 
 
 def with_pixels(results: ProbeResults, p: float) -> ProbeResults:
     scores = [
-        BaselineScore("pixels", category, 0.81, (0.7, 0.9), p, 0.5, 48) for category in results.settings.categories
+        ControlScore("pixels", category, 0.81, (0.7, 0.9), p, 0.5, 48) for category in results.settings.categories
     ]
-    return replace(results, controls=results.controls.with_baselines(scores))
+    return replace(results, controls=results.controls.with_scores(scores))
 
 
 @pytest.mark.parametrize(("p", "is_named"), [(0.01, True), (0.2, False)])
@@ -22,5 +22,6 @@ def test_pictures_that_decode_the_target_alone_are_named(
 ) -> None:
     run = planted_run({Site("backbone", 3): 1.0}, categories=("color", "shape"))
     results = train_probes(run, permutations=9)
-    sentences = best_sites_sentences(with_pixels(results, p))
+    sentences = [one for one in best_sites_sentences(with_pixels(results, p)) if "episodes): " in one]
+    assert len(sentences) == 2
     assert all(("The pictures alone decode it too (81 %, 70 to 90)." in one) == is_named for one in sentences)

@@ -8,13 +8,14 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
+from probe_kit.hashing import sha256_json
 from probe_kit.hooks import Site
 from probe_kit.runs.results import write_bundle
 from probe_kit.runs.store import locate
 from probe_kit.train import ArrayRun, load_results, save_results, train_probes
-from probe_kit.train.labels.label_store import stored_targets
 from probe_kit.train.results.inventory import inventory
-from probe_kit.train.settings import FORMAT, LABEL_FORMAT, key_of
+from probe_kit.train.results.store import stored_targets
+from probe_kit.train.settings import FORMAT
 
 PlantedRun = Callable[..., ArrayRun]
 
@@ -47,7 +48,7 @@ def test_probes_that_were_read_can_be_stored_again(planted_run: PlantedRun) -> N
 
 def test_the_folder_holds_settings_scores_and_decisions(planted_run: PlantedRun) -> None:
     run = planted_run()
-    results = train_probes(run, permutations=2)
+    results = train_probes(run, permutations=2, controls=())
     folder = run.path / "probes" / results.key
     assert sorted(path.name for path in folder.iterdir()) == [
         "decisions.npz", "directions.npz", "scores.csv", "settings.json", "times.json",
@@ -136,17 +137,16 @@ def test_saving_keeps_what_is_there(planted_run: PlantedRun) -> None:
     assert file.read_text(encoding="utf-8") == "edited by hand"
 
 
-@pytest.mark.parametrize("stored_format", [1, FORMAT - 1, FORMAT + 1, "labels-2", None])
+@pytest.mark.parametrize("stored_format", [1, FORMAT - 1, FORMAT + 1, "labels-3", None])
 def test_results_of_another_format_are_refused_by_its_name(
     planted_run: PlantedRun, stored_format: int | str | None
 ) -> None:
     run = planted_run()
     train_probes(run, permutations=2)
     other = {"format": stored_format, "model": "m"}
-    write_bundle(locate(run.path), "probes", key_of(other), {"settings": other})
-    formats = f"format {FORMAT} or {LABEL_FORMAT}"
+    write_bundle(locate(run.path), "probes", sha256_json(other)[:12], {"settings": other})
     for read in (load_results, inventory, stored_targets):
-        with pytest.raises(RunDamagedError, match=rf"has format {stored_format}; .* reads {formats}"):
+        with pytest.raises(RunDamagedError, match=rf"has format {stored_format}; .* reads format {FORMAT}"):
             read(run)
 
 

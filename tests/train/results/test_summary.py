@@ -1,37 +1,61 @@
 """The best sites in a few columns, ties and first iteration included."""
 
-import pandas as pd
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
-from probe_kit.train.results.summary import best_sites, site_cells
+from probe_kit.hooks import Site
+from probe_kit.train import ProbeCurve, ProbeResults, ProbeSettings
+from probe_kit.train.results.best_sites import best_sites, site_cells
+from probe_kit.train.results.summary import best_sites_table
+
+SITES = {
+    Site("backbone", 0): 0.5, Site("backbone", 1): 0.9, Site("backbone", 2): 0.9,
+    Site("expert", 0, "residual", 0): 0.6, Site("expert", 1, "residual", 0): 0.5,
+    Site("expert", 0, "residual", 1): 0.8, Site("expert", 1, "residual", 1): 0.7,
+}  # fmt: skip
+
+
+def curve(lower: float = 0.0) -> ProbeCurve:
+    """Decisions about 40 episodes, of which each site has a share right."""
+    labels = np.tile([True, False], 20)
+    right = np.stack([np.arange(40) < round(40 * (share - lower)) for share in SITES.values()])
+    names = np.array([f"g{number // 4}" for number in range(40)])
+    return ProbeCurve(
+        sites=tuple(SITES), labels=labels, episodes=np.arange(40).astype(str), items=names, groups=names,
+        fold_of=np.arange(40) // 4 % 5, decisions=np.where(right == labels, 1.0, -1.0),
+        strengths=np.ones((len(SITES), 5)), null=np.full((len(SITES), 9), 0.5),
+        inner=np.zeros((len(SITES), 5, 10), np.float32),
+    )  # fmt: skip
 
 
 @pytest.fixture
-def scores() -> pd.DataFrame:
-    sites = [
-        ("backbone", 0, None, 0.5), ("backbone", 1, None, 0.9), ("backbone", 2, None, 0.9),
-        ("expert", 0, 0, 0.6), ("expert", 1, 0, 0.55), ("expert", 0, 1, 0.8), ("expert", 1, 1, 0.7),
-    ]  # fmt: skip
-    rows = [
-        {
-            "category": "color", "view": "mean", "stream": stream, "iteration": step, "accuracy": accuracy,
-            "n": 40, "site": f"{stream}.{layer:02d}", "ci_low": accuracy - 0.1,
-            "ci_high": accuracy + 0.1, "p_fwe": 0.005,
-        }
-        for stream, layer, step, accuracy in sites
-    ]  # fmt: skip
-    return pd.DataFrame(rows).astype({"iteration": "Int64"})
+def results() -> ProbeResults:
+    settings = ProbeSettings(
+        "m", False, None, "s@1#0", "s@1#0", "0", "0", ("color",), ("mean",), "correct", permutations=9, seed=0
+    )
+    return ProbeResults(settings, {("color", "mean"): curve()})
 
 
-def test_the_first_of_the_best_is_named_with_its_ties_and_the_first_iteration(scores: pd.DataFrame) -> None:
-    backbone, expert = (row for _, row in best_sites(scores).iterrows())
-    assert site_cells(backbone) == ("backbone.01 +1", "90.0 [80.0, 100.0]", "–", "0.005")
-    assert site_cells(expert) == ("expert.00", "80.0 [70.0, 90.0]", "60.0", "0.005")
+def test_the_first_of_the_best_is_named_with_its_ties_and_the_first_iteration(results: ProbeResults) -> None:
+    backbone, expert = best_sites(results.scores, True)
+    assert site_cells(backbone, True)[0] == "backbone.01.residual +1"
+    assert site_cells(backbone, True)[1].startswith("90.0 [")
+    assert site_cells(backbone, True)[2:] == ("50.0", "0.100")
+    assert site_cells(expert, True)[0] == "expert.00.residual@1"
+    assert expert["first"] == pytest.approx(0.6)
+    assert backbone["first"] != backbone["first"], "the stream runs once"
 
 
-def test_categories_and_views_do_not_mix(scores: pd.DataFrame) -> None:
-    other = scores.assign(category="shape", accuracy=scores["accuracy"] - 0.2)
-    found = best_sites(pd.concat([scores, other], ignore_index=True))
-    assert found["accuracy"].round(2).tolist() == [0.9, 0.8, 0.7, 0.6]
-    assert found["ties"].tolist() == [1, 0, 1, 0]
-    assert found["first"].dropna().round(2).tolist() == [0.6, 0.4]
+def test_categories_do_not_mix(results: ProbeResults) -> None:
+    both = replace(
+        results,
+        settings=replace(results.settings, categories=("shape", "color")),
+        curves={("shape", "mean"): curve(0.2), **results.curves},
+    )
+    rows = best_sites(both.scores, True)
+    assert [row["category"] for row in rows] == ["color", "color", "shape", "shape"]
+    assert [round(row["score"], 2) for row in rows] == [0.9, 0.8, 0.7, 0.6]
+    assert [row["ties"] for row in rows] == [1, 0, 1, 0]
+    assert best_sites_table([both]).names == ("color", "color", "shape", "shape")

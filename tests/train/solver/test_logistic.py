@@ -7,7 +7,7 @@ import pytest
 from sklearn.linear_model import LogisticRegression
 
 from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
-from probe_kit.train.crossval.site_probe import STRENGTHS
+from probe_kit.train.crossval.nested_folds import STRENGTHS
 from probe_kit.train.solver import conjugate_gradient as conjugate
 from probe_kit.train.solver import design_matrix as design
 from probe_kit.train.solver import logistic as solver

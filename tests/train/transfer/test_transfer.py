@@ -18,7 +18,7 @@ from probe_kit.errors import SettingsMismatchError, TooFewGroupsError, UsageErro
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs import open_run
 from probe_kit.suite import Suite
-from probe_kit.train import ArrayRun, Labels, transfer_probes
+from probe_kit.train import ArrayRun, Target, transfer_probes
 from tests.support.labelled_run import write_labelled_run
 
 SITES = [Site("backbone", 0), Site("backbone", 1)]
@@ -54,8 +54,8 @@ def run_of(
     return ArrayRun(Path("nowhere") / name, "none", f"suite-of-{name}", episodes, features, weights_sha256=weights)
 
 
-def labels_of(run: ArrayRun, values: Any, name: str = "y", **further: Any) -> Labels:
-    return Labels.read(pd.DataFrame({"episode_id": run.episodes["episode_id"], name: values}), name, **further)
+def labels_of(run: ArrayRun, values: Any, name: str = "y", **further: Any) -> Target:
+    return Target.read(pd.DataFrame({"episode_id": run.episodes["episode_id"], name: values}), name, **further)
 
 
 def quantity(seed: int) -> Array:
@@ -121,7 +121,7 @@ def test_classes_are_matched_by_name() -> None:
         run, other, labels_of(run, first), labels_of(other, fewer, task="classes"), permutations=0
     )
     assert of_two.classes == ("low", "middle")
-    own = of_two.curves["mean"].fitted.predictions[1]
+    own = of_two.curves["mean"].fitted.decisions[1]
     assert set(own) <= {-1.0, 0.0, 1.0}, "a class that the other run lacks is never right"
 
 
@@ -138,7 +138,7 @@ def test_labels_of_the_other_run_take_part_in_no_fit() -> None:
     run, other, here, there = pair()
     one = transfer_probes(run, other, labels_of(run, here), labels_of(other, there), permutations=0)
     two = transfer_probes(run, other, labels_of(run, here), labels_of(other, -there), permutations=0)
-    np.testing.assert_array_equal(one.curves["mean"].fitted.predictions, two.curves["mean"].fitted.predictions)
+    np.testing.assert_array_equal(one.curves["mean"].fitted.decisions, two.curves["mean"].fitted.decisions)
 
 
 def test_unrelated_labels_transfer_as_often_as_p_says() -> None:
@@ -157,7 +157,7 @@ def test_groups_that_both_runs_have_are_left_out() -> None:
     names = other.episodes["group_id"].where(other.episodes.index >= 20, "own-" + other.episodes["group_id"])
     other.episodes["group_id"] = names
     tables = [
-        Labels.read(pd.DataFrame({"episode_id": one.episodes["episode_id"], "y": y}), "y", group_by="group_id")
+        Target.read(pd.DataFrame({"episode_id": one.episodes["episode_id"], "y": y}), "y", group_by="group_id")
         for one, y in ((run, here), (other, there))
     ]
     results = transfer_probes(run, other, *tables, permutations=0)
@@ -205,7 +205,8 @@ def test_the_command_prints_the_transfer_beside_the_other_runs_own_score(
     assert "nothing was stored" in transferred
     assert not (tmp_path / "a" / "probes").exists()
     assert "groups of" in said(*target, "--test-on", str(tmp_path / "a"))
-    assert "--test-on scores probes of a label" in said("--test-on", str(tmp_path / "b"))
+    side = said("--permutations", "19", "--test-on", str(tmp_path / "b"))
+    assert "correct: balanced accuracy" in side, "a side transfers as any label"
     assert "--across-weights is for a transfer" in said(*target, "--across-weights")
     assert "--jobs is not for a transfer" in said(*target, "--test-on", str(tmp_path / "b"), "--jobs", "2")
     assert open_run(tmp_path / "b").sealed

@@ -6,7 +6,6 @@ from typing import Self
 from probe_kit._system.counting import counted
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.labels.label_results import LabelResults
 from probe_kit.train.results.probe_results import ProbeResults
 
 RANDOM = "RANDOM WEIGHTS"
@@ -52,10 +51,12 @@ class ProvenanceLine:
         )  # fmt: skip
 
     @classmethod
-    def of_label(cls, results: LabelResults, view: str) -> Self:
-        """Of probes of a label in one view."""
-        own, groups = results.settings, len(set(results.groups.tolist()))
-        n = f"n = {counted(results.labels.size, 'sample')} in {counted(groups, 'group')}, view {view}"
+    def of_label(cls, results: ProbeResults, category: str, view: str) -> Self:
+        """Of probes of a label in one category and view."""
+        own, curve = results.settings, results.curves[category, view]
+        of = "" if category == "all" else f", category {category}"
+        sizes = f"{counted(curve.labels.size, 'sample')} in {counted(curve.n_groups, 'group')}"
+        n = f"n = {sizes}, view {view}{of}"
         return cls(
             own.model, own.random_weights, own.weights, own.suite, n, own.run_settings, results.key, own.target,
             own.call if own.window == 1 else None,

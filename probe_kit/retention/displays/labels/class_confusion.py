@@ -12,11 +12,10 @@ from probe_kit.retention.displays.base.style import BLUE
 from probe_kit.retention.displays.labels.label_panel import (
     LabelPanel,
     best_row,
+    label_curve_of,
     label_panels,
-    label_view,
-    streams_of,
 )
-from probe_kit.train.labels.label_results import LabelResults
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -48,26 +47,32 @@ class ClassConfusionDisplay(LabelPanel):
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
-    def from_results(cls, results: LabelResults, stream: str = "backbone", view: str | None = None) -> Self:
-        """From stored probes of a binary label or of classes; view: the first probed one by default.
+    def from_results(
+        cls,
+        results: ProbeResults,
+        stream: str = "backbone",
+        view: str | None = None,
+        category: str | None = None,
+    ) -> Self:
+        """From stored probes of a binary label or of classes; view, category: the first probed one by default.
 
         Raises UnknownSiteError for a view or stream that was not probed, UsageError for a continuous label.
         """
         from sklearn.metrics import confusion_matrix
 
-        view = label_view(results, view)
-        if not results.classes:
+        category, view, curve = label_curve_of(results, view, category)
+        if not curve.classes:
             raise UsageError(f"the label {results.settings.target!r} is continuous; expected classes to confuse")
-        curve, row = results.curves[view], best_row(results, view, stream)
-        known = np.arange(len(results.classes))
+        row = best_row(curve, stream)
+        known = np.arange(len(curve.classes))
         return cls(
             target=results.settings.target,
             view=view,
             stream=stream,
             site=str(curve.sites[row]),
-            classes=results.classes,
-            counts=confusion_matrix(results.labels, curve.predictions[row], labels=known),
-            certificate=ProvenanceLine.of_label(results, view),
+            classes=curve.classes,
+            counts=confusion_matrix(curve.labels, curve.decisions[row], labels=known),
+            certificate=ProvenanceLine.of_label(results, category, view),
         )
 
     @property
@@ -118,9 +123,8 @@ class ClassConfusionDisplay(LabelPanel):
                 )
 
 
-def class_confusions(results: LabelResults, view: str | None = None) -> "Figure":
+def class_confusions(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Confusion matrices, a panel per stream; arguments and errors as of `ClassConfusionDisplay`."""
-    view = label_view(results, view)
-    return label_panels(
-        [ClassConfusionDisplay.from_results(results, one, view) for one in streams_of(results, view)]
-    )
+    category, view, curve = label_curve_of(results, view, category)
+    displays = [ClassConfusionDisplay.from_results(results, stream, view, category) for stream in curve.streams]
+    return label_panels(displays)

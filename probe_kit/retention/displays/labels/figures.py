@@ -13,7 +13,7 @@ from probe_kit.retention.displays.labels.step_scores import step_scores
 from probe_kit.retention.displays.report_figures import run_names
 from probe_kit.retention.labels.table import LabelRetentionTable
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.labels.label_results import LabelResults
+from probe_kit.train.results.probe_results import ProbeResults
 
 
 def label_figures(runs: Sequence[RunReader], table: LabelRetentionTable) -> list[ReportFigure]:
@@ -29,17 +29,17 @@ def label_figures(runs: Sequence[RunReader], table: LabelRetentionTable) -> list
         figure
         for target, of_label in zip(table.targets, stems, strict=True)
         for position, (run, of_run) in enumerate(zip(runs, run_names(runs), strict=True))
-        for view in _views(table, run, target)
+        for category, view in _places(table, run, target)
         for figure in _of_view(
-            table.results[str(run.location), target], view, f"{of_run}-{of_label}", position, target
+            table.results[str(run.location), target], category, view, f"{of_run}-{of_label}", position, target
         )
     ]
 
 
-def _views(table: LabelRetentionTable, run: RunReader, target: str) -> list[str]:
-    """Those of the table's rows."""
-    place = str(run.location)
-    return [row.retention.view for row in table.rows if (row.location, row.retention.target) == (place, target)]
+def _places(table: LabelRetentionTable, run: RunReader, target: str) -> list[tuple[str, str]]:
+    """Categories and views of the table's rows."""
+    own = (row.retention for row in table.rows if row.location == str(run.location))
+    return [(one.category, one.view) for one in own if one.target == target]
 
 
 def file_names(targets: Sequence[str]) -> list[str]:
@@ -53,34 +53,37 @@ def file_names(targets: Sequence[str]) -> list[str]:
     return names
 
 
-def _of_view(results: LabelResults, view: str, stem: str, position: int, target: str) -> Iterator[ReportFigure]:
-    views = results.settings.views
+def _of_view(
+    results: ProbeResults, category: str, view: str, stem: str, position: int, target: str
+) -> Iterator[ReportFigure]:
+    views, curve = results.settings.views, results.curves[category, view]
+    stem += "" if category == "all" else f"-{file_names([category])[0]}"
     suffix = view_suffix(view, views)
     yield ReportFigure(
         f"{stem}-layer-curves{suffix}", in_view("Layer curves", view, views), target,
         "How well a linear probe decodes the label in groups it has not seen, layer by layer, with 95 % intervals "
         f"over groups. {ONLY_FILLED}. Grey: what the same probes reach with labels exchanged between groups. "
         "Dotted: the best control.",
-        position, partial(label_curves, results, view), is_detail=view != views[0],
+        position, partial(label_curves, results, view, category), is_detail=view != views[0],
     )  # fmt: skip
-    if results.steps.size > 1:
+    if curve.steps.size > 1:
         yield ReportFigure(
             f"{stem}-steps{suffix}", in_view("Score by step", view, views), target,
             "The same by inference, at the best site of each part, beside controls. Classes are balanced among "
             "those of the step. A step of one class is easy, so compare with the controls at that step.",
-            position, partial(step_scores, results, view), is_detail=view != views[0],
+            position, partial(step_scores, results, view, category), is_detail=view != views[0],
         )  # fmt: skip
-    if results.classes:
+    if curve.classes:
         yield ReportFigure(
             f"{stem}-confusion{suffix}", in_view("Confusion matrix", view, views), target,
             "Which class the best site of each part predicts for which, in groups it has not seen. Each row sums "
             "to 100 %; the mean of the diagonal is the balanced accuracy.",
-            position, partial(class_confusions, results, view), is_detail=view != views[0],
+            position, partial(class_confusions, results, view, category), is_detail=view != views[0],
         )  # fmt: skip
     else:
         yield ReportFigure(
             f"{stem}-predicted{suffix}", in_view("Predicted against true", view, views), target,
             "A point per sample, predicted by the best site of each part in groups it has not seen. Colours are "
             "groups. Predictions are clipped to the range of the training labels.",
-            position, partial(predicted_values, results, view), is_detail=view != views[0],
+            position, partial(predicted_values, results, view, category), is_detail=view != views[0],
         )  # fmt: skip

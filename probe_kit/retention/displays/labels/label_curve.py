@@ -12,12 +12,12 @@ from probe_kit.retention.displays.base.style import PARTS, layer_axis, significa
 from probe_kit.retention.displays.labels.label_panel import (
     BACKGROUND,
     LabelPanel,
+    label_curve_of,
     label_panels,
-    label_view,
     rows_of,
-    streams_of,
 )
-from probe_kit.train.labels.label_results import METRICS, LabelResults
+from probe_kit.train.crossval.task_scores import METRICS
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -61,22 +61,29 @@ class LabelCurveDisplay(LabelPanel):
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
-    def from_results(cls, results: LabelResults, stream: str = "backbone", view: str | None = None) -> Self:
-        """From stored probes; view: the first probed one by default. Raises UnknownSiteError for either."""
-        view = label_view(results, view)
-        curve, rows = results.curves[view], rows_of(results, view, stream)
+    def from_results(
+        cls,
+        results: ProbeResults,
+        stream: str = "backbone",
+        view: str | None = None,
+        category: str | None = None,
+    ) -> Self:
+        """From stored probes; view, category: by default the first. Raises UnknownSiteError for others."""
+        category, view, curve = label_curve_of(results, view, category)
+        rows = rows_of(curve, stream)
         layers = np.array([curve.sites[row].layer for row in rows])
         numbers = np.unique(layers)
         best = np.array([curve.largest_excess(rows[layers == layer]) for layer in numbers])
         several = int(max((layers == layer).sum() for layer in numbers))
-        table = results.scores[results.scores["view"] == view].set_index("site")
+        scores = results.scores
+        table = scores[(scores["view"] == view) & (scores["category"] == category)].set_index("site")
         shown = table.loc[[str(curve.sites[row]) for row in best]]
         limits = shown[["ci_low", "ci_high"]].to_numpy(dtype=float).T
         null = curve.null[best]
         band = np.full((2, best.size), np.nan)
         if null.shape[1] >= _ENOUGH:
             band = np.percentile(null, [2.5, 97.5], axis=1)
-        controls = results.controls.of_stream(view, stream)
+        controls = results.controls.of_stream(category, view, stream)
         iterations = [curve.sites[row].iteration for row in best]
         return cls(
             target=results.settings.target,
@@ -95,7 +102,7 @@ class LabelCurveDisplay(LabelPanel):
             signal=shown["signal"].to_numpy(dtype=bool),
             control=(controls[0].name, controls[0].score) if controls else None,
             several=several,
-            certificate=ProvenanceLine.of_label(results, view),
+            certificate=ProvenanceLine.of_label(results, category, view),
         )
 
     @property
@@ -147,8 +154,8 @@ class LabelCurveDisplay(LabelPanel):
             axes.set_title(f"control {name} {score:.2f}", fontsize=7, loc="right", color="0.2")
 
 
-def label_curves(results: LabelResults, view: str | None = None) -> "Figure":
+def label_curves(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Score of a label by layer, a panel per stream; arguments and errors as of `LabelCurveDisplay`."""
-    view = label_view(results, view)
-    streams = streams_of(results, view)
-    return label_panels([LabelCurveDisplay.from_results(results, one, view) for one in streams], level=True)
+    category, view, curve = label_curve_of(results, view, category)
+    displays = [LabelCurveDisplay.from_results(results, stream, view, category) for stream in curve.streams]
+    return label_panels(displays, level=True)

@@ -11,7 +11,8 @@ from probe_kit.errors import UnknownSiteError
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.style import axes_for, caption, legend_above, panels, plain
-from probe_kit.train.labels.label_results import LabelResults
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -86,29 +87,28 @@ def _draw_legend(figure: "Figure", grid: "Sequence[Axes]", display: LabelPanel) 
         legend_above(figure, shown)
 
 
-def label_view(results: LabelResults, view: str | None) -> str:
-    """`view`, or the first probed one. Raises UnknownSiteError for one that was not probed."""
-    view = view or results.settings.views[0]
-    if view not in results.curves:
-        raise UnknownSiteError(f"view {view!r} was not probed; probed: {', '.join(results.settings.views)}")
-    return view
+def label_curve_of(results: ProbeResults, view: str | None, category: str | None) -> tuple[str, str, ProbeCurve]:
+    """Return category, view and curve, by default the first. Raises UnknownSiteError for others."""
+    own = results.settings
+    view, category = view or own.views[0], category or own.categories[0]
+    if (category, view) not in results.curves:
+        raise UnknownSiteError(
+            f"view {view!r}, category {category!r} was not probed; probed: {', '.join(own.views)} of "
+            f"{', '.join(own.categories)}"
+        )
+    return category, view, results.curves[category, view]
 
 
-def streams_of(results: LabelResults, view: str) -> list[str]:
-    """The streams that were probed in a view, in order."""
-    return list(dict.fromkeys(site.stream for site in results.curves[view].sites))
-
-
-def rows_of(results: LabelResults, view: str, stream: str) -> NDArray[np.intp]:
-    """Positions of the sites of a stream in the curve of a view. Raises UnknownSiteError without any."""
-    rows = results.curves[view].stream(stream)
+def rows_of(curve: ProbeCurve, stream: str) -> NDArray[np.intp]:
+    """Return the positions of the sites of a stream. Raises UnknownSiteError without any."""
+    rows = curve.stream(stream)
     if not rows.size:
         raise UnknownSiteError(
-            f"stream {stream!r} was not probed in view {view!r}; probed: {', '.join(streams_of(results, view))}"
+            f"stream {stream!r} was not probed in this view; probed: {', '.join(curve.streams)}"
         )
     return rows
 
 
-def best_row(results: LabelResults, view: str, stream: str) -> int:
-    """Position of the site of a stream that has the largest score above its own chance."""
-    return results.curves[view].largest_excess(rows_of(results, view, stream))
+def best_row(curve: ProbeCurve, stream: str) -> int:
+    """Return the position of the site of a stream that has the largest score above its own chance."""
+    return curve.largest_excess(rows_of(curve, stream))

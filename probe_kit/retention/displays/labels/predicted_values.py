@@ -11,11 +11,11 @@ from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.labels.label_panel import (
     LabelPanel,
     best_row,
+    label_curve_of,
     label_panels,
-    label_view,
-    streams_of,
 )
-from probe_kit.train.labels.label_results import METRICS, LabelResults
+from probe_kit.train.crossval.task_scores import METRICS
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,25 +47,31 @@ class PredictedValuesDisplay(LabelPanel):
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
-    def from_results(cls, results: LabelResults, stream: str = "backbone", view: str | None = None) -> Self:
-        """From stored probes of a continuous label; view: the first probed one by default.
+    def from_results(
+        cls,
+        results: ProbeResults,
+        stream: str = "backbone",
+        view: str | None = None,
+        category: str | None = None,
+    ) -> Self:
+        """From stored probes of a continuous label; view, category: the first probed one by default.
 
         Raises UnknownSiteError for a view or stream that was not probed, UsageError for a label of classes.
         """
-        view = label_view(results, view)
+        category, view, curve = label_curve_of(results, view, category)
         if results.settings.task != "continuous":
             raise UsageError(f"the label {results.settings.target!r} is of classes; expected a continuous one")
-        curve, row = results.curves[view], best_row(results, view, stream)
+        row = best_row(curve, stream)
         return cls(
             target=results.settings.target,
             view=view,
             stream=stream,
             site=str(curve.sites[row]),
             score=float(curve.metric[row]),
-            true=results.labels,
-            predicted=curve.predictions[row],
-            groups=np.unique(results.groups, return_inverse=True)[1].astype(np.int64),
-            certificate=ProvenanceLine.of_label(results, view),
+            true=curve.labels,
+            predicted=curve.decisions[row],
+            groups=np.unique(curve.groups, return_inverse=True)[1].astype(np.int64),
+            certificate=ProvenanceLine.of_label(results, category, view),
         )
 
     @property
@@ -90,8 +96,8 @@ class PredictedValuesDisplay(LabelPanel):
         axes.set_xlabel("true value", fontsize=8.5)
 
 
-def predicted_values(results: LabelResults, view: str | None = None) -> "Figure":
+def predicted_values(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Predicted against true, a panel per stream; arguments and errors as of `PredictedValuesDisplay`."""
-    view = label_view(results, view)
-    displays = [PredictedValuesDisplay.from_results(results, one, view) for one in streams_of(results, view)]
+    category, view, curve = label_curve_of(results, view, category)
+    displays = [PredictedValuesDisplay.from_results(results, stream, view, category) for stream in curve.streams]
     return label_panels(displays, level=True)

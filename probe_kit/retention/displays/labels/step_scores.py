@@ -12,11 +12,12 @@ from probe_kit.retention.displays.base.style import GREEN, PARTS, Line, signific
 from probe_kit.retention.displays.labels.label_panel import (
     LabelPanel,
     best_row,
+    label_curve_of,
     label_panels,
-    label_view,
-    streams_of,
 )
-from probe_kit.train.labels.label_results import METRICS, LabelControl, LabelResults, score_interval
+from probe_kit.train.crossval.task_scores import METRICS, score_interval
+from probe_kit.train.results.control_scores import ControlScore
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -54,27 +55,35 @@ class StepScoresDisplay(LabelPanel):
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
-    def from_results(cls, results: LabelResults, stream: str = "backbone", view: str | None = None) -> Self:
-        """From stored probes; view: the first probed one by default.
+    def from_results(
+        cls,
+        results: ProbeResults,
+        stream: str = "backbone",
+        view: str | None = None,
+        category: str | None = None,
+    ) -> Self:
+        """From stored probes; view, category: the first probed one by default.
 
         Raises UnknownSiteError for a view or stream that was not probed, UsageError for labels of a single step.
         """
-        view = label_view(results, view)
-        if results.steps.size < 2:
+        category, view, curve = label_curve_of(results, view, category)
+        if curve.steps.size < 2:
             raise UsageError(f"the label {results.settings.target!r} has one step; expected several to show")
-        curve, row = results.curves[view], best_row(results, view, stream)
+        row = best_row(curve, stream)
         own, scores = results.settings, curve.scores[row]
-        table = results.scores[results.scores["view"] == view].set_index("site")
-        balanced = results.step_scores(scores)
+        scores_of_sites = results.scores
+        of_place = (scores_of_sites["view"] == view) & (scores_of_sites["category"] == category)
+        table = scores_of_sites[of_place].set_index("site")
+        balanced = curve.step_scores(scores)
         limits = [
             score_interval(
                 balanced[at_step],
-                results.labels[at_step],
-                results.groups[at_step],
+                curve.labels[at_step],
+                curve.groups[at_step],
                 own.task,
-                results.deviations[at_step],
+                curve.deviations[at_step],
             )
-            for at_step in (results.places == step for step in results.steps)
+            for at_step in (curve.places == step for step in curve.steps)
         ]
         return cls(
             target=own.target,
@@ -84,13 +93,13 @@ class StepScoresDisplay(LabelPanel):
             part=curve.parts[row],
             site=str(curve.sites[row]),
             signal=bool(table.loc[str(curve.sites[row]), "signal"]),
-            steps=results.steps,
-            from_event=results.aligned is not None,
-            score=results.by_step(scores),
+            steps=curve.steps,
+            from_event=curve.aligned is not None,
+            score=curve.by_step(scores),
             low=np.array([low for low, _ in limits]),
             high=np.array([high for _, high in limits]),
-            controls={one.name: np.array(one.by_step) for one in _shown(results, view, stream)},
-            certificate=ProvenanceLine.of_label(results, view),
+            controls={one.name: np.array(one.by_step) for one in _with_steps(results, category, view, stream)},
+            certificate=ProvenanceLine.of_label(results, category, view),
         )
 
     @property
@@ -130,9 +139,10 @@ class StepScoresDisplay(LabelPanel):
         _whole_numbers(axes, "inferences from the event on" if self.from_event else "inference of the episode")
 
 
-def _shown(results: LabelResults, view: str, stream: str) -> list[LabelControl]:
-    """The best control and `step`, each once; none of results that were stored without scores by step."""
-    own = [one for one in results.controls.of_stream(view, stream) if len(one.by_step) == results.steps.size]
+def _with_steps(results: ProbeResults, category: str, view: str, stream: str) -> list[ControlScore]:
+    """The best control and `step`, each once; none of controls that were stored without scores by step."""
+    steps = results.curves[category, view].steps.size
+    own = [one for one in results.controls.of_stream(category, view, stream) if len(one.by_step) == steps]
     return [one for number, one in enumerate(own) if number == 0 or one.name == STEP]
 
 
@@ -143,8 +153,8 @@ def _whole_numbers(axes: "Axes", label: str) -> None:
     axes.set_xlabel(label, fontsize=8.5)
 
 
-def step_scores(results: LabelResults, view: str | None = None) -> "Figure":
+def step_scores(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Score of a label by step, a panel per stream; arguments and errors as of `StepScoresDisplay`."""
-    view = label_view(results, view)
-    streams = streams_of(results, view)
-    return label_panels([StepScoresDisplay.from_results(results, one, view) for one in streams], level=True)
+    category, view, curve = label_curve_of(results, view, category)
+    displays = [StepScoresDisplay.from_results(results, stream, view, category) for stream in curve.streams]
+    return label_panels(displays, level=True)

@@ -1,0 +1,299 @@
+"""Built-in label columns of a run: `sim.*` of its trajectories, `item.*` of its plan."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.runs.action_errors import compare_actions, why_not_compared
+from probe_kit.train.choices import Task
+from probe_kit.train.columns.cells import Cell
+from probe_kit.train.columns.table import EPISODE, INFERENCE
+from probe_kit.train.data.captured_call import captured_calls
+from probe_kit.train.data.run_reader import RunReader
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SIM, ITEM, RECORDED, PLAYED = "sim.", "item.", "dataset.", "env."
+ACTION_ERROR = "action_error"
+"""Of a shown frame: root mean square of predicted minus recorded first action, in recorded deviations."""
+OUTCOME = "env.outcome"
+"""Whether an episode in an environment of one's own succeeded, once per episode."""
+PHASES = ("before grasp", "holding", "after release")
+
+
+@dataclass(frozen=True)
+class BuiltinColumn:
+    """A built-in column. episodes: (n,) ids. inferences: (n,), None for one label per episode. cells: (n,).
+
+    task: None where the values decide it.
+    """
+
+    task: Task | None
+    episodes: tuple[str, ...]
+    inferences: tuple[int, ...] | None
+    cells: tuple[Cell, ...]
+
+
+@dataclass(frozen=True)
+class Instant:
+    """A frame of a trajectory, and the side of the correct picture."""
+
+    seen: Any
+    side: str
+    frame: int
+
+    def tool(self, axis: int) -> float:
+        """Where the hand is, metres in the world frame."""
+        return float(self.seen.tool[self.frame, axis])
+
+    def cube(self, axis: int) -> float:
+        """Where the cube is, metres in the world frame."""
+        return float(self.seen.cube[self.frame, axis])
+
+    @property
+    def distance_correct(self) -> float:
+        """Of the cube to the middle of the correct picture, from above, metres."""
+        away = self.seen.cube[self.frame, :2] - self.seen.tile(self.side)[self.frame, :2]
+        return float(np.hypot(*away))
+
+    @property
+    def steps_to_grasp(self) -> float | None:
+        """Control steps to the first grasp, negative behind it; None if there is none."""
+        held = self._held
+        return float(held[0] - self.frame) if held.size else None
+
+    @property
+    def phase(self) -> str:
+        """One of PHASES; the release is the last one of the episode."""
+        held = self._held
+        if not held.size or self.frame < held[0]:
+            return PHASES[0]
+        return PHASES[1] if self.frame <= held[-1] else PHASES[2]
+
+    @property
+    def _held(self) -> NDArray[np.intp]:
+        """Frames in which both fingers touch the cube."""
+        return np.flatnonzero(self.seen.held)
+
+
+SIM_COLUMNS: dict[str, tuple[Task, Callable[[Instant], Cell]]] = {
+    "tool_x": ("continuous", lambda at: at.tool(0)),
+    "tool_y": ("continuous", lambda at: at.tool(1)),
+    "tool_z": ("continuous", lambda at: at.tool(2)),
+    "cube_x": ("continuous", lambda at: at.cube(0)),
+    "cube_y": ("continuous", lambda at: at.cube(1)),
+    "cube_z": ("continuous", lambda at: at.cube(2)),
+    "distance_correct": ("continuous", lambda at: at.distance_correct),
+    "steps_to_grasp": ("continuous", lambda at: at.steps_to_grasp),
+    "held": ("binary", lambda at: bool(at.seen.held[at.frame])),
+    "phase": ("classes", lambda at: at.phase),
+}
+"""Task and value of every `sim.*` column."""
+
+ITEM_COLUMNS = {
+    "named": "concept of the correct picture, which the instruction names",
+    "other": "concept of the wrong picture",
+    "left": "concept of the left picture",
+    "category": "category of the item",
+    "pair": "both concepts, in alphabetical order",
+}
+
+
+def builtin_column(run: RunReader, name: str) -> BuiltinColumn:
+    """The built-in column `name` of a run, for every episode or captured inference that it has.
+
+    Raises UsageError for another name and for a run of which nothing such is stored; NoTrajectoryError without
+    trajectories.
+    """
+    if name.startswith(SIM) and name.removeprefix(SIM) in SIM_COLUMNS:
+        task, value = SIM_COLUMNS[name.removeprefix(SIM)]
+        found = list(_inferences(run))
+        of_frames = _of_frames(run, [value])
+        keys = tuple(zip(*found, strict=True)) or ((), ())
+        return BuiltinColumn(task, keys[0], keys[1], tuple(cells[0] for cells in of_frames))
+    if name.startswith(ITEM) and name.removeprefix(ITEM) in ITEM_COLUMNS:
+        ids = tuple(run.episodes[EPISODE].astype(str))
+        return BuiltinColumn("classes", ids, None, tuple(_of_item(run, name.removeprefix(ITEM))))
+    if name == OUTCOME and OUTCOME in outcome_column(run):
+        outcomes = tuple(run.episodes["outcome"].astype(str))
+        return BuiltinColumn("binary", tuple(run.episodes[EPISODE].astype(str)), None, outcomes)
+    if name.startswith((RECORDED, PLAYED)):
+        return _of_source(run, name)
+    raise UsageError(f"there is no built-in column {name!r}; there are: {', '.join(builtin_names())}")
+
+
+def _of_source(run: RunReader, name: str) -> BuiltinColumn:
+    """A column of the data set or environment for every shown frame, such as `dataset.state.x` or `env.held`."""
+    prefix, columns = prefix_of(run), recorded_columns(run)
+    wanted = name.removeprefix(prefix)
+    if not name.startswith(prefix) or wanted not in columns:
+        asked = "recordings" if name.startswith(RECORDED) else "an environment of your own"
+        there = ", ".join(prefix + one for one in columns) or f"none, because the run is not of {asked}"
+        raise UsageError(f"{run.location} has no column {name}; there are: {there}")
+    found = list(_inferences(run))
+    rows = _rows(run, [episode for episode, _ in found])
+    calls = [call for _, call in found]
+    cells = _cells(run, wanted, columns[wanted][rows, calls])
+    episodes, inferences = zip(*found, strict=True)
+    return BuiltinColumn(None, episodes, inferences, cells)
+
+
+def _cells(run: RunReader, name: str, values: NDArray[np.float64]) -> tuple[Cell, ...]:
+    """The values (n,) of a column of a run's own source: numbers, or truth values where the source says so."""
+    cells = [_finite(float(value)) for value in values]
+    if name not in run.inputs.truths:  # type: ignore[attr-defined]  # only runs have inputs
+        return tuple(cells)
+    return tuple(bool(cell) if cell in (0, 1) else cell for cell in cells)
+
+
+def prefix_of(run: RunReader) -> str:
+    """In front of the columns of a run's own source."""
+    return PLAYED if getattr(run, "in_own_environment", False) else RECORDED
+
+
+def outcome_column(run: RunReader) -> dict[str, list[str]]:
+    """The column `env.outcome`, a text per episode; empty for a run in which all episodes end alike."""
+    if not getattr(run, "in_own_environment", False) or run.episodes["outcome"].nunique() < 2:
+        return {}
+    return {OUTCOME: run.episodes["outcome"].astype(str).tolist()}
+
+
+def recorded_columns(run: RunReader) -> dict[str, NDArray[np.float64]]:
+    """(E, C) values of data set or environment by name, of every shown frame; none for a run of scenes."""
+    inputs = getattr(run, "inputs", None)
+    if inputs is None:
+        return {}
+    found = {name: inputs.column(name) for name in inputs.columns}
+    for kind, names in inputs.names.items():
+        if kind in inputs.kinds:
+            values = inputs.read(kind)
+            now = values if kind == "state" else values[:, :, 0]
+            found |= {f"{kind}.{name}": now[..., place].astype(np.float64) for place, name in enumerate(names)}
+    if getattr(run, "recorded", False) and why_not_compared(run) is None:  # type: ignore[arg-type]  # only runs have inputs
+        found[ACTION_ERROR] = compare_actions(run).of_frames[0]  # type: ignore[arg-type]
+    return found
+
+
+def is_builtin(name: str) -> bool:
+    """Whether a name is that of a built-in column by its prefix; a run may lack it still."""
+    return name.startswith((SIM, ITEM, RECORDED, PLAYED))
+
+
+def builtin_names() -> list[str]:
+    """Names of all built-in columns."""
+    return [*(SIM + name for name in SIM_COLUMNS), *(ITEM + name for name in ITEM_COLUMNS)]
+
+
+def label_frame(run: RunReader) -> "pd.DataFrame":
+    """Keys and built-in columns of a run: a row per episode and captured inference, to be extended by columns.
+
+    Besides the keys `episode_id` and `inference` there are `control_step`, `group_id`, `category` and the built-in
+    columns that the run has; one without trajectories or control steps has no `sim.*`, see `why_no_sim`. Of
+    recordings there are `source_episode`, `frame`, `instruction` and the columns `dataset.*` instead, of an
+    environment of one's own `instruction` and `env.*`.
+    """
+    import pandas as pd
+
+    ids, inferences = zip(*_inferences(run), strict=True)
+    rows = _rows(run, ids)
+    table: dict[str, Sequence[Any]] = {EPISODE: ids, INFERENCE: inferences}
+    sim: dict[str, Any] = {}
+    if why_no_sim(run) is None:
+        values = _of_frames(run, [value for _, value in SIM_COLUMNS.values()])
+        sim = dict(zip((SIM + name for name in SIM_COLUMNS), zip(*values, strict=True), strict=True))
+        table["control_step"] = [frame for _, _, frames in frames_of_inferences(run) for frame in frames]
+    if getattr(run, "recorded", False):
+        steps = run.control_steps  # type: ignore[attr-defined]
+        table["source_episode"] = run.episodes["source_episode"].iloc[rows].tolist()
+        table["frame"] = steps[rows, list(inferences)].tolist()
+    if getattr(run, "in_own_environment", False):
+        table["control_step"] = run.control_steps[rows, list(inferences)].tolist()  # type: ignore[attr-defined]
+    if getattr(run, "inputs", None) is not None:
+        table["instruction"] = run.episodes["instruction"].iloc[rows].tolist()
+        sim = {
+            prefix_of(run) + name: list(_cells(run, name, own[rows, list(inferences)]))
+            for name, own in recorded_columns(run).items()
+        }
+        sim |= {name: [cells[row] for row in rows] for name, cells in outcome_column(run).items()}
+    for name in ("group_id", "category"):
+        table[name] = run.episodes[name].iloc[rows].tolist()
+    table |= sim
+    for name in ITEM_COLUMNS if getattr(run, "inputs", None) is None else ():
+        if set(_needed(name)) <= set(run.episodes):
+            cells = list(_of_item(run, name))
+            table[ITEM + name] = [cells[row] for row in rows]
+    return pd.DataFrame(table)
+
+
+def why_no_sim(run: RunReader) -> str | None:
+    """Why a run has no `sim.*` columns; None if it has them."""
+    try:
+        next(frames_of_inferences(run), None)
+    except UsageError as error:
+        return str(error)
+    return None
+
+
+def _rows(run: RunReader, ids: Sequence[str]) -> NDArray[np.intp]:
+    place = {name: row for row, name in enumerate(run.episodes[EPISODE].astype(str))}
+    return np.array([place[name] for name in ids], np.intp)
+
+
+def _inferences(run: RunReader) -> Iterator[tuple[str, int]]:
+    """Episode and number of every captured inference, in the order of the episodes."""
+    reached = [run.reached(call) for call in range(captured_calls(run))] if hasattr(run, "reached") else None
+    for row, name in enumerate(run.episodes[EPISODE].astype(str)):
+        count = 1 if reached is None else sum(bool(own[row]) for own in reached)
+        yield from ((name, call) for call in range(count))
+
+
+def frames_of_inferences(run: RunReader) -> Iterator[tuple[Any, int, list[int]]]:
+    """Trajectory, row and frames of the captured inferences of every episode.
+
+    The frame of an inference is its control step: the state after so many actions. Raises UsageError for a run
+    that stores no control steps, NoTrajectoryError for one without trajectories.
+    """
+    if not hasattr(run, "trajectories") or not hasattr(run, "control_steps"):
+        raise UsageError(f"{run.location} has no trajectories; `sim.*` and the state need them")
+    trajectories, steps, calls = run.trajectories, run.control_steps, captured_calls(run)
+    reached = np.array([run.reached(call) for call in range(calls)])  # type: ignore[attr-defined]
+    for row, seen in enumerate(trajectories):
+        yield seen, row, [int(steps[row, call]) for call in range(calls) if reached[call, row]]
+
+
+def _of_frames(run: RunReader, values: Sequence[Callable[[Instant], Cell]]) -> Iterator[list[Cell]]:
+    """The cells of some `sim.*` columns for every captured inference."""
+    for seen, row, frames in frames_of_inferences(run):
+        side = str(run.episodes["side_correct"].iloc[row])
+        for frame in frames:
+            yield [_finite(value(Instant(seen, side, frame))) for value in values]
+
+
+def _finite(value: Cell) -> Cell:
+    """A cell that is a number or nothing: a broken simulation leaves NaN."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _needed(name: str) -> tuple[str, ...]:
+    """Columns of the episodes that an `item.*` column is made of."""
+    if name == "category":
+        return ("category",)
+    return "target_concept", "distractor_concept", "side_correct"
+
+
+def _of_item(run: RunReader, name: str) -> Iterator[Cell]:
+    if lacking := [column for column in _needed(name) if column not in run.episodes]:
+        raise UsageError(f"the episodes of {run.location} lack the column {lacking[0]!r} of {ITEM}{name}")
+    for row in run.episodes[list(_needed(name))].astype(str).to_dict("records"):
+        if name == "category":
+            yield row["category"]
+            continue
+        correct, wrong, side = (row[column] for column in _needed(name))
+        left = correct if side == "left" else wrong
+        pair = " / ".join(sorted((correct, wrong)))
+        yield {"named": correct, "other": wrong, "left": left, "pair": pair}[name]

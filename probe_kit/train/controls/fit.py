@@ -1,0 +1,198 @@
+"""Fitting of controls for probe results, with all checks before the first fit."""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import SuiteNotFoundError, UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.statistics.label_permutations import pointwise_p
+from probe_kit.statistics.paired_bootstrap import better_than_reference
+from probe_kit.train.choices import CONTROLS
+from probe_kit.train.controls.features import LAYERS, PICTURED, ControlInputs, control_features, why_impossible
+from probe_kit.train.crossval.site_probe import SiteProbe
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_suite import suite_of
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.problem import Problem
+from probe_kit.train.results.control_scores import RANDOM_FEATURES, ControlComparison, Controls, ControlScore
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.target_samples import TargetSamples
+
+SIDE_DEFAULT = (RANDOM_FEATURES, "pixels")
+"""Controls of a side that are run where the suite's pictures are, unless others, or none, are requested."""
+NOT_BY_DEFAULT = frozenset({"action", "position"})
+"""Controls of other targets that must be asked for.
+
+A policy's own action is no leak: whether a site exceeds it is another question. The layout is in no instruction.
+"""
+
+
+@dataclass(frozen=True)
+class PreparedControls:
+    """Controls that are still to be run. left_out: why a default one cannot be, by name."""
+
+    names: tuple[str, ...]
+    inputs: ControlInputs
+    left_out: Mapping[str, str]
+
+
+def prepare_controls(
+    run: RunReader,
+    samples: TargetSamples,
+    is_side: bool,
+    names: Sequence[str] | None,
+    folder: Path | None,
+    stored: Controls,
+    categories: Sequence[str],
+) -> PreparedControls:
+    """Return the controls `names` that `stored` does not have yet, before anything is probed.
+
+    names: None for those that are run by default; of them what is not possible is left out, with a warning where
+    pictures are missing. folder: of the run's suite, see `suite_of`. Raises UsageError for a control that was
+    asked for and is unknown or not possible, and what `suite_of` raises.
+    """
+    own = control_features(run)
+    available = (*own, *(name for name in CONTROLS if name not in own))
+    if unknown := [name for name in names or () if name not in available]:
+        raise UsageError(f"unknown control {unknown[0]!r}; expected some of {', '.join(available)}")
+    default = SIDE_DEFAULT if is_side else tuple(name for name in available if name not in NOT_BY_DEFAULT)
+    ordered = [name for name in available if name in (default if names is None else names)]
+    reasons = {name: why for name, why in why_impossible(run, samples).items() if name not in own}
+    if names is not None and (wrong := [name for name in ordered if name in reasons]):
+        raise UsageError(f"the control {wrong[0]!r} is not possible: {reasons[wrong[0]]}. Leave it out")
+    left_out = {name: reasons[name] for name in ordered if name in reasons}
+    missing = [name for name in ordered if name not in reasons and not stored.has(name, categories)]
+    suite = None
+    if PICTURED.intersection(missing).difference(own) and getattr(run, "inputs", None) is None:
+        try:
+            suite = suite_of(run, folder)
+        except SuiteNotFoundError as error:
+            if names is not None:
+                raise
+            lost = [name for name in missing if name in PICTURED]
+            _warn_of_no_control(lost, error, is_side)
+            left_out |= dict.fromkeys(lost, "the pictures of the suite were not found")
+            missing = [name for name in missing if name not in PICTURED]
+    return PreparedControls(tuple(missing), ControlInputs(run, samples, is_side, suite), left_out)
+
+
+def _warn_of_no_control(lost: Sequence[str], reason: SuiteNotFoundError, is_side: bool) -> None:
+    names = f"control {lost[0]} is" if len(lost) == 1 else f"controls {' and '.join(lost)} are"
+    judged = ", so that a signal is judged against chance only" if is_side and RANDOM_FEATURES in lost else ""
+    warnings.warn(
+        f"the {names} on by default and NOT run{judged}: {reason}; or say that you want none (--controls none, "
+        "controls=())",
+        stacklevel=4,
+    )
+
+
+def add_controls(
+    results: ProbeResults, problems: Mapping[str, Problem], widths: Mapping[str, int], prepared: PreparedControls
+) -> ProbeResults:
+    """Return `results` with these controls for every category. widths: of every stream, for `random-features`.
+
+    Every site is compared with `random-features`, and of targets but a side with every control.
+    """
+    before = results.controls
+    missing = {**before.left_out, **prepared.left_out}
+    controls = replace(before, left_out={name: why for name, why in missing.items() if name not in before.names})
+    seed = results.settings.seed
+    for name in prepared.names:
+        features = None if name == RANDOM_FEATURES else Samples.pooled(prepared.inputs.features(name))
+        for category, problem in problems.items():
+            if features is None:
+                references = {
+                    stream: problem.curve(_named(_layer_probes(prepared.inputs, problem, width, seed)))
+                    for stream, width in widths.items()
+                }
+                scores = _layer_scores(category, references, problem.is_side)
+            else:
+                reference = problem.curve(_named([problem.probe(features)]))
+                references = dict.fromkeys(widths, reference)
+                scores = [control_score(name, category, reference)]
+            compared = name == RANDOM_FEATURES or not problem.is_side
+            comparisons = list(_compared(results, name, category, references)) if compared else []
+            controls = controls.with_scores(scores, comparisons)
+    return replace(results, controls=controls)
+
+
+def _named(probes: Sequence[SiteProbe]) -> dict[Site, SiteProbe]:
+    """Probes of controls by sites that stand for none."""
+    return {Site("control", number): probe for number, probe in enumerate(probes)}
+
+
+def _layer_probes(inputs: ControlInputs, problem: Problem, width: int, seed: int) -> list[SiteProbe]:
+    """Probes of the random layers, without label permutations."""
+    kind = "binding" if problem.is_side else "label random features"
+    layers = (inputs.layer(problem.positions, width, derive_seed(kind, seed, number)) for number in range(LAYERS))
+    return [problem.fit(Samples.pooled(layer)) for layer in layers]
+
+
+def _layer_scores(category: str, references: Mapping[str, ProbeCurve], is_side: bool) -> list[ControlScore]:
+    """One score as wide as the backbone for a side, else one for every stream."""
+    if is_side:
+        widest = references.get("backbone", next(iter(references.values())))
+        return [control_score(RANDOM_FEATURES, category, widest)]
+    return [control_score(RANDOM_FEATURES, category, curve, stream) for stream, curve in references.items()]
+
+
+def control_score(name: str, category: str, curve: ProbeCurve, stream: str = "", view: str = "") -> ControlScore:
+    """Return the mean score of the probes of a control, with p where a single one has label permutations."""
+    score, limits = curve.estimate(np.arange(len(curve.sites)))
+    p = float(pointwise_p(curve.metric.mean(keepdims=True), curve.null.mean(axis=0)[None, :])[0])
+    chance = float(curve.chance.mean())
+    by_step = (
+        np.mean([curve.by_step(scores) for scores in curve.scores], axis=0) if not curve.is_side else np.empty(0)
+    )
+    return ControlScore(
+        name=name,
+        category=category,
+        score=score,
+        ci=limits,
+        p=None if np.isnan(p) else p,
+        chance=None if np.isnan(chance) else chance,
+        n=curve.labels.size,
+        stream=stream,
+        view=view,
+        by_step=tuple(by_step.tolist()),
+    )
+
+
+def _compared(
+    results: ProbeResults, name: str, category: str, references: Mapping[str, ProbeCurve]
+) -> Iterator[ControlComparison]:
+    for (own, view), curve in results.curves.items():
+        for stream in curve.streams if own == category else ():
+            rows, reference = curve.stream(stream), references[stream].scores.mean(axis=0)
+            seed = _seed(results, name, category, view, stream)
+            p = better_than_reference(curve.scores[rows], reference, curve.groups, seed, curve.widening)
+            yield from comparisons(name, category, view, curve, rows, float(reference.mean()), p)
+
+
+def _seed(results: ProbeResults, name: str, category: str, view: str, stream: str) -> int:
+    own = results.settings
+    if own.is_side:
+        return derive_seed("binding", own.seed, category, view, stream)
+    place = (view, stream) if own.categories == ("all",) else (category, view, stream)
+    return derive_seed("label control", own.seed, name, *place)
+
+
+def comparisons(
+    name: str,
+    category: str,
+    view: str,
+    curve: ProbeCurve,
+    rows: NDArray[np.intp],
+    reference: float,
+    p: NDArray[np.float64],
+) -> Iterator[ControlComparison]:
+    """Yield the comparison of every site at `rows` with a control, from (len(rows),) p."""
+    for row, of_site in zip(rows, p, strict=True):
+        yield ControlComparison(name, category, view, str(curve.sites[row]), reference, float(of_site))

@@ -1,0 +1,86 @@
+"""A score per sample whose mean is the metric of a task.
+
+| task | score of sample i | mean |
+|---|---|---|
+| binary, classes | 1[prediction = label] / (K π), with K classes and the label's share π | balanced accuracy |
+| continuous | 1 − (y − ŷ)² / mean (y − ȳ)², ȳ the mean of the fold's training labels | R² |
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.statistics.estimates.shares import Accuracy
+from probe_kit.statistics.folds import SHARED_TRAINING, Fold
+from probe_kit.statistics.student import explained_interval
+from probe_kit.train.choices import Task
+
+Matrix = NDArray[np.float64]
+
+METRICS: dict[Task, str] = {"binary": "balanced accuracy", "classes": "balanced accuracy", "continuous": "R²"}
+
+
+def balanced_scores(predicted: Matrix, truth: Matrix) -> Matrix:
+    """(n, K) scores of predicted classes (n, K); every column of truth (n, K) has each class as often."""
+    scores: Matrix = (predicted == truth) * class_weights(truth)
+    return scores
+
+
+def class_weights(labels: NDArray[np.floating]) -> Matrix:
+    """Return the weights 1 / (K π) of coded labels (n,), with K classes and the label's share π.
+
+    Also of (n, K) columns, each of which has each class as often.
+    """
+    classes, counts = np.unique(labels.reshape(len(labels), -1)[:, 0], return_counts=True)
+    weights: Matrix = (1 / (classes.size * (counts / len(labels))))[np.searchsorted(classes, labels)]
+    return weights
+
+
+def explained_scores(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> Matrix:
+    """(n, K) scores of predicted quantities (n, K)."""
+    scores: Matrix = 1 - (truth - predicted) ** 2 / squared_deviations(truth, folds).mean(axis=0)
+    return scores
+
+
+def squared_deviations(truth: Matrix, folds: list[Fold]) -> Matrix:
+    """Return (n, K) squared deviations of quantities from the mean of their fold's training labels."""
+    deviations = np.empty_like(truth)
+    for fold in folds:
+        deviations[fold.test] = (truth[fold.test] - truth[fold.train].mean(axis=0)) ** 2
+    return deviations
+
+
+def fold_spearman(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> float:
+    """Spearman's ρ of (n,) predictions and labels within each test fold, averaged; NaN where neither varies.
+
+    Within, because every fold's probe has its own mean.
+    """
+    from scipy.stats import rankdata  # type: ignore[import-untyped]
+
+    found = []
+    for fold in folds:
+        ranks = [rankdata(values[fold.test]) for values in (predicted, truth)]
+        if all(np.ptp(one) > 0 for one in ranks):
+            found.append(float(np.corrcoef(*ranks)[0, 1]))
+    return float(np.mean(found)) if found else float("nan")
+
+
+def score_interval(
+    scores: Matrix,
+    labels: Matrix,
+    groups: NDArray[np.str_],
+    task: Task,
+    deviations: Matrix | None = None,
+) -> tuple[float, float]:
+    """Return the 95 % interval of the mean of (n,) scores, groups as the unit.
+
+    labels: (n,) coded. deviations: (n,) of a quantity from the mean of its fold's training labels, squared; None
+    for a probe that was fitted elsewhere, whose R² compares with the mean of these labels. Balanced accuracy has
+    Wilson's interval (`Accuracy`), R² that of `explained_interval`, which is approximate.
+    """
+    if task == "continuous":
+        if deviations is None:
+            return explained_interval(scores, (labels - labels.mean()) ** 2, groups)
+        return explained_interval(scores, deviations, groups, SHARED_TRAINING)
+    weights = class_weights(labels)
+    interval = Accuracy.of((scores / weights).clip(0, 1), groups, weights).interval()
+    return interval.low, interval.high

@@ -1,1 +1,0 @@
-"""Controls of a label: other inputs, and another network, for the same probe."""

@@ -1,0 +1,370 @@
+"""The probing problem of a category: samples, labels, folds, label permutations."""
+
+import warnings
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.statistics.folds import OUTER_FOLDS, fold_numbers, fold_units, stratified_folds, sums_by_group
+from probe_kit.statistics.label_permutations import (
+    exchange_blocks,
+    exchange_groups,
+    flip_groups,
+    movable_share,
+    smallest_p,
+)
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.choices import Task
+from probe_kit.train.crossval.metrics import chance_level
+from probe_kit.train.crossval.nested_folds import Matrix, NestedFold, nested_folds
+from probe_kit.train.crossval.site_probe import SiteProbe, probe_labels, probe_site
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.samples import Samples
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.settings import ProbeSettings
+from probe_kit.train.target import Target
+from probe_kit.train.target_samples import EVERYWHERE, TargetSamples
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MOST_OF_ONE_SIDE = 0.75
+"""Share of episodes with the same correct side above which a category is refused; it is 0.5 if none is missing."""
+LEAST_MOVABLE = 0.5
+"""Share of the samples that must have another group to exchange with; below it there is no p."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The samples, labels, folds and label permutations that all sites of a category share.
+
+    positions: (E,) places of the category's samples among those of the target. labels: (E,) bool of a side, else
+    coded. permuted_labels: (E, P). token_permutations: how many of them are fitted where every token is a sample.
+    classes: their names, empty for a quantity.
+    """
+
+    task: Task
+    is_side: bool
+    classes: tuple[str, ...]
+    positions: NDArray[np.intp]
+    samples: TargetSamples
+    episodes: NDArray[np.str_]
+    items: NDArray[np.str_]
+    labels: NDArray[Any]
+    permuted_labels: NDArray[Any]
+    folds: list[NestedFold]
+    token_permutations: int = 0
+
+    @property
+    def groups(self) -> NDArray[np.str_]:
+        """(E,) group of every sample."""
+        return self.samples.groups
+
+    @cached_property
+    def fold_of(self) -> NDArray[np.int64]:
+        """(E,) outer fold that tests a sample."""
+        return fold_numbers([fold.outer for fold in self.folds])
+
+    def probe(self, samples: Samples) -> SiteProbe:
+        """Probe one site; `samples` are those of all samples of the target."""
+        drawn = self.permuted_labels if samples.pools else self.permuted_labels[:, : self.token_permutations]
+        return self.fit(samples.of(self.positions), drawn)
+
+    def fit(self, samples: Samples, permuted_labels: NDArray[Any] | None = None) -> SiteProbe:
+        """Probe the samples of this category, and again for every column of (E, P) permuted labels."""
+        permuted = self.permuted_labels[:, :0] if permuted_labels is None else permuted_labels
+        if self.is_side:
+            return probe_site(samples, self.labels, permuted, self.folds)
+        return probe_labels(samples, np.column_stack([self.labels, permuted]), self.task, self.folds)
+
+    def curve(self, probes: Mapping[Site, SiteProbe], parts: tuple[str, ...] = ()) -> ProbeCurve:
+        """Return the curve of the probes of some sites, in order."""
+        own = list(probes.values())
+        return ProbeCurve(
+            sites=tuple(probes),
+            labels=self.labels,
+            episodes=self.episodes,
+            items=self.items,
+            groups=self.groups,
+            fold_of=self.fold_of,
+            decisions=np.stack([probe.decisions for probe in own]),
+            strengths=np.stack([probe.strengths for probe in own]),
+            null=np.stack([probe.null for probe in own]),
+            inner=np.stack([sums_by_group(probe.inner, self.groups) for probe in own]).astype(np.float32),
+            parts=parts,
+            task=self.task,
+            is_side=self.is_side,
+            classes=self.classes,
+            sample_scores=None if self.is_side else np.stack([probe.scores for probe in own]),
+            inferences=self.samples.inferences.astype(np.int64),
+            aligned=None if self.samples.aligned is None else self.samples.aligned.astype(np.int64),
+            smallest_p=None if self.is_side else least_p(self.labels, self.permuted_labels[:, : own[0].null.size]),
+        )
+
+
+def make_problem(
+    run: RunReader, target: Target, samples: TargetSamples, category: str, settings: ProbeSettings
+) -> Problem:
+    """Return the probing problem of one category, or of all samples for `all`.
+
+    Raises TooFewGroupsError, UnbalancedEpisodesError for a side and, for concept folds without concepts,
+    UsageError.
+    """
+    of_category = run.episodes["category"].to_numpy(dtype=str)[samples.rows] == category
+    positions = np.flatnonzero(of_category | (category == EVERYWHERE))
+    own = samples.of(positions)
+    table = run.episodes.iloc[own.rows]
+    if settings.folds != "groups":
+        own = replace(own, groups=fold_units(table, settings.folds))
+    # Of all categories together a class without samples is an error, of one category it is another's.
+    pooled = target.is_side or category == EVERYWHERE
+    coded = replace(target.coded, values=own.values) if pooled else target.coded.of_values(own.values)
+    labels: NDArray[Any] = coded.values == 1 if target.is_side else coded.values
+    draw = _side_folds_and_permutations if target.is_side else _block_folds_and_permutations
+    folds, permuted = draw(run, replace(target, coded=coded), own, labels, category, settings)
+    return Problem(
+        task=target.task,
+        is_side=target.is_side,
+        classes=coded.classes,
+        positions=positions,
+        samples=own,
+        episodes=table["episode_id"].to_numpy(dtype=str),
+        items=table["item_id" if "item_id" in table else "episode_id"].to_numpy(dtype=str),
+        labels=labels,
+        permuted_labels=permuted,
+        folds=folds,
+        token_permutations=settings.token_permutations,
+    )
+
+
+def least_p(labels: NDArray[Any], permuted_labels: NDArray[Any]) -> float:
+    """Return the share of (E, P) labellings, the real one (E,) included, that equal it: no p can be lower."""
+    same = (permuted_labels == labels[:, None]).all(axis=0)
+    return float((1 + same.sum()) / (1 + same.size))
+
+
+Drawn = tuple[list[NestedFold], NDArray[Any]]
+"""Folds, and (E, P) permuted labels."""
+
+
+# -- the side of a picture -------------------------------------------------------------------------------------
+
+
+def _side_folds_and_permutations(
+    run: RunReader, target: Target, samples: TargetSamples, labels: NDArray[Any], category: str,
+    settings: ProbeSettings,
+) -> Drawn:  # fmt: skip
+    """Groups flip their sides, or exchange the chosen ones; folds are balanced by side, for `chosen` by layout."""
+    table, groups = run.episodes.iloc[samples.rows], samples.groups
+    if settings.call > 0 and groups.size == 0:
+        raise TooFewGroupsError(f"category {category!r}: {_reached(0, settings.call)}")
+    if target.null == "flip_groups":
+        _check_balance(labels, category, settings.call)
+    try:
+        folds = _side_folds(target, table, labels, groups, derive_seed("folds", settings.seed, category))
+    except TooFewGroupsError as error:
+        if settings.call > 0:
+            seen = f"{_reached(labels.size, settings.call)}: {np.unique(groups).size} independent groups of items"
+            raise TooFewGroupsError(f"category {category!r}: {seen}, too few for folds") from error
+        raise TooFewGroupsError(f"category {category!r}, target {settings.target!r}: {error}") from error
+    seed = derive_seed("relabelling", settings.seed, category)
+    count = max(settings.permutations, settings.token_permutations)
+    if target.null == "exchange_groups":
+        drawn = exchange_groups(labels, groups, table["item_id"], table["layout"], count, seed)
+    else:
+        drawn = flip_groups(labels, groups, count, seed)
+    # Permutations that leave a training fold with a single class have no probe.
+    shares = np.array([drawn[inner.train].mean(axis=0) for fold in folds for inner in fold.inner])
+    drawn = drawn[:, ((shares > 0) & (shares < 1)).all(axis=0)]
+    _check_power(drawn.shape[1], category, settings)
+    return folds, drawn
+
+
+def _side_folds(
+    target: Target, table: "pd.DataFrame", labels: NDArray[np.bool_], groups: NDArray[np.str_], seed: int
+) -> list[NestedFold]:
+    """Return folds that are balanced by side, for `chosen` by layout.
+
+    Groups exchange their chosen sides, so folds that knew the real ones would make them easier than any exchange.
+    Raises TooFewGroupsError as `nested_folds` does, and for a training side with a single class.
+    """
+    if target.null == "flip_groups":
+        return nested_folds(labels, groups, seed)
+    folds = nested_folds(table["layout"].to_numpy(dtype=str), groups, seed, stratified_folds)
+    shares = [labels[inner.train].mean() for fold in folds for inner in fold.inner]
+    if min(shares) == 0 or max(shares) == 1:
+        raise TooFewGroupsError(
+            f"{labels.sum()} of {labels.size} episodes chose the left side, and a training fold holds one side "
+            "only; expected both in several groups. Extract more items of this category"
+        )
+    return folds
+
+
+def _check_balance(labels: NDArray[np.bool_], category: str, call: int) -> None:
+    """Warn of sides that are not equally often correct; raise UnbalancedEpisodesError if one nearly always is."""
+    share = chance_level(labels) if labels.size else 0.5
+    if share == 0.5:
+        return
+    why = "Episodes are missing from the run" if call == 0 else _reached(labels.size, call)
+    seen = (
+        f"category {category!r}: classes are not balanced, chance is {share:.3f}; expected 0.5 with both layouts "
+        f"of every item. {why}."
+    )
+    pair = "leave out the other layout of their items (--incomplete drop, incomplete='drop')."
+    if share > MOST_OF_ONE_SIDE:
+        instead = "Extract the missing episodes again" if call == 0 else "Probe an earlier inference (--call)"
+        raise UnbalancedEpisodesError(
+            f"{seen} Beyond {MOST_OF_ONE_SIDE} nothing is left to be read. {instead}, or {pair}"
+        )
+    warnings.warn(f"{seen} Leave out the other layout of their items with incomplete='drop'.", stacklevel=4)
+
+
+def _reached(episodes: int, call: int) -> str:
+    """Return why there are no more of them at a later inference."""
+    number = {0: "no episode", 1: "only 1 episode"}.get(episodes, f"only {episodes} episodes")
+    return f"{number} got as far as captured inference {call}, counted from 0, and the others ended before"
+
+
+def _check_power(count: int, category: str, settings: ProbeSettings) -> None:
+    """Warn where the groups allow no result to be significant."""
+    if count < settings.permutations and (least := smallest_p(count)) >= SIGNIFICANCE:
+        warnings.warn(
+            f"category {category!r}: its groups allow {count} label permutations, the smallest possible p is "
+            f"{least:.3f}: nothing can be below {SIGNIFICANCE}. Extract more items.",
+            stacklevel=4,
+        )
+
+
+# -- every other target ------------------------------------------------------------------------------------------
+
+
+def _block_folds_and_permutations(
+    run: RunReader, target: Target, samples: TargetSamples, labels: Matrix, category: str,
+    settings: ProbeSettings,
+) -> Drawn:  # fmt: skip
+    """Groups exchange their labels as blocks.
+
+    Folds know strata and sizes of groups, not labels: only so is every exchange of labels as likely as the real
+    ones. Raises TooFewGroupsError for fewer than five groups, a class in fewer than five, and a fold that is
+    trained on one value.
+    """
+    name = f"label {target.name!r}" + (f", category {category!r}" if category != EVERYWHERE else "")
+    classes = target.coded.classes
+    if len(classes) == 1:
+        raise TooFewGroupsError(
+            f"{name} has one class, {classes[0]!r}; expected two or more. Leave the category out"
+        )
+    _check_groups(name, target, labels, classes, samples.groups)
+    place = () if category == EVERYWHERE else (category,)
+    seed = derive_seed("label folds", settings.seed, *place)
+    folds = nested_folds(samples.strata, samples.groups, seed, stratified_folds)
+    blocks, kinds = _blocks(run, samples)
+    permutations, share = max(settings.permutations, settings.token_permutations), movable_share(blocks, kinds)
+    if permutations and share < LEAST_MOVABLE:
+        warnings.warn(
+            f"{name}: {100 * share:.0f} % of the samples are in groups that have another one to "
+            "exchange labels with; expected half or more, so there is no p. Groups exchange where they have the "
+            "same layouts, labelled inferences and value of --exchange-within. Label the same inferences in every "
+            "group, or leave groups with gaps out",
+            stacklevel=3,
+        )
+        permutations = 0
+    source = exchange_blocks(blocks, kinds, permutations, derive_seed("label exchanges", settings.seed, *place))
+    columns = np.column_stack([labels, labels[source]])
+    columns = columns[:, _trainable(name, columns, folds)]
+    least = least_p(columns[:, 0], columns[:, 1:])
+    if columns.shape[1] > 1 and (columns == columns[:, :1]).all():
+        _warn_of_one_pattern(name, classes, labels, blocks)
+    elif least >= SIGNIFICANCE and least > 1.001 * smallest_p(permutations):
+        warnings.warn(
+            f"{name}: its groups allow no p below {least:.3f}, so nothing can be below {SIGNIFICANCE}. Label more "
+            "groups",
+            stacklevel=3,
+        )
+    return folds, columns[:, 1:]
+
+
+def _warn_of_one_pattern(
+    name: str, classes: tuple[str, ...], labels: Matrix, blocks: Mapping[str, NDArray[np.intp]]
+) -> None:
+    first = labels[next(iter(blocks.values()))].tolist()
+    listed = [classes[int(value)] if classes else f"{value:g}" for value in first[:4]]
+    more = ", …" if len(first) > len(listed) else ""
+    warnings.warn(
+        f"{name} is the same in every group: each of the {len(blocks)} groups holds "
+        f"{', '.join(listed)}{more} in this order. Exchanging labels between groups changes nothing, so every "
+        "p is 1. Give groups in which the label differs (--group-by; `groups` in Python), or a label that differs "
+        "between the groups",
+        stacklevel=4,
+    )
+
+
+def _check_groups(
+    name: str, target: Target, labels: Matrix, classes: tuple[str, ...], groups: NDArray[np.str_]
+) -> None:
+    count, by = np.unique(groups).size, target.group_by or "group_id"
+    if count < OUTER_FOLDS:
+        raise TooFewGroupsError(
+            f"{name}: {count} groups ({by}) have labels; expected at least {OUTER_FOLDS}. "
+            "Label more episodes, or give smaller groups (--group-by; `groups` in Python)"
+        )
+    for number, of_class in enumerate(classes):
+        having = np.unique(groups[labels == number]).size
+        if having < OUTER_FOLDS:
+            raise TooFewGroupsError(
+                f"{name}: the class {of_class!r} is in {having} of {count} groups ({by}); "
+                f"expected at least {OUTER_FOLDS}. Label more episodes of it, merge it "
+                "with another class, or leave its cells empty"
+            )
+
+
+def _blocks(
+    run: RunReader, samples: TargetSamples
+) -> tuple[dict[str, NDArray[np.intp]], dict[str, tuple[Hashable, ...]]]:
+    """The samples of every group in an order that corresponds between groups, and what makes two groups alike.
+
+    Episodes correspond by their layout and labelled inferences, then by item.
+    """
+    places: dict[int, list[int]] = {}
+    for position, row in enumerate(samples.rows.tolist()):
+        places.setdefault(row, []).append(position)
+    members: dict[str, list[int]] = {}
+    for row, own in places.items():
+        members.setdefault(str(samples.groups[own[0]]), []).append(row)
+    table = run.episodes
+    items = table["item_id" if "item_id" in table else "episode_id"].to_numpy(dtype=str)
+    layouts = table["layout"].to_numpy(dtype=str) if "layout" in table else np.full(len(table), "")
+    looks = {row: (str(layouts[row]), tuple(samples.steps[own].tolist())) for row, own in places.items()}
+    blocks: dict[str, NDArray[np.intp]] = {}
+    kinds: dict[str, tuple[Hashable, ...]] = {}
+    for group, rows in members.items():
+        by_item: dict[str, list[int]] = {}
+        for row in rows:
+            by_item.setdefault(str(items[row]), []).append(row)
+        ordered = sorted((sorted((looks[row], row) for row in own), item) for item, own in by_item.items())
+        chain: list[tuple[Any, int]] = [pair for own, _ in ordered for pair in own]
+        blocks[group] = np.array([place for _, row in chain for place in places[row]], np.intp)
+        stratum = str(samples.strata[blocks[group][0]])
+        kinds[group] = stratum, tuple(tuple(look for look, _ in own) for own, _ in ordered)
+    return blocks, kinds
+
+
+def _trainable(name: str, columns: Matrix, folds: list[NestedFold]) -> NDArray[np.bool_]:
+    """(1 + P,) whether a labelling leaves no training fold with a single value. Raises TooFewGroupsError."""
+    fine = np.ones(columns.shape[1], bool)
+    for fold in folds:
+        for one in (fold.outer, *fold.inner):
+            fine &= np.ptp(columns[one.train], axis=0) > 0
+    if not fine[0]:
+        raise TooFewGroupsError(
+            f"{name} is constant in a training fold, so there is nothing to learn; expected both "
+            "values in most groups. Label more groups, or draw other folds with --seed"
+        )
+    return fine

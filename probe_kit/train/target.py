@@ -1,0 +1,363 @@
+"""`Target`: what probes decode, a label for every episode or captured inference.
+
+A target is a side of a picture, another built-in column, or a column of a user's table. Its cells are read in
+`columns`; which samples of a run it names is decided in `target_samples`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._terminal.plain_text import terminal_safe
+from probe_kit.errors import UsageError
+from probe_kit.hashing import derive_seed, sha256_json
+from probe_kit.runs.layout import RECORDED_EPISODES
+from probe_kit.runs.scene_only import check_scene_run
+from probe_kit.statistics.label_permutations import flip_items
+from probe_kit.train.choices import SIDES, Task
+from probe_kit.train.columns.builtin import builtin_column
+from probe_kit.train.columns.cells import Cell
+from probe_kit.train.columns.table import EPISODE, FRAME, INFERENCE, SOURCE, LabelTable, read_table
+from probe_kit.train.columns.values import LabelValues, code_labels
+from probe_kit.train.data.run_reader import RunReader, check_several_wordings
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+Null = Literal["flip_groups", "exchange_groups", "exchange_blocks"]
+NULLS: dict[Null, str] = {
+    "flip_groups": "groups flip all their labels: of the correct side, which a suite draws freely",
+    "exchange_groups": "groups exchange their labels layout by layout: of the chosen side",
+    "exchange_blocks": "groups exchange their labels as blocks, inference by inference: of every other target",
+}
+_MOST_CLASSES = 20
+_COUNTED = {INFERENCE: "a captured inference", FRAME: "a frame", SOURCE: "an episode"}
+
+
+@dataclass(frozen=True)
+class Target:
+    """One label per episode, or per captured inference of an episode, for `train_probes(run, target=target)`.
+
+    Made by `Target.read` from a table, or by `Target.of_run` from what a run stores.
+
+    name: of the column or side. null: how label permutations are drawn, see `NULLS`.
+    coded: task, classes and values. episodes: (n,) ids. inferences: (n,) captured inference of every label, None
+    where a label is of a whole episode. group_by: column whose values folds, intervals and nulls keep together;
+    None for the groups of the run. exchange_within: column within which label permutations exchange groups; None
+    for everywhere. groups, strata: (n,) those columns, None where the run has them. table: where errors point to.
+    of_source: whether episodes and inferences are numbers of episodes and frames of a data set; see `on`.
+    builtin: whether probe_kit computed the column.
+    """
+
+    name: str
+    coded: LabelValues
+    episodes: tuple[str, ...]
+    inferences: tuple[int, ...] | None
+    table: LabelTable
+    group_by: str | None = None
+    exchange_within: str | None = None
+    groups: tuple[str, ...] | None = None
+    strata: tuple[str, ...] | None = None
+    of_source: bool = False
+    builtin: bool = False
+    null: Null = "exchange_blocks"
+
+    @classmethod
+    def read(
+        cls,
+        table: "Path | str | pd.DataFrame",
+        name: str,
+        task: Task | None = None,
+        group_by: str | None = None,
+        exchange_within: str | None = None,
+    ) -> "Target":
+        """Return the column `name` of a table: a CSV or Parquet file, or a DataFrame.
+
+        Key columns are `episode_id` and, for labels that change within an episode, `inference`, counted from 0.
+        Of recordings they may be `source_episode` and `frame`, by the numbers of the data set. Empty cells are
+        left out. task: binary, classes or continuous; None where the values leave no doubt.
+        group_by, exchange_within: columns of the table or of the run's episodes.
+        Raises UsageError, naming file and line, for a missing or mixed column, a key used twice, an integer beyond
+        2^53, an infinite number, a control character, or a task that the values cannot have.
+        """
+        further = [column for column in (group_by, exchange_within) if column is not None]
+        found = read_table(table, [name, *further])
+        of_source = EPISODE not in found.columns
+        episode_key, step_key = (SOURCE, FRAME) if of_source else (EPISODE, INFERENCE)
+        if name not in found.columns or name in (episode_key, step_key):
+            others = (column for column in found.names if column not in (episode_key, step_key))
+            listed = ", ".join(map(terminal_safe, others))[:500] or "none"
+            raise UsageError(f"{found.source} has no column {name!r} to decode; it has: {listed}")
+        if not found.lines:
+            raise UsageError(f"{found.source} has no {found.unit} below its heading; expected one per label")
+        inferences = _numbers(found, step_key)
+        if of_source:  # numbers as a spreadsheet or a merge may leave them, such as 3.0
+            episodes = tuple(map(str, _numbers(found, episode_key) or ()))
+        else:
+            episodes = tuple(found.texts(episode_key))
+        cells = found.values(name, task)
+        groups, strata = _names(found, group_by), _names(found, exchange_within)
+        at = _once(found, episodes, inferences, [cells, *filter(None, (groups, strata))])
+        return cls(
+            name,
+            code_labels([cells[row] for row in at], task, name),
+            tuple(episodes[row] for row in at),
+            None if inferences is None else tuple(inferences[row] for row in at),
+            found.at(at),
+            group_by,
+            exchange_within,
+            None if groups is None else tuple(groups[row] for row in at),
+            None if strata is None else tuple(strata[row] for row in at),
+            of_source,
+        )
+
+    def on(self, run: RunReader) -> "tuple[Target, int]":
+        """Return these labels with the keys of a run, and how many frames or episodes the run does not show.
+
+        Labels that have its keys already are returned as they are. Raises UsageError for a run of scenes, for
+        frames or episodes that were never recorded, and if the run shows none of the frames.
+        """
+        if not self.of_source:
+            return self, 0
+        if not getattr(run, "recorded", False):
+            raise UsageError(
+                f"{self.table.source} has the key {SOURCE!r} of recordings, and {run.location} is of scenes; "
+                f"expected {EPISODE!r}. `probe-kit labels RUN` writes the ids"
+            )
+        shown = _shown(run, self.inferences is not None)
+        frames: Sequence[int] = self.inferences or (-1,) * len(self.episodes)
+        _check_recorded(run, self.table, self.episodes, self.inferences)
+        keys = [shown.get((episode, frame), ()) for episode, frame in zip(self.episodes, frames, strict=True)]
+        at = [number for number, found in enumerate(keys) for _ in found]
+        if not at:
+            raise UsageError(f"{self.table.source} has no label of a frame that {run.location} shows")
+        flat = [key for found in keys for key in found]
+        return replace(
+            self,
+            coded=self.coded.of(at),
+            episodes=tuple(episode for episode, _ in flat),
+            inferences=None if self.inferences is None else tuple(call for _, call in flat),
+            table=self.table.at(at),
+            groups=None if self.groups is None else tuple(self.groups[number] for number in at),
+            strata=None if self.strata is None else tuple(self.strata[number] for number in at),
+            of_source=False,
+        ), sum(not found for found in keys)
+
+    @classmethod
+    def of_run(
+        cls,
+        run: RunReader,
+        name: str,
+        task: Task | None = None,
+        group_by: str | None = None,
+        exchange_within: str | None = None,
+        seed: int = 0,
+    ) -> "Target":
+        """Return a side or built-in column of a run, such as `sim.tool_y`; `probe-kit targets RUN` lists them.
+
+        task: the column's own by default. seed: of the target `shuffled`. Raises UsageError for another name, and
+        for a run that lacks what the column needs; NoTrajectoryError for `sim.*` of a run without trajectories.
+        """
+        if name in SIDES:
+            return _side(run, name, seed, task, group_by, exchange_within)
+        column = builtin_column(run, name)
+        keys: dict[str, list[Cell]] = {EPISODE: list(column.episodes), name: list(column.cells)}
+        lines = list(range(1, len(column.episodes) + 1))
+        table = LabelTable(f"the built-in column {name}", "sample", tuple(keys), keys, lines)
+        coded = code_labels(table.typed(name), task or column.task, name)
+        return cls(name, coded, column.episodes, column.inferences, table, group_by, exchange_within, builtin=True)
+
+    def equal_to(self, value: str) -> "Target":
+        """Return whether labels are the class `value`, as a binary label, such as an event where windows begin.
+
+        Raises UsageError for a value that is no class.
+        """
+        classes = self.coded.classes
+        if value not in classes:
+            there = ", ".join(classes[:8]) or "quantities, not classes"
+            raise UsageError(f"{self.described} has no value {value!r}; it has {there}")
+        own = self.coded.values
+        coded = LabelValues(
+            "binary", ("False", "True"), np.where(np.isnan(own), np.nan, own == classes.index(value))
+        )
+        return replace(self, name=f"{self.name}={value}", coded=coded)
+
+    @property
+    def task(self) -> Task:
+        """binary, classes or continuous."""
+        return self.coded.task
+
+    @property
+    def is_side(self) -> bool:
+        """Whether this is the side of a picture, whose chance is one half."""
+        return self.null != "exchange_blocks"
+
+    @property
+    def per_step(self) -> bool:
+        """Whether labels are of single inferences, not of whole episodes."""
+        return self.inferences is not None
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of the column: of every label with its episode and inference, in whatever order they were given."""
+        classes, values = self.coded.classes, self.coded.values.tolist()
+        inferences: Sequence[int] = self.inferences or (-1,) * len(self.episodes)
+        return sha256_json(
+            sorted(
+                [episode, inference, classes[int(value)] if classes else value]
+                for episode, inference, value in zip(self.episodes, inferences, values, strict=True)
+                if value == value
+            )
+        )
+
+    @property
+    def definition(self) -> str:
+        """Hash of what the label is, not of its values: column, task, source, and per episode or inference.
+
+        A built-in column is one formula in every run. Of a table only the name is known: one column name must mean
+        one thing in both tables.
+        """
+        return sha256_json([self.name, self.task, self.builtin, self.per_step])
+
+    @property
+    def described(self) -> str:
+        """The definition in words."""
+        kind = "built-in column" if self.builtin else "column of a table"
+        return f"the {kind} {self.name!r} ({self.task}, per {'inference' if self.per_step else 'episode'})"
+
+    @property
+    def contents(self) -> str:
+        """Name, task and values in one line."""
+        return f"{terminal_safe(self.name)} ({self.task}), {self.values_in_words}"
+
+    @property
+    def values_in_words(self) -> str:
+        """The classes with their counts, or the range of a quantity, and how many labels are missing."""
+        values = self.coded.values
+        present = values[np.isfinite(values)]
+        if self.coded.classes:
+            counts = np.bincount(present.astype(np.int64), minlength=len(self.coded.classes)).tolist()
+            counted = [f"{terminal_safe(name)} {n}" for name, n in zip(self.coded.classes, counts, strict=True)]
+            more = f", and {len(counted) - _MOST_CLASSES} more" if len(counted) > _MOST_CLASSES else ""
+            text = f"{len(counted)} classes: {', '.join(counted[:_MOST_CLASSES])}{more}"
+        else:
+            text = f"{present.size} numbers from {present.min():g} to {present.max():g}"
+        missing = int(np.isnan(values).sum())
+        return text + f"; {missing} missing" * (missing > 0)
+
+    def __repr__(self) -> str:
+        present = int(np.isfinite(self.coded.values).sum())
+        of = "inferences" if self.per_step else "episodes"
+        return f"<Target {self.name}: {self.task}, {present} {of}, from {self.table.source}>"
+
+
+def _side(
+    run: RunReader, name: str, seed: int, task: Task | None, group_by: str | None, exchange_within: str | None
+) -> Target:
+    """Return the side of the correct picture, the chosen one, or the correct one flipped for half of the items.
+
+    Raises UsageError for a run without sides, for episodes of several wordings, and for options of other targets.
+    """
+    check_scene_run(run, f"a probe of the side ({name})")
+    further = {"task": task, "group_by": group_by, "exchange_within": exchange_within}
+    if refused := [option for option, value in further.items() if value not in (None, "binary")]:
+        raise UsageError(
+            f"{refused[0]}={further[refused[0]]} with the side {name!r}; expected none, because a side is "
+            "binary and its groups are the run's. Leave it out, or take another target"
+        )
+    check_several_wordings(run.episodes)
+    labels = side_labels(run.episodes, name, seed)
+    episodes = tuple(run.episodes[EPISODE].astype(str))
+    values = np.where(labels < 0, np.nan, labels.astype(np.float64))
+    lines = list(range(1, len(episodes) + 1))
+    table = LabelTable(f"the side {name}", "episode", (EPISODE,), {EPISODE: list(episodes)}, lines)
+    coded = LabelValues("binary", ("right", "left"), values)
+    null: Null = "exchange_groups" if name == "chosen" else "flip_groups"
+    return Target(name, coded, episodes, None, table, builtin=True, null=null)
+
+
+def side_labels(episodes: "pd.DataFrame", name: str, seed: int) -> NDArray[np.int8]:
+    """Return the side of every episode, (E,): 1 left, 0 right, −1 where it is not defined."""
+    sides = episodes["side_placed" if name == "chosen" else "side_correct"]
+    labels = np.select([sides == "left", sides == "right"], [np.int8(1), np.int8(0)], np.int8(-1))
+    if name != "shuffled":
+        return labels
+    flipped = flip_items(labels == 1, episodes["item_id"], 1, derive_seed("shuffled target", seed))
+    return flipped[:, 0].astype(np.int8)
+
+
+def _shown(run: RunReader, by_frame: bool) -> dict[tuple[str, int], list[tuple[str, int]]]:
+    """Episode ids and inferences of a run by source episode and frame; of whole episodes the frame is -1."""
+    found: dict[tuple[str, int], list[tuple[str, int]]] = {}
+    steps = run.control_steps  # type: ignore[attr-defined]
+    for row, (name, source) in enumerate(zip(run.episodes[EPISODE], run.episodes[SOURCE], strict=True)):
+        for call, frame in enumerate(steps[row].tolist() if by_frame else [-1]):
+            if frame >= 0 or not by_frame:
+                found.setdefault((str(source), frame), []).append((str(name), call))
+    return found
+
+
+def _check_recorded(
+    run: RunReader, table: LabelTable, episodes: Sequence[str], frames: Sequence[int] | None
+) -> None:
+    """Raise UsageError for an episode that the data set lacks, or a frame that its episode lacks."""
+    count: int = run.settings["recording"][RECORDED_EPISODES]  # type: ignore[attr-defined]
+    rows = zip(run.episodes[SOURCE].tolist(), run.episodes["recorded_frames"].tolist(), strict=True)
+    lengths = {str(source): int(length) for source, length in rows}
+    for row, episode in enumerate(episodes):
+        if int(episode) >= count:
+            raise UsageError(
+                f"{table.where(row, SOURCE)} is {episode}; the data set of {run.location} has {count} episodes, "
+                "counted from 0. Correct the numbers of the episodes"
+            )
+        if frames is not None and frames[row] >= lengths.get(episode, frames[row] + 1):
+            raise UsageError(
+                f"{table.where(row, FRAME)} is {frames[row]}; episode {episode} of the data set of "
+                f"{run.location} has {lengths[episode]} frames, counted from 0 in each episode. Correct the "
+                "table, which may count from 1, or by the column `index` of the data set"
+            )
+
+
+def _numbers(table: LabelTable, column: str) -> tuple[int, ...] | None:
+    """A key column of whole numbers; None where the table lacks it. Raises UsageError for other cells."""
+    if column not in table.columns:
+        return None
+    cells = table.numbers(column)
+    for row, cell in enumerate(cells):
+        fraction = isinstance(cell, float) and not cell.is_integer()
+        if isinstance(cell, bool | str | None) or fraction or cell < 0:
+            shown = "empty" if cell is None else repr(cell)
+            raise UsageError(
+                f"{table.where(row, column)} is {shown}; expected the number of {_COUNTED[column]}, from 0"
+            )
+    return tuple(int(cell) for cell in cells if cell is not None)
+
+
+def _once(
+    table: LabelTable, episodes: Sequence[str], inferences: Sequence[int] | None, columns: Sequence[Sequence[Cell]]
+) -> list[int]:
+    """The rows of a table, one per key: rows that are equal in all `columns` count once.
+
+    Raises UsageError for two rows with one key and other values.
+    """
+    first: dict[tuple[str, int], int] = {}
+    for row, episode in enumerate(episodes):
+        key = episode, -1 if inferences is None else inferences[row]
+        if (before := first.setdefault(key, row)) == row or all(cells[before] == cells[row] for cells in columns):
+            continue
+        named = f"episode {episode!r}" + ("" if inferences is None else f", inference {key[1]}")
+        raise UsageError(
+            f"{table.where(row)}: {named} has a label in {table.unit} {table.lines[before]} already. Leave one "
+            f"out{'' if inferences is not None else f', or add a column {INFERENCE!r}'}"
+        )
+    return list(first.values())
+
+
+def _names(table: LabelTable, column: str | None) -> tuple[str, ...] | None:
+    return None if column is None or column not in table.columns else tuple(table.group_names(column))

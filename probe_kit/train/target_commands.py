@@ -1,0 +1,98 @@
+"""`probe-kit targets` and `probe-kit labels`: what can be probed in a run, and a table to add to."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from probe_kit._system.counting import counted
+from probe_kit._terminal import options as common
+from probe_kit._terminal.console import marked, out, say
+from probe_kit.errors import ProbeKitError, UsageError
+from probe_kit.train.choices import SIDES
+
+if TYPE_CHECKING:
+    from probe_kit.runs import Run
+    from probe_kit.train import RunReader
+
+
+def targets(run: common.RunFolder, wording: common.Wording = None, partial: common.Partial = False) -> None:
+    """List what can be probed in a run: sides and built-in columns, with their classes or range.
+
+    Decode one with `probe-kit train RUN --target NAME`. Tables of your own give further ones, see `probe-kit
+    labels`.
+    """
+    from rich.table import Table
+    from rich.text import Text
+
+    opened = _open(run, partial, wording)
+    table = Table("target", "task", "per", "values")
+    for listed in listed_targets(opened):
+        table.add_row(*map(Text, listed))
+    out.print(table)
+    say(marked("next: [bold]probe-kit train {} --target NAME[/]", run))
+
+
+def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str]]:
+    """Yield name, task, `episode` or `inference`, and classes with counts or range of every target of a run.
+
+    One that the run cannot give has the reason in the last place, such as a column with a single value.
+    """
+    from probe_kit.train.columns.builtin import builtin_names, outcome_column, prefix_of, recorded_columns
+    from probe_kit.train.target import Target
+
+    names = [*SIDES, *builtin_names()]
+    if getattr(run, "inputs", None) is not None:
+        names = [*(prefix_of(run) + name for name in recorded_columns(run)), *outcome_column(run)]
+    for name in names:
+        try:
+            target = Target.of_run(run, name)
+        except ProbeKitError as error:
+            yield name, "–", "–", str(error)
+        else:
+            yield name, target.task, "inference" if target.per_step else "episode", target.values_in_words
+
+
+def labels(
+    run: common.RunFolder,
+    out_file: Annotated[Path, typer.Option("--out", metavar="FILE", help="CSV file to write.")] = Path(
+        "labels.csv"
+    ),
+    wording: common.Wording = None,
+    partial: common.Partial = False,
+) -> None:
+    """Write a table to which you add label columns of your own.
+
+    The table has a line per episode and captured inference, with the built-in columns that `train --target` knows.
+    Add a column, and decode it with `probe-kit train RUN --labels FILE --target COLUMN`.
+    """
+    from probe_kit._system.csv_text import csv_of_frame
+    from probe_kit._system.drafts import draft_of
+    from probe_kit.train.columns.builtin import label_frame, why_no_sim
+
+    if out_file.exists():
+        raise UsageError(f"{out_file} exists; choose another --out or remove it")
+    opened = _open(run, partial, wording)
+    frame = label_frame(opened)
+    with draft_of(out_file) as draft:
+        draft.write_text(csv_of_frame(frame), encoding="utf-8", newline="\n")
+        draft.rename(out_file)
+    out.print(
+        f"{out_file}: {counted(len(frame), 'line')}, columns {', '.join(map(str, frame))}",
+        markup=False,
+        highlight=False,
+        soft_wrap=True,
+    )
+    if opened.inputs is None and (reason := why_no_sim(opened)):
+        say(marked("[yellow]no sim.* columns:[/] {}", reason))
+    say(marked("next: add a column, then [bold]probe-kit train {} --labels {} --target COLUMN[/]", run, out_file))
+
+
+def _open(run: str, partial: bool, wording: str | None) -> "Run":
+    from probe_kit.runs import open_run
+
+    opened = open_run(run, allow_partial=partial).in_wording(wording)
+    if len(opened.episodes) == 0:
+        raise UsageError(f"{opened.location} has no finished episode to label. Finish it first")
+    return opened

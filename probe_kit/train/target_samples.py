@@ -1,0 +1,275 @@
+"""The samples of a run that a target names: pairs of episode and captured inference, with groups and strata."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.train.choices import Incomplete
+from probe_kit.train.columns.table import EPISODE, INFERENCE
+from probe_kit.train.data.captured_call import captured_calls, check_call
+from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.target import Target
+
+REACHED = 0.9
+"""Share of the episodes that reach the last inference of the default window."""
+_TRUE_OR_FALSE = (("False", "True"), ("no", "yes"), ("0", "1"))
+EVERYWHERE = "all"
+"""Category that holds the episodes of all categories, and the only stratum where groups exchange everywhere."""
+
+
+@dataclass(frozen=True)
+class TargetSamples:
+    """n samples with a label, episode by episode and inference by inference.
+
+    rows: (n,) positions in the run's episodes. inferences: (n,) captured inference. values: (n,) coded labels.
+    groups, strata: (n,) names of the group and of where it exchanges. window: inferences per episode. left_out:
+    how many of what have no part in the probes, by reason. aligned: (n,) place in a window that begins at an
+    event, None where windows begin at the first inference.
+    """
+
+    rows: NDArray[np.intp]
+    inferences: NDArray[np.intp]
+    values: NDArray[np.float64]
+    groups: NDArray[np.str_]
+    strata: NDArray[np.str_]
+    window: int
+    left_out: dict[str, int]
+    aligned: NDArray[np.intp] | None = None
+
+    @property
+    def steps(self) -> NDArray[np.intp]:
+        """(n,) the place in the window, or the inference: what corresponds between episodes."""
+        return self.inferences if self.aligned is None else self.aligned
+
+    def of(self, chosen: NDArray[Any]) -> "TargetSamples":
+        """Return some of the samples, by a mask (n,) or by positions."""
+        names = ("rows", "inferences", "values", "groups", "strata", *(["aligned"] * (self.aligned is not None)))
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+
+
+def target_samples(
+    run: RunReader,
+    target: Target,
+    categories: Sequence[str] | None,
+    call: int,
+    window: int | None,
+    align_to: Target | None = None,
+    incomplete: Incomplete = "keep",
+) -> TargetSamples:
+    """Return the samples of `run` that `target` names.
+
+    categories: only their episodes; None for all. call: the captured inference that a label of whole episodes
+    is decoded from. window: for labels of single inferences how many of each episode, from the first on; None for
+    the most that 90 % of the episodes reach. Episodes that end before are left out. align_to: true or false by
+    inference; windows begin at the first inference where it is true, and episodes without one are left out.
+    incomplete: `drop` leaves out items of which a layout is missing.
+    Raises UsageError for keys that the run does not have, for groups that split an episode or items, and for an
+    event that is not true or false by inference.
+    """
+    target, unseen = target.on(run)
+    if target.per_step and call:
+        raise UsageError(
+            f"call={call} with {target.described}, which has a label for every inference; expected one per "
+            f"episode. Use --window N for the first N inferences, or leave out the column {INFERENCE!r}"
+        )
+    check_call(run, call)
+    grid, reached, chosen = _label_grid(run, target), _reached(run), _of_categories(run, categories)
+    start: NDArray[np.intp] = np.full(len(reached), call)
+    left_out: dict[str, int] = {}
+    if align_to is not None:
+        start = _events(run, target, align_to)
+        left_out[f"episodes in which {align_to.name} is never true"] = int((chosen & (start < 0)).sum())
+        chosen = chosen & (start >= 0)
+    counts = reached.sum(axis=1) - start
+    if target.per_step:
+        window = _window(counts[chosen], reached.shape[1], window)
+    else:
+        if window is not None:
+            raise UsageError(
+                f"window={window} with {target.described}, a label per episode; leave it out, or use --call N"
+            )
+        window = 1
+        grid = np.repeat(grid[:, :1], reached.shape[1], axis=1)
+    complete = _complete(run, counts >= window, incomplete)
+    whole = chosen & (counts >= window) & complete
+    calls = start[:, None] + np.arange(window)
+    values = np.take_along_axis(grid, calls.clip(0, grid.shape[1] - 1), axis=1)
+    labelled = whole[:, None] & np.isfinite(values)
+    rows, steps = np.nonzero(labelled)
+    groups, strata = groups_of(run, target)
+    if not target.is_side:
+        _check_groups(run, target, groups, strata, np.unique(rows))
+    short = f"before inference {call + window - 1}" if align_to is None else f"within {window} inferences of it"
+    left_out |= {
+        f"episodes that end {short}": int((chosen & (counts < window)).sum()),
+        "episodes of items without their other layout": int((chosen & (counts >= window) & ~complete).sum()),
+        "episodes without a label": int((whole & ~labelled.any(axis=1)).sum()),
+        "inferences without a label": int((~labelled)[labelled.any(axis=1)].sum()),
+        f"labels outside the window of {window}": _outside(grid[whole], labelled[whole]) if target.per_step else 0,
+        "labels of frames or episodes that the run does not show": unseen,
+    }
+    return TargetSamples(
+        rows,
+        calls[rows, steps],
+        values[labelled],
+        groups[rows],
+        strata[rows],
+        window,
+        {reason: count for reason, count in left_out.items() if count},
+        None if align_to is None else steps,
+    )
+
+
+def groups_of(run: RunReader, target: Target) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
+    """Return (E,) group and stratum of every episode: those of the run, unless the target names columns."""
+    if target.group_by is None:
+        groups: NDArray[np.str_] = run.episodes["group_id"].to_numpy(dtype=str)
+    else:
+        groups = _column(run, target, target.group_by, target.groups, EVERYWHERE)
+    return groups, _column(run, target, target.exchange_within, target.strata, EVERYWHERE)
+
+
+def _complete(run: RunReader, reached: NDArray[np.bool_], incomplete: Incomplete) -> NDArray[np.bool_]:
+    """(E,) whether an episode's item has all layouts, among the episodes that are `reached`; all with `keep`."""
+    complete = np.ones(reached.size, bool)
+    if incomplete == "drop":
+        if lacking := [name for name in ("item_id", "layout") if name not in run.episodes]:
+            raise UsageError(
+                f"incomplete='drop' with the episodes of {run.location}, which have no column {lacking[0]!r}; "
+                "expected items in two layouts. Leave --incomplete out"
+            )
+        episodes = run.episodes[reached]
+        layouts = episodes.groupby("item_id")["layout"].transform("nunique")
+        complete[np.flatnonzero(reached)] = (layouts == episodes["layout"].nunique()).to_numpy()
+    return complete
+
+
+def _outside(table: NDArray[np.float64], labelled: NDArray[np.bool_]) -> int:
+    """How many labels (E, C) of episodes with a whole window are outside it. labelled: (E, window) inside it."""
+    return int(np.isfinite(table).sum() - labelled.sum())
+
+
+def _events(run: RunReader, target: Target, align_to: Target) -> NDArray[np.intp]:
+    """(E,) the first inference at which `align_to` is true, -1 without one. Raises UsageError."""
+    event, _ = align_to.on(run)
+    if not (target.per_step and event.per_step and event.coded.classes in _TRUE_OR_FALSE):
+        raise UsageError(
+            f"windows of {target.described} aligned to {event.described}"
+            + (f" with the values {', '.join(event.coded.classes[:4])}" if event.coded.classes else "")
+            + "; expected labels per inference, and a column of true and false, yes and no, or 1 and 0, per "
+            "inference"
+        )
+    happened = _label_grid(run, event) == 1
+    return np.where(happened.any(axis=1), happened.argmax(axis=1), -1)
+
+
+def _reached(run: RunReader) -> NDArray[np.bool_]:
+    """(E, C) whether an episode has a captured inference."""
+    calls = captured_calls(run)
+    if not hasattr(run, "reached"):
+        return np.ones((len(run.episodes), 1), bool)
+    return np.stack([run.reached(call) for call in range(calls)], axis=1)
+
+
+def _of_categories(run: RunReader, categories: Sequence[str] | None) -> NDArray[np.bool_]:
+    if categories is None or EVERYWHERE in categories:
+        return np.ones(len(run.episodes), bool)
+    chosen: NDArray[np.bool_] = run.episodes["category"].isin(list(categories)).to_numpy()
+    return chosen
+
+
+def _window(counts: NDArray[np.intp], most: int, asked: int | None) -> int:
+    """Inferences per episode. counts: those of every episode from the start of its window on."""
+    if asked is not None:
+        if not 1 <= asked <= most:
+            raise UsageError(f"window={asked}; expected 1 to {most}, the captured inferences of an episode")
+        return asked
+    shares = [float((counts >= size).mean()) if counts.size else 0.0 for size in range(1, most + 1)]
+    return max(1, sum(share >= REACHED for share in shares))
+
+
+def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
+    """(E, C) labels by episode and inference, or (E, 1) by episode; NaN where there are none.
+
+    Raises UsageError for an episode or inference that the run does not have.
+    """
+    place = {name: row for row, name in enumerate(run.episodes[EPISODE].astype(str))}
+    planned = _planned(run)
+    reached = _reached(run)
+    grid = np.full((len(place), reached.shape[1] if target.per_step else 1), np.nan)
+    for number, name in enumerate(target.episodes):
+        row = place.get(name)
+        if row is None:
+            if name in planned:
+                continue
+            raise UsageError(
+                f"{target.table.where(number)}: {run.location} has no episode {name!r}; it has {len(place)}, such "
+                f"as {next(iter(place), 'none')!r}. `probe-kit labels RUN` writes the ids"
+            )
+        inference = 0 if target.inferences is None else target.inferences[number]
+        if target.per_step and not (inference < reached.shape[1] and reached[row, inference]):
+            raise UsageError(
+                f"{target.table.where(number)}: episode {name!r} has {int(reached[row].sum())} captured "
+                f"inferences, counted from 0; there is no {inference}. Leave the line out, or capture "
+                "more with --captured-calls"
+            )
+        grid[row, inference] = target.coded.values[number]
+    return grid
+
+
+def _planned(run: Any) -> set[str]:
+    """Ids of episodes that a run plans, finished or not, shown or not."""
+    root = getattr(run, "root", None)
+    return {str(planned["episode_id"]) for planned in root.plan} if root is not None else set()
+
+
+def _column(
+    run: RunReader, target: Target, name: str | None, cells: Sequence[str] | None, default: str
+) -> NDArray[np.str_]:
+    """(E,) a column of the table, or else of the run's episodes; empty texts where the table has no line."""
+    if name is None:
+        return np.full(len(run.episodes), default)
+    if cells is None:
+        if name not in run.episodes:
+            raise UsageError(
+                f"neither {target.table.source} nor the episodes of {run.location} have a column {name!r}; the "
+                f"episodes have {', '.join(map(str, run.episodes))}"
+            )
+        return run.episodes[name].to_numpy(dtype=str)
+    first: dict[str, int] = {}
+    for number, episode in enumerate(target.episodes):
+        before = first.setdefault(episode, number)
+        if cells[before] != cells[number]:
+            raise UsageError(
+                f"{target.table.where(number, name)}: episode {episode!r} is in {cells[number]!r}, and in "
+                f"{cells[before]!r} in {target.table.unit} {target.table.lines[before]}; expected one value"
+            )
+    return np.array([cells[first[one]] if one in first else "" for one in run.episodes[EPISODE].astype(str)], str)
+
+
+def _check_groups(
+    run: RunReader, target: Target, groups: NDArray[np.str_], strata: NDArray[np.str_], rows: NDArray[np.intp]
+) -> None:
+    """Raise UsageError for groups that separate items with a shared picture, and strata that split a group."""
+    own = run.episodes["group_id"].to_numpy(dtype=str) if "group_id" in run.episodes else groups
+    for inner, outer, problem in (
+        (own, groups, f"--group-by {target.group_by} separates items that share a picture"),
+        (groups, strata, f"--exchange-within {target.exchange_within} splits a group"),
+    ):
+        for name, first, other in _split(inner[rows], outer[rows]):
+            raise UsageError(
+                f"{problem}: group {name!r} is in {first!r} and in {other!r}. Its episodes depend on each other, "
+                "so no p would be right. Give a column that is the same within a group, or leave the option out"
+            )
+
+
+def _split(inner: NDArray[np.str_], outer: NDArray[np.str_]) -> Iterator[tuple[str, str, str]]:
+    """Every name of `inner` that has two of `outer`, with both."""
+    first: dict[str, str] = {}
+    for name, other in zip(inner.tolist(), outer.tolist(), strict=True):
+        if first.setdefault(name, other) != other:
+            yield name, first[name], other
