@@ -33,7 +33,7 @@ def controls(name: str, score: float, p: float, view: str = "mean") -> Controls:
     sites = [str(site) for site in (*BACKBONE, *ACTION)]
     return Controls(
         (ControlScore(name, "all", score, (score, score), None, None, 80),),
-        tuple(ControlComparison(name, "all", view, site, score, p) for site in sites),
+        comparisons=tuple(ControlComparison(name, "all", view, site, score, p) for site in sites),
     )
 
 
