@@ -166,7 +166,7 @@ def test_keys_and_groups_that_the_run_does_not_have_are_refused_with_their_row(r
         samples_of(run, steps, window=5)
     with pytest.raises(UsageError, match=r"call=1 with .* which has a label for every inference"):
         samples_of(run, steps, call=1)
-    with pytest.raises(UsageError, match=r"window=2 with .*, a label of whole episodes"):
+    with pytest.raises(UsageError, match=r"window=2 with .*, a label per episode"):
         samples_of(run, frame, window=2)
 
 
