@@ -35,11 +35,11 @@ def demo(
     from probe_kit.demo.pipeline import FULL, QUICK, compare_organisms, run_demo
 
     if compare:
-        from probe_kit.demo.organisms import to_rich
+        from probe_kit.demo.organisms import organism_table
 
         with progress() as bar:
             findings = compare_organisms(out_folder, lambda stage: counter(bar, stage))
-        out.print(to_rich(findings))
+        out.print(organism_table(findings))
         if any(finding.agreement == "wrong" for finding in findings):
             raise typer.Exit(1)
         return

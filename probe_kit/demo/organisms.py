@@ -10,9 +10,10 @@ followed the answer (*used*). The early checkpoint has the VLM's backbone and an
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 from probe_kit._tables.numbers import number, percent
+from probe_kit._tables.table import Cell, Table, grouped
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.extract.vqa.templates import TEMPLATES
 from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
@@ -23,9 +24,6 @@ from probe_kit.retention.columns.text import exceeds_text, retention_value
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
 from probe_kit.train import ProbeResults, train_probes
-
-if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import Cell, ResponsiveTable
 
 NamedProgress = Callable[[str], Callable[..., None]]
 Truth = str
@@ -213,34 +211,20 @@ def measured(row: RetentionRow, shown: bool) -> Truth:
     return f"{'against: ' * use.reversed}{use.behaviour}"
 
 
-def to_rich(findings: Sequence[Finding]) -> "ResponsiveTable":
+def organism_table(findings: Sequence[Finding]) -> Table:
     """One line per organism and category: the truth, the verdict, and the numbers behind it."""
-    from probe_kit._terminal.responsive_table import Part, ResponsiveTable
-
-    counted = count_agreements([finding.agreement for finding in findings])
-    caption = f"{counted}; accuracies in %, retention with its interval"
+    notes = [count_agreements([finding.agreement for finding in findings])]
+    notes.append("accuracies in %, retention with its interval")
     if any(finding.expected == DOES_NOT_DECIDE for finding in findings):
         either = " and ".join(f"*{verdict}*" for verdict in COMPATIBLE[DOES_NOT_DECIDE][:2])
-        caption += f". *{DOES_NOT_DECIDE}*: the action expert was not trained; {either} are both true of it"
-    return ResponsiveTable(
-        title="Model organisms",
-        caption=caption,
-        name="policy",
-        names=tuple(finding.organism for finding in findings),
-        styles=("",) * len(findings),
-        parts=(
-            Part(
-                "Verdicts",
-                ("category", "expected", "measured", "agreement"),
-                tuple(map(_verdict_cells, findings)),
-            ),
-            Part(
-                "What they rest on",
-                ("SR %", "± Δ", "follow / reversal %", "backbone", "p", "exceeds", "action", "retention [95 %]"),
-                tuple(map(_number_cells, findings)),
-            ),
-        ),
+        notes.append(f"*{DOES_NOT_DECIDE}*: the action expert was not trained; {either} are both true of it")
+    numbers = ("SR %", "± Δ", "follow / reversal %", "backbone", "p", "exceeds", "action", "retention [95 %]")
+    headings = grouped(
+        ("", ("policy",)),
+        ("Verdicts", ("category", "expected", "measured", "agreement")),
+        ("What they rest on", numbers),
     )
+    return Table.of("Model organisms", headings, list(map(_cells, findings)), notes=notes)
 
 
 def count_agreements(found: Sequence[Agreement]) -> str:
@@ -252,22 +236,11 @@ def count_agreements(found: Sequence[Agreement]) -> str:
     )
 
 
-def _verdict_cells(finding: Finding) -> "tuple[Cell, ...]":
-    from probe_kit._terminal.responsive_table import Cell
-
-    style = {"true": "green", "inconclusive": "yellow", "wrong": "red"}[finding.agreement]
-    return (
-        Cell(finding.category), Cell(finding.expected), Cell(finding.measured), Cell(finding.agreement, style),
-    )  # fmt: skip
-
-
-def _number_cells(finding: Finding) -> "tuple[Cell, ...]":
-    from probe_kit._terminal.responsive_table import Cell
-
+def _cells(finding: Finding) -> tuple[Cell | str, ...]:
     row = finding.row
-    texts = (
+    return (
+        finding.organism, finding.category, finding.expected, finding.measured,
+        Cell(finding.agreement, alarm=finding.agreement == "wrong"),
         percent(row.success.sr), MARGIN.text(row), FOLLOWS.text(row), percent(row.backbone.score),
-        number(row.backbone.p_fwe, 3),
-        exceeds_text(row.backbone), percent(row.action.score), retention_value(row),
+        number(row.backbone.p_fwe, 3), exceeds_text(row.backbone), percent(row.action.score), retention_value(row),
     )  # fmt: skip
-    return tuple(map(Cell, texts))

@@ -193,6 +193,8 @@ def intervene(
     source = ReplaySource(suite, checkpoint, read_pairs(model_options or []), weights_seed, device, files)
     result = _run(opened, intervention, source)
     print_result(result, style, details)
+    if style == "table":
+        say(marked("next: [bold]probe-kit retention {}[/]  use beside probes and success", run))
     say(marked("stored as {}; next: [bold]probe-kit retention {}[/]", result.key, run))
 
 
@@ -247,5 +249,5 @@ def print_result(result: "InterventionResult", style: common.Format = "table", d
     for note in result.notes:
         say(marked("[yellow]note:[/] {}", note))
     if style == "table":
-        for sentence in result.sentences:
+        for sentence in result.sentences if details else result.findings:
             out.print(sentence)

@@ -105,11 +105,12 @@ def _answer(one: "Needed") -> str:
 
 
 def _print(found: "list[Power]") -> None:
-    from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
+    from probe_kit._tables.table import Table
     from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
     from probe_kit.statistics.significance import detectable
 
     headings = (
+        "items",
         "signal, points",
         "against chance %",
         "against random-features %",
@@ -120,6 +121,7 @@ def _print(found: "list[Power]") -> None:
     )
     rows = [
         (
+            str(one.items),
             *(
                 f"{100 * share:.0f}"
                 for share in (one.above, one.chance, one.random_features, one.untrained, one.absent)
@@ -129,18 +131,12 @@ def _print(found: "list[Power]") -> None:
         )
         for one in found
     ]
-    out.print(
-        ResponsiveTable(
-            title="Power: how often a signal is seen",
-            caption="random-features and the untrained network at chance; absent: how often a stream without "
-            f"signal is called absent, below {100 * ABSENT_BELOW:g} %; ±: of the four, the largest, measured over "
-            "seeds; a leaking control of that accuracy is red in 80 % of suites",
-            name="items",
-            names=tuple(str(one.items) for one in found),
-            styles=("",) * len(found),
-            parts=(Part("Power", headings, tuple(tuple(map(Cell, row)) for row in rows)),),
-        )
-    )
+    notes = [
+        "random-features and the untrained network at chance; absent: how often a stream without signal is called "
+        f"absent, below {100 * ABSENT_BELOW:g} %; ±: of the four, the largest, measured over seeds; a leaking "
+        "control of that accuracy is red in 80 % of suites"
+    ]
+    out.print(Table.of("Power: how often a signal is seen", headings, rows, notes=notes))
 
 
 def _whole(text: str) -> int:

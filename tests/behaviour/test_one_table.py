@@ -81,13 +81,13 @@ def test_columns_that_do_not_fit_are_named_and_details_prints_them(
     name: str, width: int, run: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     short = " ".join(printed(name, run, width, capsys, monkeypatch).split())
-    (left_out,) = re.findall(r"with --details or more room: ([^.]*?) Color \(", short) or [""]
+    (left_out,) = re.findall(r"[Ww]ith --details or more room: ([^.]*?)\.? Color ", short) or [""]
     details: dict[str, Callable[[], str | None]] = {
         "train": lambda: command("train", str(run), "--permutations", "2", "--views", "mean,last", "--details"),
         "intervene": lambda: print_result(load_effects(open_run(run)), details=True),
     }
     whole = details[name]() or capsys.readouterr().out
-    assert left_out or width > 80
+    assert left_out or width > 80, short
     for heading in filter(None, left_out.split(", ")):
         assert heading in " ".join(whole.split())
 

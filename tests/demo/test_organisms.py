@@ -19,9 +19,9 @@ from probe_kit.demo.organisms import (
     VLM,
     Finding,
     measured,
+    organism_table,
     settings_of,
     source_of,
-    to_rich,
 )
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import extract_run
@@ -136,7 +136,7 @@ def test_the_table_shows_the_margin_that_decides() -> None:
     margins = {"chance_margin_episodes": 0.1414, "chance_margin": 0.2001}
     shown = replace(one, success=replace(one.success, **margins))
     with out.capture() as printed:
-        out.print(to_rich([Finding("trained", "color", "used", verdict(shown), shown)]), width=160)
+        out.print(organism_table([Finding("trained", "color", "used", verdict(shown), shown)]), width=160)
     text = printed.get()
     assert "20.0" in text
     assert "14.1" not in text
@@ -149,7 +149,7 @@ def test_the_table_counts_the_true_verdicts() -> None:
         Finding("early", "state", DOES_NOT_DECIDE, "inconclusive", row(0.5, 0.3)),
     ]
     with out.capture() as printed:
-        out.print(to_rich(findings), width=160)
+        out.print(organism_table(findings), width=160)
     text = " ".join(printed.get().split())
     assert "1 of 3 verdicts are true, 1 inconclusive, 1 is wrong" in text
     assert "*not used* and *moves with it, does not decide* are both true of it" in text

@@ -30,7 +30,7 @@ from probe_kit.train.data.run_reader import RunReader
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit._tables.table import Table
     from probe_kit.hooks import Policy
     from probe_kit.hooks.capturing.attention import AttentionMass
     from probe_kit.intervene.sessions.session import ReplaySession
@@ -111,7 +111,7 @@ class AttentionReadout(Intervention):
         return AttentionShares.of(measurement).rows()
 
     @staticmethod
-    def table(rows: "Sequence[AttentionRow]", context: TableContext) -> "ResponsiveTable":
+    def table(rows: "Sequence[AttentionRow]", context: TableContext) -> "Table":
         """Return one line per category and block of the backbone that is read."""
         del rows
         attention = AttentionShares.of(context.measurement)

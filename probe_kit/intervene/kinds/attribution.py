@@ -54,7 +54,7 @@ from probe_kit.runs.run import Run
 from probe_kit.statistics.sign_flips import max_t
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit._tables.table import Table
     from probe_kit.intervene.sessions.session import ReplaySession
 
 NAME = "attribution"
@@ -219,7 +219,7 @@ class AttributionPatching(Intervention):
         ]
 
     @staticmethod
-    def table(rows: Sequence[AttributionEffect], context: TableContext) -> "ResponsiveTable":
+    def table(rows: Sequence[AttributionEffect], context: TableContext) -> "Table":
         """Return one line per category and cell."""
         void = [
             f"{name}: {describe_void(part)}"

@@ -30,7 +30,7 @@ from probe_kit.train.data.run_reader import RunReader
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit._tables.table import Table
     from probe_kit.intervene.sessions.session import ReplaySession
 
 Values = NDArray[np.float64]
@@ -74,6 +74,10 @@ class CategoryVerdict(Protocol):
     @property
     def explanation(self) -> str:
         """Return the numbers it rests on, or why there is none."""
+
+    @property
+    def finding(self) -> tuple[str, str]:
+        """Return it in a word or two, and what the action does."""
 
     def describe(self, swap: Any) -> str:
         """Return what an image swap showed, in sentences."""
@@ -184,7 +188,7 @@ class Intervention(ABC):
 
     @staticmethod
     @abstractmethod
-    def table(rows: Sequence[Any], context: TableContext) -> "ResponsiveTable":
+    def table(rows: Sequence[Any], context: TableContext) -> "Table":
         """Return the rows as a table for a terminal."""
 
     @staticmethod
@@ -192,6 +196,11 @@ class Intervention(ABC):
         """Return the finding, a sentence per category; none of a kind that only describes."""
         del rows, context
         return []
+
+    @classmethod
+    def findings(cls, rows: Sequence[Any], context: TableContext) -> list[str]:
+        """Return the last lines of a command: a short sentence per category, by default `sentences`."""
+        return cls.sentences(rows, context)
 
     @staticmethod
     def notes(rows: Sequence[Any], measurement: Measurement) -> list[str]:
@@ -389,22 +398,29 @@ def effect_table[Row](
     lines: Sequence[tuple[str, Row]],
     parts: Mapping[str, Mapping[str, Callable[[Row], str]]],
     is_bold: Callable[[Row], bool] = lambda _: False,
-) -> "ResponsiveTable":
+) -> "Table":
     """Return a table. lines: name and row of each. parts: by title, the text of a row's cell by column."""
-    from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
+    from probe_kit._tables.table import Cell, Heading, Table, grouped
 
-    cells = {
-        part: tuple(tuple(Cell(text(row)) for text in columns.values()) for _, row in lines)
-        for part, columns in parts.items()
-    }
-    return ResponsiveTable(
-        title=title,
-        caption=caption,
-        name=heading,
-        names=tuple(name for name, _ in lines),
-        styles=tuple("bold" if is_bold(row) else "" for _, row in lines),
-        parts=tuple(Part(part, tuple(columns), cells[part]) for part, columns in parts.items()),
-    )
+    names = heading.split(SEPARATOR_OF_NAMES)
+    rows: list[tuple[Cell | str, ...]] = [
+        (
+            *(Cell(text, strong=is_bold(row)) for text in _split_name(name, len(names))),
+            *(text(row) for columns in parts.values() for text in columns.values()),
+        )
+        for name, row in lines
+    ]
+    headings = (*map(Heading, names), *grouped(*((part, tuple(columns)) for part, columns in parts.items())))
+    return Table.of(title, headings, rows, names=len(names), notes=[caption])
+
+
+SEPARATOR_OF_NAMES = " · "
+
+
+def _split_name(name: str, count: int) -> list[str]:
+    """Return the names of a row, one per column that names it."""
+    texts = name.split(SEPARATOR_OF_NAMES, count - 1)
+    return [*texts, *[""] * (count - len(texts))]
 
 
 def lines_of[Row: Effect](rows: Iterable[Row], name: Callable[[Row], str]) -> list[tuple[str, Row]]:

@@ -58,7 +58,7 @@ from probe_kit.statistics.mcnemar import sign_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit._tables.table import Table
     from probe_kit.intervene.sessions.session import ReplaySession
 
 MIN_IN_ZONE_RATIO = 0.5
@@ -207,7 +207,7 @@ class ClosedLoop(Intervention):
         return closed_loop_effects(measurement.outcomes, measurement.seed_text, measurement.key)
 
     @staticmethod
-    def table(rows: "Sequence[ClosedLoopEffect]", context: TableContext) -> "ResponsiveTable":
+    def table(rows: "Sequence[ClosedLoopEffect]", context: TableContext) -> "Table":
         """Return one line per category and condition, the identity patch first."""
         return effect_table(
             f"Is it so in closed loop? {context.subject}",

@@ -52,7 +52,7 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit._tables.table import Table
     from probe_kit.intervene.directions import TokenFeatures
     from probe_kit.intervene.sessions.session import ReplaySession
 
@@ -173,7 +173,7 @@ class ConceptErasure(Intervention):
         return erasure_effects(measurement.outcomes, measurement.seed_text, measurement.key, accuracies)
 
     @staticmethod
-    def table(rows: "Sequence[ErasureEffect]", context: TableContext) -> "ResponsiveTable":
+    def table(rows: "Sequence[ErasureEffect]", context: TableContext) -> "Table":
         """Return one line per category and place; controls are columns of what is compared with them."""
         edits = [row for row in rows if row.finding not in ("control", "identity patch")]
         return effect_table(

@@ -35,7 +35,7 @@ from probe_kit.suite.categories import category_of
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit._tables.table import Table
     from probe_kit.intervene.sessions.session import ReplaySession
 
 NAME = "image-swap"
@@ -294,7 +294,7 @@ class ImageSwap(Intervention):
         return image_swap_effects(measurement.outcomes, measurement.seed_text, measurement.key, readout, apart)
 
     @staticmethod
-    def table(rows: Sequence[ImageSwapEffect], context: TableContext) -> "ResponsiveTable":
+    def table(rows: Sequence[ImageSwapEffect], context: TableContext) -> "Table":
         """Return one line per category, with its verdict."""
         verdicts = context.verdicts
         reasons = [f"{name}: {verdict.explanation}" for name, verdict in verdicts.items() if verdict.explanation]
@@ -322,6 +322,19 @@ class ImageSwap(Intervention):
             + (verdicts[row.category].describe(row) if row.category in verdicts else swap_rates(row, "images"))
             for row in rows
         ]
+
+    @classmethod
+    def findings(cls, rows: Sequence[ImageSwapEffect], context: TableContext) -> list[str]:
+        """Return one short sentence per category: the verdict, and how often a swap turns the action."""
+        names = [category_of(row.category).title for row in rows]
+        width = max(map(len, names), default=0)
+        found = []
+        for row, name in zip(rows, names, strict=True):
+            turned = f"a swap turns it in {100 * row.follow_rate:.0f} % of the episodes"
+            use = context.verdicts.get(row.category)
+            verdict, what = ("swapped", "") if use is None else use.finding
+            found.append(f"{name.ljust(width)}  {verdict}: {'; '.join(filter(None, (what, turned)))}.")
+        return found
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:

@@ -26,7 +26,7 @@ from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NO
 from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, SourceRun
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit._tables.table import Table
     from probe_kit.intervene.sessions.session import ReplaySession
 
 _CONDITIONS = {"instruction": INSTRUCTION_SWAP, "images": IMAGE_SWAP, "noise": NOISE}
@@ -149,7 +149,7 @@ class InstructionSwap(Intervention):
         ]
 
     @staticmethod
-    def table(rows: Sequence[InstructionSwapEffect], context: TableContext) -> "ResponsiveTable":
+    def table(rows: Sequence[InstructionSwapEffect], context: TableContext) -> "Table":
         """Return one line per category."""
         return effect_table(
             f"Is the instruction read? {context.subject}",

@@ -34,7 +34,7 @@ from probe_kit.runs.run import Run
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit._tables.table import Table
     from probe_kit.intervene.directions import DirectionBasis
     from probe_kit.intervene.sessions.session import ReplaySession
 
@@ -154,7 +154,7 @@ class Interchange(Intervention):
         return patch_effects(measurement.outcomes, measurement.seed_text, target_side, measurement.key)
 
     @staticmethod
-    def table(rows: Sequence[PatchEffect], context: TableContext) -> "ResponsiveTable":
+    def table(rows: Sequence[PatchEffect], context: TableContext) -> "Table":
         """Return one line per category and edit; controls are columns of what is compared with them."""
         unread = context.measurement.certificate.get("unread", ())
         edits = [row for row in rows if not row.is_control]

@@ -49,7 +49,7 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
 
 if TYPE_CHECKING:
-    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit._tables.table import Table
     from probe_kit.intervene.sessions.session import ReplaySession
 
 NAME = "joint"
@@ -211,7 +211,7 @@ class JointPlaces(Intervention):
         ]
 
     @staticmethod
-    def table(rows: "Sequence[JointEffect]", context: TableContext) -> "ResponsiveTable":
+    def table(rows: "Sequence[JointEffect]", context: TableContext) -> "Table":
         """Return one line per category and set."""
         return effect_table(
             f"Where is it read, alone and jointly? {context.subject}, joint places",

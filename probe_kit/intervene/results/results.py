@@ -27,7 +27,7 @@ from probe_kit.train.results.store import load_results
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit._terminal.responsive_table import ResponsiveTable
+    from probe_kit._tables.table import Table
     from probe_kit.train.results.probe_results import ProbeResults
 
 
@@ -169,14 +169,19 @@ class InterventionResult:
         return csv_of_frame(self.table)
 
     @property
+    def findings(self) -> tuple[str, ...]:
+        """The last lines of the command: a short sentence per category."""
+        return tuple(self._kind.findings(self.effects, self._context))
+
+    @property
     def sentences(self) -> tuple[str, ...]:
         """The finding, a sentence per category, and a line about the layer; none of a kind that only describes."""
         return *self._kind.sentences(self.effects, self._context), *self.layers.values()
 
-    def to_rich(self, details: bool = True) -> "ResponsiveTable":
+    def to_rich(self, details: bool = True) -> "Table":
         """The table for a terminal. details: split it where it is wide, else leave columns out by name."""
         context = replace(self._context, explains=details)
-        return replace(self._kind.table(self.effects, context), splits=details)
+        return replace(self._kind.table(self.effects, context), overflow="split" if details else "leave out")
 
     @property
     def _context(self) -> TableContext:

@@ -142,6 +142,29 @@ class UseVerdict:
         """Whether a reader asks for its numbers: of what is not used by its own readout."""
         return self.behaviour not in USES
 
+    @property
+    def finding(self) -> tuple[str, str]:
+        """The verdict in a word or two, and what the action does, without numbers."""
+        first, *later = self.by_readout
+        if later and (first.behaviour in USES) != (later[0].behaviour in USES):
+            if first.behaviour in USES:
+                return "used at first", "the first actions follow the answer, the whole episode does not"
+            return "used later", "the first actions do not follow the answer, the whole episode does"
+        if self.behaviour == "used":
+            in_reverse = ("used in reverse", "the action goes to the other picture")
+            return in_reverse if self.reversed else ("used", "the action follows the answer")
+        if self.behaviour in USES:
+            direction = "goes against" if self.reversed else "follows"
+            how = f"only where it lies on the {self.side}" if self.side else "in some episodes or part of the way"
+            return "partly used", f"the action {direction} the answer {how}"
+        if self.behaviour == "moves with it, does not decide":
+            return "not decisive", "the answer shifts the action without turning it"
+        if self.behaviour == "not used":
+            return "not used", "the action does not follow the answer"
+        if self.lacks_control:
+            return "use undecided", "the action follows neither this answer nor that of another category"
+        return "use undecided", "more items would tell"
+
     def describe(self, swap: Swapped) -> str:
         """Return what an image swap showed, in sentences."""
         return f"{describe_swap(swap, self)}. {self.sentence}"

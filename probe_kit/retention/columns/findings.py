@@ -9,7 +9,7 @@ import shlex
 from collections.abc import Sequence
 
 from probe_kit._tables.numbers import whole
-from probe_kit.intervene.results.verdict import USES, UseVerdict
+from probe_kit.intervene.results.verdict import UseVerdict
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.sentences import is_probed, knows
 from probe_kit.retention.columns.text import is_vlm
@@ -94,34 +94,20 @@ def _head(row: RetentionRow, asked: RetentionRow | None, used: str) -> str:
 
 def _of_use(row: RetentionRow, asked: RetentionRow | None, use: UseVerdict) -> str:
     """Return the sentence of a row whose pictures were swapped."""
-    first, *later = use.by_readout
-    if later and (first.behaviour in USES) != (later[0].behaviour in USES):
-        if first.behaviour in USES:
-            head, what = "used at first", "the first actions follow the answer, the whole episode does not"
-        else:
-            head, what = "used later", "the first actions do not follow the answer, the whole episode does"
-        return _sentence(head, what, row=row)
-    if use.behaviour == "used" and use.reversed:
-        return _sentence("used in reverse", "the action goes to the other picture", row=row)
-    if use.behaviour == "used":
-        return _sentence("used", *_read_and(row, "the action follows"), row=row)
-    if use.behaviour in USES:
-        direction = "goes against" if use.reversed else "follows"
-        how = f"only where it lies on the {use.side}" if use.side else "in some episodes or part of the way"
-        return _sentence("partly used", f"the action {direction} the answer {how}", row=row)
-    if use.behaviour == "moves with it, does not decide":
-        what = "the answer shifts the action without turning it"
-        return _sentence(_head(row, asked, "not decisive"), what, *_missing(row), row=row)
-    if use.behaviour == "not used" and use.is_of_first_chunk and knows(row):
+    verdict, what = use.finding
+    if verdict == "used":
+        return _sentence(verdict, *_read_and(row, "the action follows"), row=row)
+    if verdict == "not used" and use.is_of_first_chunk and knows(row):
         what = "the first actions do not follow the answer, later ones may"
         return _sentence(_head(row, asked, "not used at first"), what, *_missing(row), row=row)
-    if use.behaviour == "not used":
-        return _sentence(_head(row, asked, "not used"), *_read_and(row, "the action does not follow"), row=row)
-    if use.lacks_control:
-        what = "the action follows neither this answer nor that of another category"
-        return _sentence(_head(row, asked, "use undecided"), what, *_missing(row), row=row)
-    read = [_READ] if _is_encoded(row) else _missing(row, "the answer")
-    return _sentence(_head(row, asked, "use undecided"), *read, "more items would tell", row=row)
+    if verdict == "not used":
+        return _sentence(_head(row, asked, verdict), *_read_and(row, "the action does not follow"), row=row)
+    if use.behaviour == "inconclusive" and not use.lacks_control:
+        read = [_READ] if _is_encoded(row) else _missing(row, "the answer")
+        return _sentence(_head(row, asked, verdict), *read, what, row=row)
+    if verdict in ("not decisive", "use undecided"):
+        return _sentence(_head(row, asked, verdict), what, *_missing(row), row=row)
+    return _sentence(verdict, what, row=row)
 
 
 def _holds(part: StreamPart) -> bool:

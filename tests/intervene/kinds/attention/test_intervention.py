@@ -133,7 +133,7 @@ def test_means_are_over_what_is_not_asked_for_and_every_episode_counts_alike() -
 
 def headings(shares: AttentionShares) -> tuple[str, ...]:
     measurement = Measurement(outcomes_of({"color": follower(4)}), "suite", {}, {}, lambda _: shares.to_bytes())
-    return AttentionReadout.table([], TableContext(measurement, "of", {})).parts[0].headings
+    return AttentionReadout.table([], TableContext(measurement, "of", {})).columns[2:]
 
 
 def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen(weighed: AttentionShares) -> None:
