@@ -35,7 +35,7 @@ from probe_kit.study.commands import app as study_app
 from probe_kit.suite.commands import app as suite_app
 from probe_kit.train.commands import train
 from probe_kit.train.power_commands import power
-from probe_kit.train.target_commands import labels
+from probe_kit.train.target_commands import labels, targets
 from probe_kit.view.commands import RUNS_BY_NAME, view
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ for name, commands in (("suite", suite_app), ("run", run_app), ("study", study_a
 run_app.command()(show)
 run_app.command("list")(list_runs)
 for command in (
-    *(demo, doctor, models, extract, ask, power, train, labels, retention, view),
+    *(demo, doctor, models, extract, ask, power, targets, train, labels, retention, view),
     *(new_adapter, check_adapter, check_environment, verify),
 ):
     app.command(rich_help_panel=_PANEL_OF[command.__name__.replace("_", "-")])(command)

@@ -22,7 +22,7 @@ def held_against(run: ArrayRun, p: float, control: str = "random-features") -> A
         for (category, view), curve in results.curves.items()
         for site in curve.sites
     ]
-    save_results(replace(results, controls=Controls().with_excess(found)), run.path)
+    save_results(replace(results, controls=Controls().with_scores([], found)), run.path)
     return run
 
 

@@ -1,5 +1,6 @@
 """Built-in columns of a run, and the table that `probe-kit labels` writes."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ from probe_kit.cli import app
 from probe_kit.env.scoring.trajectory import CHANNELS
 from probe_kit.errors import UsageError
 from probe_kit.runs import open_run
-from probe_kit.train import Target
-from probe_kit.train.columns.builtin import builtin_names, label_frame
+from probe_kit.train import Target, train_probes
+from probe_kit.train.columns.builtin import SIM_COLUMNS, builtin_names, label_frame
+from probe_kit.train.target_commands import listed_targets
 from tests.support.labelled_run import CALLS, EVERY, GRASP, RELEASE
 
 
@@ -68,3 +70,20 @@ def test_a_constant_or_unknown_column_is_refused_by_name(labelled_run: Path) -> 
         Target.of_run(run.only(["color"]), "item.category")
     with pytest.raises(UsageError, match=r"no built-in column 'sim.tool_w'; there are: sim.tool_x"):
         Target.of_run(run, "sim.tool_w")
+
+
+def test_a_target_is_added_by_the_entry_that_contributing_shows(
+    labelled_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The diff of CONTRIBUTING is applied; list, table and probes then have the target."""
+    page = (Path(__file__).parents[3] / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    diff = page.partition("## To add a target")[2].partition("```diff")[2].partition("```")[0]
+    added = "\n".join(line[1:] for line in diff.splitlines() if line.startswith("+ "))
+    (entry,) = eval(f"{{{added}}}", {"np": np}).items()
+    monkeypatch.setitem(SIM_COLUMNS, *entry)
+    shutil.copytree(labelled_run, tmp_path / "run")
+    run = open_run(tmp_path / "run")
+    assert "sim.speed" in [name for name, *_ in listed_targets(run)]
+    assert label_frame(run)["sim.speed"].min() >= 0
+    results = train_probes(run, target="sim.speed", permutations=0, controls=("step",))
+    assert results.settings.task == "continuous"
