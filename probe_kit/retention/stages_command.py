@@ -33,7 +33,7 @@ def show_stages(
     from probe_kit.retention.columns.comparisons import known_used_tables
     from probe_kit.retention.compare.known_used import match_runs
     from probe_kit.runs import open_run
-    from probe_kit.train import load_results
+    from probe_kit.train.results.store import load_side_results
 
     if len(runs) != 2:
         raise UsageError(f"--compare stages compares two runs, and {len(runs)} are given; expected VLM_RUN RUN")
@@ -45,7 +45,7 @@ def show_stages(
     vlm = scored(open_run(runs[0]), score, with_side_words)
     policy = open_run(runs[1]).in_wording(wording)
     try:
-        results = load_results(policy, key)
+        results = load_side_results(policy, key)
     except NoProbesError as error:
         if view is not None:
             raise UsageError(f"--views {view}: {error}") from None

@@ -41,7 +41,7 @@ from probe_kit.runs.scene_only import check_scene_run
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.results.store import is_current, load_results
+from probe_kit.train.results.store import is_current, load_side_results
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -411,17 +411,12 @@ def _read_probes(
                 missing.append(f"Success rates only: no probes of {run.location} belong to this table.")
             continue
         try:
-            found = load_results(run, key)
+            found = load_side_results(run, key)
         except NoProbesError as error:
             if run.streams or ask_of(run) is None:
                 shares = "Success rates" if ask_of(run) is None else "Answers"
                 missing.append(f"{shares} only: {error}")
             continue
-        if not found.settings.is_side:
-            raise UsageError(
-                f"{run.location}: the probes {found.key} are of {found.settings.target!r}, not of a side. Add "
-                f"--target {found.settings.target}, or give the key of other probes"
-            )
         results[str(run.location)] = found
         if not is_current(found.settings, run):
             missing.append(

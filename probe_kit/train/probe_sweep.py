@@ -11,7 +11,7 @@ from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryE
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.statistics.folds import FoldUnit
-from probe_kit.train.choices import SIDES, Incomplete
+from probe_kit.train.choices import Incomplete
 from probe_kit.train.controls.fit import add_controls, prepare_controls
 from probe_kit.train.controls.untrained import add_untrained, check_untrained
 from probe_kit.train.crossval.site_probe import SiteProbe
@@ -97,6 +97,8 @@ def train_probes(
         "incomplete": incomplete, "seed": seed, "call": call, "window": window, "align_to": align_to,
     }  # fmt: skip
     crew = ExecutionSettings(jobs, device, ray)
+    for reader in filter(None, (run, untrained)):
+        check_run(reader, categories)
     sweep = Sweep.of(run, target, categories, crew, progress, **options)
     _check_device_of(sweep.target, device)
     sweep.check()
@@ -152,11 +154,9 @@ def _check_device_of(target: Target, device: str | None) -> None:
 
 
 def check_run(run: RunReader, categories: Sequence[str] | None) -> None:
-    """Raise for a run without episodes, activations or the categories, and for one in several wordings."""
+    """Raise for a run without episodes or the categories, and for one in several wordings."""
     if len(run.episodes) == 0:
         raise RunIncompleteError(f"{run.location} has no finished episode to probe. Finish it first")
-    if not run.streams:
-        raise NoProbesError(f"{run.location} has no activations to probe: of {run.model!r} no stream was stored.")
     names = list(dict.fromkeys(run.episodes["category"]))
     for category in categories or ():
         if category not in (*names, EVERYWHERE):
@@ -206,9 +206,10 @@ class Sweep:
         align_to: Target | None = None,
     ) -> "Sweep":
         """Read labels and samples; nothing is probed yet."""
-        if isinstance(target, str) and target in SIDES:  # refuses a run of recordings first
-            target = Target.of_run(run, target, seed=seed)
-        check_run(run, categories)
+        if not run.streams:
+            raise NoProbesError(
+                f"{run.location} has no activations to probe: of {run.model!r} no stream was stored."
+            )
         target = Target.of_run(run, target, seed=seed) if isinstance(target, str) else target
         if categories is None:
             categories = tuple(dict.fromkeys(run.episodes["category"])) if target.is_side else (EVERYWHERE,)

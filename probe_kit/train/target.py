@@ -24,7 +24,7 @@ from probe_kit.train.columns.builtin import builtin_column
 from probe_kit.train.columns.cells import Cell
 from probe_kit.train.columns.table import EPISODE, FRAME, INFERENCE, SOURCE, LabelTable, read_table
 from probe_kit.train.columns.values import LabelValues, code_labels
-from probe_kit.train.data.run_reader import RunReader, check_several_wordings
+from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -262,7 +262,7 @@ def _side(
 ) -> Target:
     """Return the side of the correct picture, the chosen one, or the correct one flipped for half of the items.
 
-    Raises UsageError for a run without sides, for episodes of several wordings, and for options of other targets.
+    Raises UsageError for a run without sides, and for options of other targets.
     """
     check_scene_run(run, f"a probe of the side ({name})")
     further = {"task": task, "group_by": group_by, "exchange_within": exchange_within}
@@ -271,7 +271,6 @@ def _side(
             f"{refused[0]}={further[refused[0]]} with the side {name!r}; expected none, because a side is "
             "binary and its groups are the run's. Leave it out, or take another target"
         )
-    check_several_wordings(run.episodes)
     labels = side_labels(run.episodes, name, seed)
     episodes = tuple(run.episodes[EPISODE].astype(str))
     values = np.where(labels < 0, np.nan, labels.astype(np.float64))

@@ -124,6 +124,17 @@ def load_results(run: RunReader, key: str | None = None, target: str | None = No
     return _read(run, max(newest.values(), key=_rank))
 
 
+def load_side_results(run: RunReader, key: str | None = None) -> ProbeResults:
+    """Return stored results of a side, as `load_results` does. Raises UsageError for a key of another target."""
+    results = load_results(run, key)
+    if not results.settings.is_side:
+        raise UsageError(
+            f"{run.location}: the probes {results.key} are of {results.settings.target!r}, not of a side. Add "
+            f"--target {results.settings.target}, or give the key of other probes"
+        )
+    return results
+
+
 def _is_default(bundle: Bundle, target: str) -> bool:
     """Whether results are of a target, and of a side at its first captured inference."""
     settings = settings_of(bundle)

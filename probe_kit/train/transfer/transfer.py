@@ -18,7 +18,7 @@ from probe_kit.train.crossval.task_scores import balanced_scores
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import Samples, read_samples, sites_of
 from probe_kit.train.execution import ExecutionSettings
-from probe_kit.train.probe_sweep import TOKEN_PERMUTATIONS, Progress, Sweep, check_options
+from probe_kit.train.probe_sweep import TOKEN_PERMUTATIONS, Progress, Sweep, check_options, check_run
 from probe_kit.train.problem import Problem, least_p, make_problem
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.solver.row_subset import RowSubset
@@ -63,6 +63,8 @@ def transfer_probes(
     options: dict[str, Any] = {"views": views, "seed": seed, "call": call}
     pooled = categories or (EVERYWHERE,)
     of_other = target if other_target is None else other_target
+    for reader in (run, other):
+        check_run(reader, categories)
     side = Sweep.of(run, target, pooled, ExecutionSettings(), None, window=window, permutations=0, **options)
     own_window = side.samples.window if side.target.per_step else None
     options |= {"permutations": permutations, "token_permutations": token_permutations, "window": own_window}
