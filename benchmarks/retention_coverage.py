@@ -28,7 +28,7 @@ from probe_kit.retention.estimators.stream_scores import Rate
 from probe_kit.statistics.estimates.crossfit import CrossFit
 from probe_kit.statistics.estimates.retention import retention
 from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
-from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.intervals import Interval
 
 SHUFFLES = 20
 STREAMS = ("action", "backbone")

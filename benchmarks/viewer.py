@@ -29,7 +29,7 @@ from typing import Any
 
 from probe_kit import open_run
 from probe_kit.view import write_viewer
-from probe_kit.view.page_files import page_files
+from probe_kit.view.export import page_files
 
 ROOT = Path(__file__).parents[1]
 VIEWS = {

@@ -41,7 +41,7 @@ from probe_kit.runs.layout import (
 from probe_kit.scene_names import ArmName, Rendering, RuleName, SceneName
 from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
-from probe_kit.suite.ladder import WORDINGS, Wording
+from probe_kit.suite.wording import WORDINGS, Wording
 from probe_kit.train.choices import CONTROLS, INCOMPLETE, SIDES, TASKS, Control, Incomplete, Side, Task
 
 LEAVES: dict[str, Any] = dict(commands_of(typer.main.get_command(app), None))

@@ -1,10 +1,11 @@
-"""Reading of foreign files: regular files alone, and no more bytes than expected."""
+"""Reading of foreign files: regular files alone, no more bytes than expected, and YAML with bounded aliases."""
 
 import errno
 import os
 import stat
 from io import BufferedReader
 from pathlib import Path
+from typing import Any
 
 MOST_BYTES = 256 << 20
 """The largest configuration or picture that is read; the vocabularies of tokenizers are a tenth of it."""
@@ -64,3 +65,37 @@ def _check(path: Path, found: os.stat_result, most: int) -> None:
 def _too_large(path: Path, size: int, most: int) -> OSError:
     reason = f"it has {size / 1e6:,.0f} MB; expected at most {most / 1e6:,.0f} MB"
     return OSError(errno.EFBIG, reason, str(path))
+
+
+MOST_NODES = 1_000_000
+_MOST_YAML_BYTES = 16 << 20
+
+
+def load_yaml(file: Path) -> Any:
+    """Return the value in a file of safe YAML.
+
+    Raises OSError as `read_regular` does, ValueError for other text, for text that nests too deeply, and for
+    aliases that stand for more than `MOST_NODES` values: nine lines can stand for a billion.
+    """
+    import yaml
+
+    try:
+        value = yaml.safe_load(read_regular(file, _MOST_YAML_BYTES))
+        count = _nodes(value, {})
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from error
+    except RecursionError:
+        raise ValueError("it nests too deeply, or refers to itself") from None
+    if count > MOST_NODES:
+        raise ValueError(f"its aliases stand for {count:.0e} values; expected at most {MOST_NODES:,}")
+    return value
+
+
+def _nodes(value: Any, counted: dict[int, int]) -> int:
+    """The number of values below one, where an alias counts as all that it stands for."""
+    if not isinstance(value, dict | list | set | tuple):
+        return 1
+    if id(value) not in counted:
+        children = value.values() if isinstance(value, dict) else value
+        counted[id(value)] = 1 + sum(_nodes(child, counted) for child in children)
+    return counted[id(value)]

@@ -1,8 +1,10 @@
-"""Detection of this machine's devices and cores without importing torch, which takes seconds."""
+"""The machine that runs probe_kit: its scheduling, and the facts that results record."""
 
 import os
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from probe_kit._system.counting import counted
@@ -66,3 +68,21 @@ def _of_system() -> list[str]:
 
 def _surely_without_gpu() -> bool:
     return sys.platform == "linux" and not any(any(Path("/dev").glob(name)) for name in _GPU_NODES)
+
+
+@contextmanager
+def same_scheduling() -> Iterator[None]:
+    """Put the scheduling policy of this thread back at the end.
+
+    For root, the video encoder SVT-AV1 makes the thread that opens it a real-time one of the highest priority. All
+    other processes of the machine would then wait for this one, and for those that it starts. Does nothing on
+    systems without scheduling policies.
+    """
+    if not hasattr(os, "sched_setscheduler"):
+        yield
+        return
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, parameters)

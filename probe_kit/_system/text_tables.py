@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from probe_kit._system.bounded_files import open_regular
-from probe_kit._system.csv_text import unescaped
+from probe_kit._system.escaping import unescaped
 from probe_kit._system.table_cells import is_missing, plain_cell
 from probe_kit.errors import ProbeKitError, UsageError
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from probe_kit._tables.content import Cell, Content
 from probe_kit._tables.heat import heat_colour
 from probe_kit._tables.numbers import NONE
-from probe_kit._terminal.local_paths import without_places
+from probe_kit._terminal.plain_text import without_places
 
 if TYPE_CHECKING:
     from jinja2 import Environment

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from probe_kit._system.markdown_text import markdown_safe
+from probe_kit._system.escaping import markdown_safe
 from probe_kit._tables.content import Cell, Content
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from probe_kit._system.csv_text import csv_of_rows
+from probe_kit._system.escaping import csv_of_rows
 from probe_kit._tables.content import Cell, Content, Heading, Row, grouped
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Sanitising of foreign text: escape sequences and control characters are shown, not executed."""
+"""Plain text: what a terminal would obey is shown instead, and local folders are left out of shared pages."""
 
 import re
 
@@ -15,3 +15,25 @@ def terminal_safe(text: str) -> str:
 def _sign(found: re.Match[str]) -> str:
     code = ord(found[0])
     return chr(0x2400 + code) if code < 0x20 else "\u2421" if code == 0x7F else "\ufffd"
+
+
+_QUOTED = re.compile(r"""(["'`])((?:file://)?(?:~|[A-Za-z]:)?[/\\][^"'`\n]*[/\\][^"'`\n]*)\1""")
+"""A whole path in quotes, as in JSON; it may hold spaces."""
+_PART = r"[\w.@+~%=-]+"
+_BARE = re.compile(
+    r"(?<![\w:/\\.\]})>…-])(?:file://)?"
+    rf"(?:(?:~|[A-Za-z]:)?(?:/{_PART}){{2,}}|~/{_PART}|[A-Za-z]:(?:\\{{1,2}}{_PART})+)/?"
+)
+"""A path of two parts or more in a sentence."""
+
+
+def without_places(text: str, places: tuple[str, ...] = ()) -> str:
+    """`text` with the last part alone of every absolute path, and of `places`, which may hold spaces."""
+    for place in sorted(filter(None, places), key=len, reverse=True):
+        text = text.replace(place, _last(place))
+    text = _QUOTED.sub(lambda found: f"{found[1]}{_last(found[2])}{found[1]}", text)
+    return _BARE.sub(lambda found: _last(found[0]), text)
+
+
+def _last(path: str) -> str:
+    return re.split(r"[/\\]", path.rstrip("/\\"))[-1]

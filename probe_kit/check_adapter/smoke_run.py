@@ -7,7 +7,7 @@ from typing import Any
 
 from PIL import Image, ImageDraw
 
-from probe_kit._system.csv_text import csv_of_rows
+from probe_kit._system.escaping import csv_of_rows
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.hooks.conformance.check import require
 from probe_kit.runs import Run

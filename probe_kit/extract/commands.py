@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from probe_kit.extract.settings import Settings
     from probe_kit.runs import Run
     from probe_kit.runs.location import Location
-    from probe_kit.suite.ladder import Wording
+    from probe_kit.suite.wording import Wording
 
 
 LARGE = 64 * 10**9

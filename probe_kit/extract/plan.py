@@ -10,7 +10,7 @@ from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.runs.layout import LaterViews, StoredStream
 from probe_kit.suite import Episode, Suite
-from probe_kit.suite.ladder import Wording, in_words
+from probe_kit.suite.wording import Wording, in_words
 
 
 class PlannedRow(Protocol):

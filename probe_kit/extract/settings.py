@@ -30,7 +30,7 @@ from probe_kit.hooks.contract.protocol import PLAIN
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
-    from probe_kit.suite.ladder import Wording
+    from probe_kit.suite.wording import Wording
 
 SOURCES: tuple[type[SourceSettings], ...] = (SceneSettings, LeRobotSource, EnvSource)
 """The kinds of sources, that of no option first."""

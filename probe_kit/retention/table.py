@@ -4,10 +4,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
-from probe_kit._system.csv_text import csv_of_frame
-from probe_kit._system.markdown_text import markdown_safe
+from probe_kit._system.escaping import csv_of_frame, markdown_safe
 from probe_kit._tables.table import Table
-from probe_kit._terminal.local_paths import without_places
+from probe_kit._terminal.plain_text import without_places
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
 from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.statistics.estimates.mover import NO_LIMITS
-from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.intervals import NO_LIMITS, Interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 MOST_EXACT = 200_000

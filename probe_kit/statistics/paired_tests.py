@@ -1,11 +1,66 @@
-"""Exact tests of correct against wrong on the same items, with groups of items as the unit."""
+"""Exact tests of paired differences on the same episodes or items, and their corrections for many tests.
 
-from collections.abc import Sequence
+Groups of items are the unit: items that share pictures are not independent.
+"""
+
+from collections.abc import Callable, Hashable, Sequence
+from itertools import product
+from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.statistics.significance import SIGNIFICANCE
+
+
+def sign_p(more: int, less: int) -> float:
+    """Exact two-sided p that `more` against `less` is a fair coin's; 1.0 without any.
+
+    Of episodes that one condition alone got right against those the other alone did, it is McNemar's exact test.
+    """
+    trials, most = more + less, max(more, less)
+    tail = sum(comb(trials, heads) for heads in range(most, trials + 1)) / 2**trials
+    return float(min(1.0, 2 * tail))
+
+
+def grouped_sign_p(difference: NDArray[np.int_], groups: NDArray[np.str_]) -> float:
+    """The same with a group as the unit, so that items that share pictures count once.
+
+    difference: (E,) per episode 1, 0 or -1, by which condition was right. groups: (E,).
+    """
+    _, group_of = np.unique(groups, return_inverse=True)
+    lead = np.bincount(group_of, weights=difference)
+    return sign_p(int((lead > 0).sum()), int((lead < 0).sum()))
+
+
+ROUNDING = 1e-9
+"""Effects so small (metres) come from the order of sums, and have no sign."""
+
+
+def unit_means(values: NDArray[np.float64], units: ArrayLike) -> NDArray[np.float64]:
+    """Mean of (…, E) values over the episodes of each unit, (…, U) in the order of their names."""
+    names, unit_of = np.unique(np.asarray(units), return_inverse=True)
+    means = np.stack([values[..., unit_of == unit].mean(axis=-1) for unit in range(names.size)], axis=-1)
+    return np.asarray(means, np.float64)
+
+
+def greater_p(effects: NDArray[np.float64]) -> float:
+    """Chance that at least so many of the effects (U,) are positive, if each sign were a fair coin's.
+
+    Effects that are zero, up to rounding, take no part; 1 where there is none.
+    """
+    positive, negative = int((effects > ROUNDING).sum()), int((effects < -ROUNDING).sum())
+    trials = positive + negative
+    return float(sum(comb(trials, heads) for heads in range(positive, trials + 1)) / 2**trials)
+
+
+def paired_greater_p(values: NDArray[np.float64], items: ArrayLike, groups: ArrayLike) -> float:
+    """The same by item and by group, the larger of the two: items that share pictures are not independent.
+
+    values: (E,) effect per episode. items, groups: (E,).
+    """
+    return max(greater_p(unit_means(values, units)) for units in (items, groups))
+
 
 Right = NDArray[np.bool_]
 """(N,) whether each item is right."""
@@ -91,3 +146,67 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
         highest = max(highest, min(1.0, (len(order) - rank) * p))
         corrected[place] = highest
     return corrected
+
+
+def corrected[Row](
+    rows: Sequence[Row],
+    p: Callable[[Row], float | None],
+    summary: Callable[[Row], bool] = lambda _: False,
+    test: Callable[[Row], Hashable] | None = None,
+) -> list[float | None]:
+    """The corrected p of every row, in order; None where it has none.
+
+    summary: whether a row is over several categories; such rows are a family of their own. test: what a row
+    tests; several rows of one test, such as the views of one success rate, count once. By default each its own.
+    """
+    named = list(range(len(rows))) if test is None else [test(row) for row in rows]
+    found: dict[Hashable, float | None] = {}
+    for over_all in (False, True):
+        family = {name: p(row) for name, row in zip(named, rows, strict=True) if summary(row) == over_all}
+        found |= zip(family, holm(list(family.values())), strict=True)
+    return [found[name] for name in named]
+
+
+FLOOR = 1e-6
+"""Metres added to every standard error: a site that nothing reads has effects of exactly 0, and a finite T."""
+EXACT = 12
+"""Up to so many groups every pattern of signs is tried; beyond, `DRAWS` of them."""
+DRAWS = 2000
+
+
+def max_t(
+    values: NDArray[np.float64], items: ArrayLike, groups: ArrayLike, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """One-sided tests of S effects that are positive in the mean, together.
+
+    values: (S, E) effect per episode. items, groups: (E,); an item's episodes are averaged, and the items of a
+    group change signs together. seed: of the draws. Returns (S,) each: T = mean / (standard error + FLOOR), its p,
+    and its p against the largest T of all S under the same signs (family-wise).
+    """
+    names, first = np.unique(np.asarray(items), return_index=True)
+    means = unit_means(values, items)
+    _, group_of = np.unique(np.asarray(groups)[first], return_inverse=True)
+    signs = _signs(int(group_of.max()) + 1, seed)[:, group_of]
+    root = np.sqrt(names.size)
+    squares = (means**2).sum(axis=1)
+    drawn = signs @ means.T / names.size
+    spread = np.sqrt(np.maximum(squares / names.size - drawn**2, 0.0) * names.size / max(names.size - 1, 1))
+    t = drawn / (spread / root + FLOOR)  # (draws, S); the first draw changes no sign
+    observed = t[0]
+    slack = 1e-9 * (1 + np.abs(observed))
+    p = (t >= observed - slack).mean(axis=0)
+    p_fwe = (t.max(axis=1)[:, None] >= observed - slack).mean(axis=0)
+    return observed, np.asarray(p), np.asarray(p_fwe)
+
+
+def smallest_flip_p(groups: int) -> float:
+    """The smallest p-value of `max_t` with so many groups: one pattern of all that are tried."""
+    return 0.5**groups if groups <= EXACT else 1 / DRAWS
+
+
+def _signs(groups: int, seed: int) -> NDArray[np.float64]:
+    """(draws, groups) of ±1, the first row all +1."""
+    if groups <= EXACT:
+        return np.array(list(product((1.0, -1.0), repeat=groups)))
+    drawn = np.random.default_rng(seed).choice((1.0, -1.0), (DRAWS - 1, groups))
+    return np.vstack([np.ones(groups), drawn])

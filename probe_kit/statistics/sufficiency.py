@@ -13,7 +13,7 @@ from probe_kit.statistics.estimates.crossfit import FEWEST_GROUPS
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most, findable
 from probe_kit.statistics.folds import OUTER_FOLDS
 from probe_kit.statistics.label_permutations import possible_flips, smallest_p
-from probe_kit.statistics.sign_flips import smallest_flip_p
+from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 GROUPS_FOR_PROBES = OUTER_FOLDS

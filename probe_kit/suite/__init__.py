@@ -2,15 +2,13 @@
 
 from probe_kit.suite.build import build_suite, default_suite
 from probe_kit.suite.categories import CATEGORIES, Category
-from probe_kit.suite.checks.validate import Report, validate_suite
-from probe_kit.suite.custom.from_csv import suite_from_csv
-from probe_kit.suite.custom.own_items import Terms
-from probe_kit.suite.custom.own_pictures import PicturePair, suite_from_pictures
 from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side
 from probe_kit.suite.manifest import load_suite
+from probe_kit.suite.own_questions import PicturePair, Terms, suite_from_csv, suite_from_pictures
 from probe_kit.suite.pictures import load_picture
 from probe_kit.suite.suite import Suite
-from probe_kit.suite.validation.findings import Finding
+from probe_kit.suite.validate import Report, validate_suite
+from probe_kit.suite.validation.records import Finding
 
 __all__ = [
     "CATEGORIES",

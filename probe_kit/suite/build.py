@@ -11,15 +11,14 @@ from typing import Any
 
 from probe_kit.errors import UsageError
 from probe_kit.hashing import sha256_json, sha256_text
-from probe_kit.suite.card import drawing_libraries, new_suite
 from probe_kit.suite.categories import CATEGORIES, check_categories
 from probe_kit.suite.generators import GENERATORS
-from probe_kit.suite.generators.couples import SUITE_NAME, SUITE_VERSION
+from probe_kit.suite.generators.generator import SUITE_NAME, SUITE_VERSION
 from probe_kit.suite.generators.twins import draw_twins
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item
 from probe_kit.suite.manifest import check_foreign_folder, load_suite, save_suite
-from probe_kit.suite.suite import Suite
+from probe_kit.suite.suite import Suite, drawing_libraries, new_suite
 
 Progress = Callable[[int, int], None]
 ITEMS = 150
@@ -142,19 +141,7 @@ def _cache_key(options: Mapping[str, Any]) -> str:
     the notice beside it holds its checksums.
     """
     folder = Path(__file__).parent
-    own = (
-        "build",
-        "card",
-        "categories",
-        "grouping",
-        "items",
-        "ladder",
-        "making",
-        "manifest",
-        "pictures",
-        "suite",
-        "wording",
-    )
+    own = ("build", "categories", "grouping", "items", "making", "manifest", "pictures", "suite", "wording")
     sources = [
         *sorted((folder / "generators").rglob("*.py")),
         *(folder / f"{name}.py" for name in own),

@@ -41,7 +41,7 @@ class Item:
 
     `left` and `right` refer to the *original* layout; the swapped layout is derived, never stored.
     `side_word` marks a sign whose name holds a side word, such as "no left turn sign".
-    `wordings`: what else the item can be asked in, by name, see `suite.ladder`; no part of the item's identity.
+    `wordings`: what else the item can be asked in, by name, see `suite.wording`; no part of the item's identity.
     `folder` is what the file names are relative to on this machine; it takes no part in the item's identity.
     """
 

@@ -1,24 +1,36 @@
-"""Construction of items, shared by drawn and converted questions."""
+"""The maker of pictures and items, for drawn and converted questions and for those of a user."""
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NotRequired, TypedDict, Unpack, cast
+from typing import Any
 from unicodedata import normalize
 
-from probe_kit.hashing import sha256_json
-from probe_kit.suite.categories import CATEGORIES
+from PIL import Image
+
+from probe_kit.suite.categories import category_of
 from probe_kit.suite.items import Item, Side
-from probe_kit.suite.pictures import picture_file_name
+from probe_kit.suite.pictures import encode_png, letterboxed, picture_file_name, pixels_sha256
+
+_TRANSFER_TYPES = {
+    **dict.fromkeys(("shape", "symmetry", "counting", "time", "celebrity"), "moderate"),
+    "living-world": "heavy",
+}
+"""Of the paper's categories; `near` for all others."""
+_LARGEST, _SMALLEST = 512, 224  # pixels of a stored picture's side
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An encoded picture with all that an item records about it."""
+    """An encoded picture with all that an item records about it.
+
+    original_pixels: hash of the pixels that it was made from. operation: what was done to them before.
+    """
 
     image_id: str
     png: bytes
     pixels_sha256: str
+    original_pixels: str = ""
+    operation: str = "none"
 
     @property
     def file_name(self) -> str:
@@ -26,59 +38,48 @@ class Picture:
         return picture_file_name(self.pixels_sha256)
 
 
-class ItemDraft(TypedDict):
-    """The fields of a question from which an item is made; see `Item`."""
-
-    transfer_type: str
-    construction: str
-    instruction: str
-    object_phrase: str
-    object_article: str
-    polarity: str
-    target_concept: str
-    distractor_concept: str
-    pair_id: str
-    rule_id: str
-    curation_status: str
-    license: str
-    attribution: str
-    redistributable: bool
-    contains_real_face: bool
-    source: dict[str, Any]
-    gen: dict[str, Any]
-    side_word: NotRequired[bool]
-    wordings: NotRequired[dict[str, str]]
+def picture_of(image_id: str, image: Image.Image) -> Picture:
+    """The picture as it is."""
+    return Picture(image_id, encode_png(image), pixels_sha256(image))
 
 
-def make_item(
-    suite: str,
-    category: str,
-    side: Side,
-    pictures: tuple[Picture, Picture],
-    content: Mapping[str, Any],
-    **question: Unpack[ItemDraft],
-) -> Item:
+def squared_picture(image_id: str, image: Image.Image, operation: str = "none") -> Picture:
+    """The picture on a white square of 224 to 512 pixels. operation: what was done to it before."""
+    square = letterboxed(image)
+    size = min(max(square.width, _SMALLEST), _LARGEST)
+    stored = square if square.width == size else square.resize((size, size), Image.Resampling.BICUBIC)
+    return Picture(image_id, encode_png(stored), pixels_sha256(stored), pixels_sha256(image), operation)
+
+
+def make_item(item_id: str, category: str, side: Side, pictures: tuple[Picture, Picture], **fields: Any) -> Item:
     """An item whose group is not known yet.
 
-    suite: what its id begins with. side: where the correct one of `pictures`, left and right, lies.
-    content: what makes it this item and no other; its hash is the id's end.
+    side: where the correct one of `pictures`, left and right, lies. fields: all others of an `Item` that are not
+    those of most items. Texts are composed (Unicode's form NFC).
     """
     left, right = pictures
-    composed = {name: normalize("NFC", one) if isinstance(one, str) else one for name, one in question.items()}
-    return Item(
-        item_id=f"{suite}-{category}-{sha256_json(content)[:10]}",
-        category=category,
-        domain=CATEGORIES[category].domain,
-        correct_side=side,
-        left_file_name=left.file_name,
-        right_file_name=right.file_name,
-        left_sha256=hashlib.sha256(left.png).hexdigest(),
-        right_sha256=hashlib.sha256(right.png).hexdigest(),
-        left_pixels_sha256=left.pixels_sha256,
-        right_pixels_sha256=right.pixels_sha256,
-        left_image_id=left.image_id,
-        right_image_id=right.image_id,
-        group_id="",
-        split="eval",
-        **cast("ItemDraft", composed),
-    )
+    record = {
+        "item_id": item_id,
+        "category": category,
+        "domain": category_of(category).domain,
+        "transfer_type": _TRANSFER_TYPES.get(category, "near"),
+        "polarity": "none",
+        "correct_side": side,
+        "left_file_name": left.file_name,
+        "right_file_name": right.file_name,
+        "left_sha256": hashlib.sha256(left.png).hexdigest(),
+        "right_sha256": hashlib.sha256(right.png).hexdigest(),
+        "left_pixels_sha256": left.pixels_sha256,
+        "right_pixels_sha256": right.pixels_sha256,
+        "left_image_id": left.image_id,
+        "right_image_id": right.image_id,
+        "group_id": "",
+        "split": "eval",
+        "curation_status": "rules-only",
+        "gen": {},
+        **fields,
+    }
+    composed: dict[str, Any] = {
+        name: normalize("NFC", value) if isinstance(value, str) else value for name, value in record.items()
+    }
+    return Item(**composed)

@@ -16,13 +16,21 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit._system.bounded_files import read_regular
-from probe_kit._system.csv_text import csv_of_rows
 from probe_kit._system.drafts import draft_of
+from probe_kit._system.escaping import csv_of_rows
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite.items import Item
 from probe_kit.suite.suite import Suite
-from probe_kit.suite.validation.findings import Finding, error, listing
-from probe_kit.suite.validation.records import check_card, check_record, check_schema, parse_line, unique_ids
+from probe_kit.suite.validation.records import (
+    Finding,
+    check_card,
+    check_record,
+    check_schema,
+    error,
+    listing,
+    parse_line,
+    unique_ids,
+)
 from probe_kit.suite.validation.rules import LOADING_RULES
 
 CARD = "suite.json"

@@ -67,8 +67,8 @@ def labels(
     The table has a line per episode and captured inference, with the built-in columns that `train --target` knows.
     Add a column, and decode it with `probe-kit train RUN --labels FILE --target COLUMN`.
     """
-    from probe_kit._system.csv_text import csv_of_frame
     from probe_kit._system.drafts import draft_of
+    from probe_kit._system.escaping import csv_of_frame
     from probe_kit.train.columns.builtin import label_frame, why_no_sim
 
     if out_file.exists():

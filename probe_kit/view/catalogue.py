@@ -1,13 +1,14 @@
-"""The payloads of a page by name: what `--export` writes and the server sends."""
+"""The payloads of a page by name, for `--export` and the server, and the following of runs that grow."""
 
 import re
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from probe_kit.hashing import sha256_json
 from probe_kit.retention.columns.glossary import VIEWER_WORDS
 from probe_kit.runs import Run
+from probe_kit.runs.layout import COMMITS, FAILED
 from probe_kit.runs.thumbnails import read_sheet
 from probe_kit.view.payloads.coding import failure_script, payload_script
 from probe_kit.view.payloads.episode_payload import episode_payload
@@ -107,3 +108,42 @@ class Catalogue:
             for key, viewed in self.runs.items()
         ]
         return {"schema": SCHEMA, "runs": runs, "words": list(VIEWER_WORDS.items())}
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How far a run is. run: its key. failed: episodes that were given up."""
+
+    run: str
+    committed: int
+    planned: int
+    failed: int
+
+
+class Follower:
+    """The runs of a catalogue that were unfinished; `poll` puts their new episodes into the catalogue."""
+
+    def __init__(self, catalogue: Catalogue) -> None:
+        self._catalogue = catalogue
+        self._keys = [key for key in catalogue.runs if not self._is_finished(key)]
+
+    @property
+    def is_growing(self) -> bool:
+        """Whether any run was unfinished."""
+        return bool(self._keys)
+
+    def poll(self) -> list[Growth]:
+        """List commits and failures of every unfinished run, and read new commits only."""
+        return [self._poll(key) for key in self._keys]
+
+    def _poll(self, key: str) -> Growth:
+        run = self._catalogue.runs[key].run
+        known = {COMMITS: len(run.commits()), FAILED: len(run.failed)}
+        if not self._is_finished(key) and any(len(run.location.keys(where)) != n for where, n in known.items()):
+            run = run.grown()
+            self._catalogue.replace(key, run)
+        return Growth(key, len(run.commits()), run.planned, len(run.failed))
+
+    def _is_finished(self, key: str) -> bool:
+        run = self._catalogue.runs[key].run
+        return len(run.commits()) >= run.planned

@@ -9,7 +9,18 @@ from probe_kit._system.drafts import draft_of
 from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.runs import Run
 from probe_kit.view.catalogue import Catalogue
-from probe_kit.view.page_files import page_files
+
+APP = Path(__file__).parent / "app"
+INDEX = "index.html"
+
+
+def page_files() -> dict[str, bytes]:
+    """Content of the page's files by their name below the page's address, in order."""
+    return {
+        path.name if path.name == INDEX else f"app/{path.name}": path.read_bytes()
+        for path in sorted(APP.iterdir())
+    }
+
 
 _MARK = "This folder was exported by probe_kit."
 README = f"""{_MARK}

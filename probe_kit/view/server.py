@@ -29,9 +29,8 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from probe_kit.errors import ProbeKitError, UsageError
-from probe_kit.view.catalogue import INDEX_PAYLOAD, Catalogue
-from probe_kit.view.follower import Follower, Growth
-from probe_kit.view.page_files import INDEX, page_files
+from probe_kit.view.catalogue import INDEX_PAYLOAD, Catalogue, Follower, Growth
+from probe_kit.view.export import INDEX, page_files
 
 HOST = "127.0.0.1"
 TICK_S = 2.0

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.suite.generators import GENERATORS
-from probe_kit.suite.generators.couples import draw_couples
+from probe_kit.suite.generators.generator import draw_couples
 from probe_kit.suite.pictures import pixels_sha256
 from vlm_tiny_training.painting import Surface
 

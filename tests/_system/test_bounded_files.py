@@ -16,9 +16,8 @@ import pytest
 import probe_kit
 from probe_kit._system import bounded_arrays, bounded_json
 from probe_kit._system.bounded_arrays import open_arrays
-from probe_kit._system.bounded_files import check_regular, open_regular, read_regular
+from probe_kit._system.bounded_files import check_regular, load_yaml, open_regular, read_regular
 from probe_kit._system.bounded_json import load_gzipped_json, load_json
-from probe_kit._system.bounded_yaml import load_yaml
 from tests.support.parsed import package_nodes
 
 PACKAGE = Path(probe_kit.__file__).parent
@@ -120,7 +119,7 @@ UNBOUNDED = {
     "read_bytes", "read_text", "safe_load", "ParquetFile", "read_table", "read_parquet", "read_csv", "decompress",
 }  # fmt: skip
 ELSEWHERE = {
-    "_system/bounded_yaml.py": "the reader itself",
+    "_system/bounded_files.py": "the reader itself",
     "_system/bounded_arrays.py": "the reader itself",
     "runs/export/matrices.py": "the matrix that it has just written",
     "_system/parquet_files.py": "the reader itself",
@@ -130,10 +129,10 @@ ELSEWHERE = {
     "hooks/families/shared/statistics_bounds.py": "files of the package",
     "hooks/conformance/loading.py": "a copy of a checkpoint that was read",
     "models/magma/statistics.py": "files of the package",
-    "suite/generators/drawing/art.py": "files of the package",
+    "suite/generators/art.py": "files of the package",
     "suite/pictures.py": "`stored_picture`: files of the package",
     "suite/build.py": "files of the package",
-    "view/page_files.py": "files of the package",
+    "view/export.py": "files of the package",
     "retention/report/render.py": "files of the package",
     "runs/provenance.py": "files of the package",
     "extract/rollout/worker.py": "the video that it has just written",

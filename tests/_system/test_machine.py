@@ -1,11 +1,15 @@
+"""The machine: devices, cores and scheduling."""
+
+import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from probe_kit._system import machine
-from probe_kit._system.machine import check_device_name, what_is_here
+from probe_kit._system.machine import check_device_name, same_scheduling, what_is_here
 from probe_kit.errors import UsageError
 
 
@@ -41,3 +45,33 @@ def test_with_torch_there_it_names_what_torch_finds() -> None:
     import torch
 
     assert ("cuda:0" in what_is_here()) == torch.cuda.is_available()
+
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "sched_setscheduler"), reason="no scheduling policies here")
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_thread_that_a_library_makes_a_batch_one_is_normal_again(fails: bool) -> None:
+    policy = os.sched_getscheduler(0)
+    try:
+        with same_scheduling():
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+            if fails:
+                raise KeyError
+    except KeyError:
+        pass
+    assert os.sched_getscheduler(0) == policy
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only of root")
+@pytest.mark.filterwarnings("ignore")
+def test_encoding_av1_makes_a_thread_of_root_a_real_time_one_otherwise(tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    with same_scheduling():
+        with av.open(str(tmp_path / "film.mp4"), "w") as film:
+            stream = film.add_stream("libsvtav1", 5, width=64, height=64, pix_fmt="yuv420p")
+            film.mux(stream.encode(av.VideoFrame(64, 64, "yuv420p")) + stream.encode())
+        during = os.sched_getscheduler(0)
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+    if during == os.SCHED_OTHER:
+        pytest.skip("this machine gives no thread real time")

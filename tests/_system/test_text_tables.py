@@ -14,7 +14,7 @@ from probe_kit.errors import ProbeKitError, SuiteError, UsageError
 from probe_kit.suite.converters.benchmarks import mmbench
 from probe_kit.suite.converters.curation import read_curation
 from probe_kit.suite.converters.options import MmbenchOptions
-from probe_kit.suite.custom.from_csv import read_rows
+from probe_kit.suite.own_questions import read_rows
 from probe_kit.train import Target
 from tests.support.parsed import package_nodes
 

@@ -1,7 +1,10 @@
+"""Observations in the formats of other toolkits, and pictures as a GIF."""
+
 import numpy as np
 import pytest
+from PIL import Image
 
-from probe_kit.env.adapters import to_lerobot, to_openpi
+from probe_kit.env.adapters import save_gif, to_lerobot, to_openpi
 
 
 @pytest.fixture
@@ -34,3 +37,18 @@ def test_openpi_gets_the_whole_picture_padded_to_a_square(observation):
     assert (rows.sum(), rows[:28].any(), rows[-28:].any()) == (168, False, False)
     assert request["prompt"] == "Put the cube on the cat"
     np.testing.assert_array_equal(request["observation/state"], observation["agent_pos"])
+
+
+def test_a_recording_has_every_picture_and_plays_in_real_time(tmp_path):
+    pictures = [np.full((48, 64, 3), shade, np.uint8) for shade in (0, 90, 180, 250)]
+    save_gif(tmp_path / "episode.gif", pictures, fps=5)
+    with Image.open(tmp_path / "episode.gif") as gif:
+        assert (gif.n_frames, gif.size, gif.info["duration"], gif.info["loop"]) == (4, (64, 48), 200, 0)
+        gif.seek(2)
+        assert gif.convert("RGB").getpixel((5, 5)) == (180, 180, 180)
+
+
+def test_a_recording_of_nothing_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="no pictures"):
+        save_gif(tmp_path / "empty.gif", [])
+    assert not (tmp_path / "empty.gif").exists()

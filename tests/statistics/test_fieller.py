@@ -3,7 +3,7 @@ from math import inf
 import numpy as np
 import pytest
 
-from probe_kit.statistics.fieller import Interval, fieller_interval
+from probe_kit.statistics.intervals import Interval, fieller_interval
 
 
 def test_limits_solve_fiellers_equation() -> None:

@@ -8,8 +8,7 @@ from scipy.stats import permutation_test, ttest_ind
 
 from probe_kit.errors import UsageError
 from probe_kit.statistics import model_groups
-from probe_kit.statistics.estimates.mover import NO_LIMITS
-from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.intervals import NO_LIMITS, Interval
 from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
 from probe_kit.statistics.paired_tests import flip_gains_p
 

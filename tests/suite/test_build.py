@@ -9,7 +9,7 @@ import pytest
 
 from probe_kit.errors import SuiteError, UnknownCategoryError, UsageError
 from probe_kit.suite import Suite, build_suite, default_suite
-from probe_kit.suite.card import drawing_libraries
+from probe_kit.suite.suite import drawing_libraries
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -182,7 +182,7 @@ def test_another_version_of_what_draws_is_another_suite_in_the_cache(
     assert default_suite(["color"], 2).folder != before
 
 
-@pytest.mark.parametrize("source", ["wording.py", "pictures.py", "grouping.py", "generators/drawing/canvas.py"])
+@pytest.mark.parametrize("source", ["wording.py", "pictures.py", "grouping.py", "generators/canvas.py"])
 def test_other_code_that_draws_or_words_is_another_suite_in_the_cache(
     source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

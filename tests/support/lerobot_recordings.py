@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from probe_kit._execution.scheduling import same_scheduling
+from probe_kit._system.machine import same_scheduling
 from probe_kit.hooks.contract.observation import Observation
 
 CAMERA = "observation.images.top"

@@ -12,7 +12,7 @@ from probe_kit.cli import app
 from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.runs import open_run
 from probe_kit.view import write_viewer
-from probe_kit.view.page_files import APP, page_files
+from probe_kit.view.export import APP, page_files
 
 MOST_BYTES = 120_000
 """Of the page's own files, without licences."""

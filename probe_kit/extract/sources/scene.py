@@ -14,7 +14,7 @@ from probe_kit._terminal.options import further_option, read_size, some_of
 from probe_kit.extract.parts import LARGEST, Scene, option_of
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.scene_names import ArmName, Rendering
-from probe_kit.suite.ladder import WORDINGS, Wording, check_wordings
+from probe_kit.suite.wording import WORDINGS, Wording, check_wordings
 
 _option = partial(typer.Option, rich_help_panel="Scene")
 
@@ -81,8 +81,8 @@ class SceneSettings(SourceSettings):
     """Questions of a suite in the built-in scene.
 
     suite: suite folder; None for the embedded suite. categories: slugs; None for all of the suite. items: items
-    per category; None for all. wordings: names of `suite.ladder`, each a condition of the run; None for the items'
-    own words alone. scene: by default the model's own, see `Family.home`.
+    per category; None for all. wordings: names of `suite.wording`, each a condition of the run; None for the
+    items' own words alone. scene: by default the model's own, see `Family.home`.
     """
 
     kind: Literal["scene"] = "scene"

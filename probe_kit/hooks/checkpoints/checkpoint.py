@@ -5,9 +5,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from probe_kit._system.bounded_files import MOST_BYTES, check_regular, read_regular, read_regular_text
+from probe_kit._system.bounded_files import MOST_BYTES, check_regular, load_yaml, read_regular, read_regular_text
 from probe_kit._system.bounded_json import load_json
-from probe_kit._system.bounded_yaml import load_yaml
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks.checkpoints.commits import pinned_commit, record_commit
 from probe_kit.hooks.checkpoints.hub import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out

@@ -51,7 +51,7 @@ from probe_kit.intervene.replay import (
 )
 from probe_kit.intervene.settings import FIRST_CHUNK
 from probe_kit.runs.run import Run
-from probe_kit.statistics.sign_flips import max_t
+from probe_kit.statistics.paired_tests import max_t
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table

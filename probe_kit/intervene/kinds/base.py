@@ -23,7 +23,7 @@ from probe_kit.intervene.replay import Condition, ReplayBatch, replay
 from probe_kit.intervene.settings import FIRST_CHUNK, categories_in, items_of
 from probe_kit.intervene.tokens import TILES
 from probe_kit.runs.run import Run
-from probe_kit.statistics.sign_flips import max_t
+from probe_kit.statistics.paired_tests import max_t
 from probe_kit.suite.categories import category_of
 from probe_kit.train.data.run_reader import RunReader
 

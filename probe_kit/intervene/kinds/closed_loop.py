@@ -54,7 +54,7 @@ from probe_kit.intervene.replay import (
 from probe_kit.intervene.settings import FIRST_CHUNK, categories_in
 from probe_kit.intervene.tokens import TILES, role_tokens
 from probe_kit.runs.run import Run
-from probe_kit.statistics.mcnemar import sign_p
+from probe_kit.statistics.paired_tests import sign_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:

@@ -46,7 +46,7 @@ from probe_kit.intervene.settings import FIRST_CHUNK
 from probe_kit.intervene.tokens import TILES, role_tokens
 from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold
-from probe_kit.statistics.paired_signs import paired_greater_p
+from probe_kit.statistics.paired_tests import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:

@@ -43,8 +43,7 @@ from probe_kit.intervene.places import SEPARATOR, list_places, resolve_all
 from probe_kit.intervene.replay import CleanRun, Condition, Patched, ReplayBatch, SourceRun, replay
 from probe_kit.intervene.selection import StoredResult, stored_results
 from probe_kit.intervene.settings import PER_STEP
-from probe_kit.statistics.paired_signs import paired_greater_p
-from probe_kit.statistics.sign_flips import max_t, smallest_flip_p
+from probe_kit.statistics.paired_tests import max_t, paired_greater_p, smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
 

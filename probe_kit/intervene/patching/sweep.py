@@ -15,8 +15,7 @@ from probe_kit.intervene.patching.inference import infer, run_with_cache
 from probe_kit.intervene.patching.patch import Basis, Cell, Cells, as_tuple, infer_patched
 from probe_kit.intervene.places import PlaceName
 from probe_kit.statistics.bootstrap import draw_groups, units_seed
-from probe_kit.statistics.paired_signs import paired_greater_p
-from probe_kit.statistics.sign_flips import max_t
+from probe_kit.statistics.paired_tests import max_t, paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:

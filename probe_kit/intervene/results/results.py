@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probe_kit._system.counting import counted
-from probe_kit._system.csv_text import csv_of_frame
+from probe_kit._system.escaping import csv_of_frame
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.kinds import kind_of
 from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, frame_of
@@ -19,7 +19,7 @@ from probe_kit.intervene.places import unread_note
 from probe_kit.intervene.results.evidence import stored_other_readouts, stored_places, stored_ties, which_layer
 from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_all, describe_readouts, encoded_in
 from probe_kit.intervene.settings import PER_STEP
-from probe_kit.statistics.sign_flips import smallest_flip_p
+from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
 from probe_kit.train.results.store import load_results

@@ -17,9 +17,9 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk, Pair
 from probe_kit.intervene.sessions.session import ReplaySession, ReplaySource, sources_of
 from probe_kit.runs.run import Run
-from probe_kit.suite.counterparts import counterparts_of
+from probe_kit.suite.grouping import counterparts_of
 from probe_kit.suite.items import Episode, Item, Layout
-from probe_kit.suite.ladder import check_wordings, in_words
+from probe_kit.suite.wording import check_wordings, in_words
 from probe_kit.train.data.run_suite import suite_of
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from typing import Any
 
 from transformers import Qwen2_5_VLConfig
 
+from probe_kit._system.bounded_files import load_yaml
 from probe_kit._system.bounded_json import load_json
-from probe_kit._system.bounded_yaml import load_yaml
 from probe_kit.errors import CheckpointError
 from probe_kit.models.qwen import without_precision
 

@@ -35,7 +35,7 @@ from probe_kit.retention.rows.parts import Mode
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.statistics.estimates.retention import Ratio, retention_difference
 from probe_kit.statistics.estimates.scores import Scores
-from probe_kit.statistics.multiple_testing import corrected
+from probe_kit.statistics.paired_tests import corrected
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
 
 if TYPE_CHECKING:

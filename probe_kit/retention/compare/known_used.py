@@ -19,9 +19,9 @@ from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.retention import best_site
 from probe_kit.runs.scene_only import check_scene_run
-from probe_kit.statistics.multiple_testing import corrected
 from probe_kit.statistics.paired_tests import (
     clopper_pearson,
+    corrected,
     fisher_p,
     flip_p,
     mcnemar_p,

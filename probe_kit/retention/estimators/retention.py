@@ -15,10 +15,9 @@ from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageEr
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention.estimators.stream_scores import ACTION, BACKBONE, StreamScores, score_streams
 from probe_kit.statistics.estimates.balanced import CHANCE
-from probe_kit.statistics.estimates.mover import NO_LIMITS
 from probe_kit.statistics.estimates.retention import Ratio, retention
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, is_absent
-from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.intervals import NO_LIMITS, Interval
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED, Controls, Exceeds, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 

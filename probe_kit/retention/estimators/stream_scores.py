@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.statistics.estimates.crossfit import CrossFit, crossfit
-from probe_kit.statistics.estimates.mover import correlation_of, difference_interval, mean_interval, not_surer
 from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.estimates.verdict import at_most, findable, permuted_threshold
-from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.intervals import Interval, correlation_of, difference_interval, mean_interval, not_surer
 from probe_kit.train.results.probe_curve import ProbeCurve
 
 ACTION, BACKBONE = "action", "backbone"

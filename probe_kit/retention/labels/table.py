@@ -7,11 +7,10 @@ from math import nan
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.counting import counted
-from probe_kit._system.csv_text import csv_of_frame
-from probe_kit._system.markdown_text import markdown_safe
+from probe_kit._system.escaping import csv_of_frame, markdown_safe
 from probe_kit._tables.numbers import number, with_limits
 from probe_kit._tables.table import Heading, Table, grouped
-from probe_kit._terminal.local_paths import without_places
+from probe_kit._terminal.plain_text import without_places
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.behaviour.run_labels import full_names

@@ -6,7 +6,7 @@ from pathlib import Path
 from probe_kit._system.drafts import write_whole
 from probe_kit._tables.heat import heat_key
 from probe_kit._tables.table import Table
-from probe_kit._terminal.local_paths import without_places
+from probe_kit._terminal.plain_text import without_places
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.comparisons import known_used_tables
 from probe_kit.retention.columns.modes import Modes, modes_of

@@ -8,7 +8,7 @@ from io import BytesIO
 from urllib.parse import quote
 from xml.etree import ElementTree
 
-from probe_kit._terminal.local_paths import without_places
+from probe_kit._terminal.plain_text import without_places
 from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.report_figures import caption_of
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from probe_kit._execution.scheduling import same_scheduling
+from probe_kit._system.machine import same_scheduling
 from probe_kit._system.optional_dependencies import require
 from probe_kit.env.scoring.trajectory import MOTION, STATE
 from probe_kit.errors import UsageError

@@ -6,9 +6,8 @@ from math import nan, sqrt
 import numpy as np
 
 from probe_kit.statistics.estimates.balanced import Matrix
-from probe_kit.statistics.estimates.mover import NO_LIMITS, difference_interval
 from probe_kit.statistics.estimates.scores import Scores, t_quantile
-from probe_kit.statistics.fieller import Interval, fieller_interval
+from probe_kit.statistics.intervals import NO_LIMITS, Interval, difference_interval, fieller_interval
 
 LEAST_KNOWN = 0.25
 """Share of the backbone's score that the lower end of its 95 % interval must reach.

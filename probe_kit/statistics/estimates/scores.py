@@ -9,7 +9,7 @@ from probe_kit.errors import UsageError
 from probe_kit.statistics.estimates.balanced import CHANCE, Matrix
 from probe_kit.statistics.estimates.crossfit import CrossFit
 from probe_kit.statistics.estimates.shares import TAIL, wilson_interval
-from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.intervals import Interval
 
 
 @dataclass(frozen=True)

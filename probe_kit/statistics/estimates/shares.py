@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.statistics.estimates.mover import (
+from probe_kit.statistics.intervals import (
     NEGLIGIBLE_VARIANCE,
+    Interval,
     correlation_of,
     difference_interval,
     not_surer,
 )
-from probe_kit.statistics.fieller import Interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 Matrix = NDArray[np.float64]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from probe_kit._system.bounded_files import read_regular, read_regular_text
 from probe_kit._system.counting import counted
 from probe_kit._system.drafts import draft_of, full_disk_in_words, move_draft
-from probe_kit._system.markdown_text import markdown_safe
+from probe_kit._system.escaping import markdown_safe
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import UsageError
 from probe_kit.study.archive import (

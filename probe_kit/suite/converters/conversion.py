@@ -14,10 +14,9 @@ from PIL import Image
 from probe_kit._system.bounded_files import open_regular
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.suite.card import new_suite
 from probe_kit.suite.categories import check_categories
 from probe_kit.suite.converters.benchmarks import act2answer, compbench, iconqa, mmbench, okvqa, vlthink
-from probe_kit.suite.converters.benchmarks.act2answer_pairs import SOURCE as ACT2ANSWER
+from probe_kit.suite.converters.benchmarks.act2answer import SOURCE as ACT2ANSWER
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
 from probe_kit.suite.converters.curation import apply_curation, read_curation, write_curation
 from probe_kit.suite.converters.emission import emit, sample
@@ -37,8 +36,8 @@ from probe_kit.suite.converters.rewriting import rewrite
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item
 from probe_kit.suite.manifest import check_foreign_folder, save_suite
-from probe_kit.suite.suite import Suite
-from probe_kit.suite.validation.near_duplicates import Look, look_of
+from probe_kit.suite.pictures import Look, look_of
+from probe_kit.suite.suite import Suite, new_suite
 from probe_kit.suite.wording import instruction_for
 
 VERSION = "1.0.0"

@@ -10,8 +10,8 @@ from PIL import Image
 
 from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.bounded_json import parse_json
-from probe_kit._system.csv_text import csv_of_rows
 from probe_kit._system.drafts import write_whole
+from probe_kit._system.escaping import csv_of_rows
 from probe_kit._system.table_cells import is_missing, plain_cell, truth_of
 from probe_kit._system.text_tables import open_table
 from probe_kit.errors import SuiteError

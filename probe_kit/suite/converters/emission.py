@@ -11,15 +11,7 @@ from probe_kit.hashing import sha256_json
 from probe_kit.suite.converters.candidates import Reading, SourcePicture
 from probe_kit.suite.converters.pairing import Bundle, Proposal
 from probe_kit.suite.items import Item, Side, other_side
-from probe_kit.suite.making import Picture, make_item
-from probe_kit.suite.pictures import encode_png, letterboxed, pixels_sha256
-
-TRANSFER_TYPES = {
-    **dict.fromkeys(("emotion", "attribute", "state", "color", "public-info", "traffic"), "near"),
-    **dict.fromkeys(("shape", "symmetry", "counting", "time", "celebrity"), "moderate"),
-    "living-world": "heavy",
-}
-_LARGEST, _SMALLEST = 512, 224  # pixels of a stored picture's side
+from probe_kit.suite.making import Picture, make_item, squared_picture
 
 
 @dataclass(frozen=True)
@@ -28,16 +20,6 @@ class Emitted:
 
     items: list[Item]
     pictures: dict[str, bytes]
-
-
-@dataclass(frozen=True)
-class StoredPicture(Picture):
-    """A picture of a source as a suite stores it.
-
-    original_pixels: hash of the source's pixels. operation: what was done to them."""
-
-    original_pixels: str
-    operation: str
 
 
 def sample(bundles: Sequence[Bundle], count: int) -> list[Bundle]:
@@ -56,11 +38,11 @@ def emit(
     rng: np.random.Generator,
 ) -> Emitted:  # fmt: skip
     """The items of the bundles. Twins keep their two pictures where they are; all sides balance."""
-    store: dict[str, StoredPicture] = {}
+    store: dict[str, Picture] = {}
 
-    def stored(picture: SourcePicture) -> StoredPicture:
+    def stored(picture: SourcePicture) -> Picture:
         if picture.image_id not in store:
-            store[picture.image_id] = stored_picture(picture.image_id, render(picture), picture.operation)
+            store[picture.image_id] = squared_picture(picture.image_id, render(picture), picture.operation)
         return store[picture.image_id]
 
     items = [
@@ -92,16 +74,8 @@ def _side(proposal: Proposal, first: Proposal, side_of_first: Side) -> Side:
     return side_of_first if proposal.target == first.target else other_side(side_of_first)
 
 
-def stored_picture(image_id: str, image: Image.Image, operation: str) -> StoredPicture:
-    """`image` on a white square of 224 to 512 pixels. operation: what was done to it before."""
-    square = letterboxed(image)
-    size = min(max(square.width, _SMALLEST), _LARGEST)
-    shown = square if square.width == size else square.resize((size, size), Image.Resampling.BICUBIC)
-    return StoredPicture(image_id, encode_png(shown), pixels_sha256(shown), pixels_sha256(image), operation)
-
-
 def _item(
-    source: str, proposal: Proposal, side: Side, target: StoredPicture, distractor: StoredPicture, reading: Reading
+    source: str, proposal: Proposal, side: Side, target: Picture, distractor: Picture, reading: Reading
 ) -> Item:
     left, right = (target, distractor) if side == "left" else (distractor, target)
     assert proposal.wording is not None
@@ -113,12 +87,10 @@ def _item(
         "source_id": proposal.source_id,
     }
     return make_item(
-        source,
+        f"{source}-{proposal.category}-{sha256_json(content)[:10]}",
         proposal.category,
         side,
         (left, right),
-        content,
-        transfer_type=TRANSFER_TYPES[proposal.category],
         construction=proposal.construction,
         instruction=proposal.instruction,
         object_phrase=proposal.wording.phrase,
@@ -144,6 +116,5 @@ def _item(
             "right_original_pixels_sha256": right.original_pixels,
             "picture_operation": left.operation,
         },
-        gen={},
         side_word=proposal.side_word,
     )

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from probe_kit.suite.generators.canvas import Tile
 from probe_kit.suite.generators.categories.attribute import ATTRIBUTE
 from probe_kit.suite.generators.categories.color import COLOR
 from probe_kit.suite.generators.categories.counting import COUNTING
@@ -13,7 +14,7 @@ from probe_kit.suite.generators.categories.state import STATE
 from probe_kit.suite.generators.categories.symmetry import SYMMETRY
 from probe_kit.suite.generators.categories.time import TIME
 from probe_kit.suite.generators.categories.traffic import TRAFFIC
-from probe_kit.suite.generators.generator import Concept, Generator, Tile
+from probe_kit.suite.generators.generator import Concept, Generator
 from probe_kit.suite.wording import instruction_for
 
 __all__ = ["GENERATORS", "Concept", "Generator", "Tile", "vocabulary"]

@@ -1,11 +1,14 @@
-"""The interface of a category: its concepts, which two may meet, and a pair of tiles for them."""
+"""A category of the embedded suite: its concepts, which of them meet, and the couples of tiles that are drawn."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Protocol
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
 
 import numpy as np
-from PIL import Image
+
+from probe_kit.hashing import derive_seed, sha256_json
+from probe_kit.suite.generators.canvas import Tile
 
 
 @dataclass(frozen=True)
@@ -15,15 +18,6 @@ class Concept:
     name: str
     phrase: str
     polarity: Literal["pos", "neg", "none"] = "none"
-
-
-class Tile(Protocol):
-    """Everything one picture is drawn from: a frozen dataclass of plain values, and so a record of it."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    def draw(self) -> Image.Image:
-        """The picture, RGB; equal tiles give equal pixels."""
 
 
 @dataclass(frozen=True)
@@ -41,3 +35,84 @@ class Generator[C: Concept]:
     pairs: tuple[tuple[C, C], ...]
     tiles: Callable[[C, C, np.random.Generator], tuple[Tile, Tile]]
     named: Callable[[Any], str] | None = None
+
+
+def spread_pairs[C: Concept](
+    concepts: Sequence[C], allowed: Callable[[C, C], bool], most: int | None = None
+) -> tuple[tuple[C, C], ...]:
+    """Allowed pairs, at most `most`, that use every concept about equally often.
+
+    The concepts stand in a circle, in an order that follows no family; neighbours are paired first, then those
+    two places apart, and so on.
+    """
+    circle = sorted(concepts, key=lambda concept: sha256_json(asdict(concept)))
+    size = len(circle)
+    pairs = [
+        (circle[place], circle[(place + step) % size])
+        for step in range(1, size // 2 + 1)
+        for place in range(size if 2 * step < size else size // 2)
+    ]
+    return tuple(pair for pair in pairs if allowed(*pair))[:most]
+
+
+def half_within[C: Concept](
+    concepts: Sequence[C], family: Callable[[C], object], allowed: Callable[[C, C], bool]
+) -> tuple[tuple[C, C], ...]:
+    """All allowed pairs inside one family, and as many across families.
+
+    Were most pairs mixed, what a family has in common, such as a red ring, would already tell them apart.
+    """
+    within = spread_pairs(concepts, lambda a, b: family(a) == family(b) and allowed(a, b))
+    across = spread_pairs(concepts, lambda a, b: family(a) != family(b) and allowed(a, b), most=len(within))
+    return within + across
+
+
+def none_alike[C: Concept](families: Sequence[set[str]]) -> Callable[[C, C], bool]:
+    """A rule that allows two concepts unless their names are together in one of `families` of look-alikes."""
+    return lambda one, other: not any({one.name, other.name} <= family for family in families)
+
+
+SUITE_NAME = "a2a-embedded"
+# The next major version if the picture, text or side of any item changes; the next minor if items are added.
+SUITE_VERSION = "2.0.0"
+
+
+@dataclass(frozen=True)
+class Couple:
+    """Two tiles as they lie in the original layout; asked for once each, they become two items."""
+
+    left: Concept
+    right: Concept
+    left_tile: Tile
+    right_tile: Tile
+    left_asked_first: bool
+
+
+def draw_couples(generator: Generator[Any], seed: int) -> Iterator[Couple]:
+    """Endless couples of one category; the first ones are the same however many are taken."""
+    order = _random("order", generator.category, seed)
+    for number, (left, right) in enumerate(visiting_order(generator.pairs, order)):
+        rng = _random(number, generator.category, seed)
+        left_asked_first = bool(rng.integers(2))
+        left_tile, right_tile = generator.tiles(left, right, rng)
+        yield Couple(left, right, left_tile, right_tile, left_asked_first)
+
+
+def visiting_order[C: Concept](pairs: Sequence[tuple[C, C]], rng: np.random.Generator) -> Iterator[tuple[C, C]]:
+    """Endless (left, right) pairs: all of them shuffled, then all of them shuffled again.
+
+    The concept that has lain left more often goes right, so that no phrase leans to one side.
+    """
+    lean: Counter[str] = Counter()
+    while True:
+        for index in rng.permutation(len(pairs)):
+            left, right = pairs[index]
+            surplus = lean[left.phrase] - lean[right.phrase]
+            if surplus > 0 or (surplus == 0 and rng.integers(2)):
+                left, right = right, left
+            lean.update({left.phrase: 1, right.phrase: -1})
+            yield left, right
+
+
+def _random(part: str | int, category: str, seed: int) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(derive_seed(seed, SUITE_NAME, category, part)))

@@ -10,13 +10,11 @@ from itertools import islice
 from typing import Any
 
 from probe_kit.hashing import sha256_json
-from probe_kit.suite.categories import CATEGORIES
 from probe_kit.suite.generators import GENERATORS
-from probe_kit.suite.generators.couples import SUITE_NAME, SUITE_VERSION, Couple, draw_couples
-from probe_kit.suite.generators.generator import Generator, Tile
+from probe_kit.suite.generators.canvas import Tile
+from probe_kit.suite.generators.generator import SUITE_NAME, SUITE_VERSION, Couple, Generator, draw_couples
 from probe_kit.suite.items import Item, Side
-from probe_kit.suite.making import Picture, make_item
-from probe_kit.suite.pictures import encode_png, pixels_sha256
+from probe_kit.suite.making import Picture, make_item, picture_of
 from probe_kit.suite.wording import instruction_for, side_words
 
 ATTRIBUTION = "probe_kit"
@@ -24,18 +22,11 @@ LICENSE = "Apache-2.0"
 
 
 @dataclass(frozen=True)
-class DrawnPicture(Picture):
-    """A drawn tile. tile: what it was drawn from."""
-
-    tile: dict[str, Any]
-
-
-@dataclass(frozen=True)
 class Twins:
     """Two items over the same two pictures."""
 
     items: tuple[Item, Item]
-    pictures: tuple[DrawnPicture, DrawnPicture]
+    pictures: tuple[Picture, Picture]
 
 
 def draw_twins(category: str, count: int, seed: int) -> Iterator[Twins]:
@@ -48,44 +39,37 @@ def draw_twins(category: str, count: int, seed: int) -> Iterator[Twins]:
             "version": SUITE_VERSION,
             "seed": seed,
             "couple": number,
-            "left": pictures[0].tile,
-            "right": pictures[1].tile,
+            "left": asdict(couple.left_tile),
+            "right": asdict(couple.right_tile),
         }
         sides: tuple[Side, Side] = ("left", "right") if couple.left_asked_first else ("right", "left")
         first, second = (_item(couple, pictures, side, gen, generator) for side in sides)
         yield Twins((first, second), pictures)
 
 
-def _draw(category: str, tile: Tile) -> DrawnPicture:
-    image = tile.draw()
-    parameters = asdict(tile)
-    return DrawnPicture(
-        tile=parameters,
-        image_id=f"{SUITE_NAME}/{category}/{sha256_json(parameters)[:16]}",
-        png=encode_png(image),
-        pixels_sha256=pixels_sha256(image),
-    )
+def _draw(category: str, tile: Tile) -> Picture:
+    return picture_of(f"{SUITE_NAME}/{category}/{sha256_json(asdict(tile))[:16]}", tile.draw())
 
 
 def _item(
     couple: Couple,
-    pictures: tuple[DrawnPicture, DrawnPicture],
+    pictures: tuple[Picture, Picture],
     side: Side,
     gen: dict[str, Any],
     generator: Generator[Any],
 ) -> Item:
     """The item that asks for what lies on `side`; its group is not known yet."""
-    category = CATEGORIES[gen["generator"]]
+    category = gen["generator"]
     target, distractor = (couple.left, couple.right) if side == "left" else (couple.right, couple.left)
-    pair_id = f"{SUITE_NAME}-{category.slug}-s{gen['seed']}-{gen['couple']:04d}"
+    pair_id = f"{SUITE_NAME}-{category}-s{gen['seed']}-{gen['couple']:04d}"
     instruction = instruction_for(target.phrase, "the")
     tiles = (couple.left_tile, couple.right_tile) if side == "left" else (couple.right_tile, couple.left_tile)
+    content = {"instruction": instruction, "correct_side": side, "gen": gen}
     return make_item(
-        SUITE_NAME,
-        category.slug,
+        f"{SUITE_NAME}-{category}-{sha256_json(content)[:10]}",
+        category,
         side,
         pictures,
-        {"instruction": instruction, "correct_side": side, "gen": gen},
         transfer_type="procedural",
         construction="procedural",
         instruction=instruction,
@@ -96,7 +80,6 @@ def _item(
         distractor_concept=distractor.name,
         pair_id=pair_id,
         rule_id="procedural",
-        curation_status="rules-only",
         license=LICENSE,
         attribution=ATTRIBUTION,
         redistributable=True,

@@ -1,17 +1,55 @@
-"""E01 to E04: the lines of `metadata.jsonl` and the card, before items are made of them."""
+"""Findings, and E01 to E04: the lines of `metadata.jsonl` and the card, before items are made of them."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, fields
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
+from itertools import groupby
 from math import isfinite
-from typing import Any
+from operator import attrgetter
+from typing import Any, Literal
 from unicodedata import is_normalized
 
 from probe_kit._system.bounded_json import parse_json
 from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, is_slug
 from probe_kit.suite.items import Item
-from probe_kit.suite.ladder import WORDINGS
-from probe_kit.suite.validation.findings import Finding, error
+from probe_kit.suite.wording import WORDINGS
+
+PRINTED_PER_RULE = 20
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One violation of one rule; errors make a suite unusable, warnings do not."""
+
+    rule: str
+    severity: Literal["error", "warning"]
+    where: str
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.rule} {self.where}: {self.message}"
+
+
+def error(rule: str, where: str, message: str) -> Finding:
+    """A finding that makes the suite unusable."""
+    return Finding(rule, "error", where, message)
+
+
+def warning(rule: str, where: str, message: str) -> Finding:
+    """A finding that results survive, if one knows of it."""
+    return Finding(rule, "warning", where, message)
+
+
+def listing(findings: Iterable[Finding]) -> str:
+    """The findings as lines sorted by rule, at most 20 of each rule and then how many more there are."""
+    lines = []
+    for rule, same_rule in groupby(sorted(findings, key=attrgetter("rule")), key=attrgetter("rule")):
+        found = [str(finding) for finding in same_rule]
+        lines += found[:PRINTED_PER_RULE]
+        if len(found) > PRINTED_PER_RULE:
+            lines.append(f"{rule}: and {len(found) - PRINTED_PER_RULE} more")
+    return "\n".join(lines)
+
 
 SCHEMA_MAJOR = "1"
 LONGEST_FIELD = 4096

@@ -14,7 +14,7 @@ from probe_kit.suite.grouping import ties
 from probe_kit.suite.items import Item, Side
 from probe_kit.suite.pictures import LARGEST_PICTURE, decode_picture, picture_size, pixels_sha256
 from probe_kit.suite.suite import Suite, count_by_category
-from probe_kit.suite.validation.findings import Finding, error
+from probe_kit.suite.validation.records import Finding, error
 from probe_kit.suite.wording import MOST_CHARACTERS, MOST_WORDS, VERBATIM, side_words
 
 SMALLEST_PICTURE = 64

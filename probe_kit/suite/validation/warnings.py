@@ -13,12 +13,11 @@ from PIL import Image
 from probe_kit._system.counting import counted
 from probe_kit.statistics.folds import OUTER_FOLDS
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, category_of
-from probe_kit.suite.counterparts import counterparts_of
+from probe_kit.suite.grouping import counterparts_of
 from probe_kit.suite.items import Item
-from probe_kit.suite.pictures import load_picture
+from probe_kit.suite.pictures import NEAR_DUPLICATE_BITS, Look, load_picture, look_of
 from probe_kit.suite.suite import Suite, count_by_category
-from probe_kit.suite.validation.findings import Finding, warning
-from probe_kit.suite.validation.near_duplicates import NEAR_DUPLICATE_BITS, Look, look_of
+from probe_kit.suite.validation.records import Finding, warning
 from probe_kit.suite.validation.rules import SIDES
 
 LEAST_ROLE_BALANCE = 0.4

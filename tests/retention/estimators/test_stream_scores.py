@@ -15,7 +15,7 @@ from probe_kit.retention.estimators.stream_scores import PooledScores, Rate, Str
 from probe_kit.statistics.estimates.retention import retention, retention_difference
 from probe_kit.statistics.estimates.scores import Scores
 from probe_kit.statistics.estimates.shares import Share
-from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.intervals import Interval
 from probe_kit.train import ProbeCurve
 from tests.support.inner_qualities import inner_of
 

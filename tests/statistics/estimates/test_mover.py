@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from probe_kit.errors import UsageError
-from probe_kit.statistics.estimates.mover import NO_LIMITS, difference_interval, mean_interval
-from probe_kit.statistics.fieller import Interval
+from probe_kit.statistics.intervals import NO_LIMITS, Interval, difference_interval, mean_interval
 
 
 def normal(value: float, error: float) -> Interval:

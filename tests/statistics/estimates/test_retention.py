@@ -6,9 +6,9 @@ from scipy.stats import t
 
 from probe_kit.statistics.estimates.balanced import GroupSums
 from probe_kit.statistics.estimates.crossfit import Stream
-from probe_kit.statistics.estimates.mover import NO_LIMITS, difference_interval
 from probe_kit.statistics.estimates.retention import Ratio, retention, retention_difference
 from probe_kit.statistics.estimates.scores import Scores
+from probe_kit.statistics.intervals import NO_LIMITS, difference_interval
 from tests.support.inner_qualities import fitted, stream_of
 
 

@@ -4,7 +4,7 @@ from PIL import Image
 
 from probe_kit.suite.converters import ConvertOptions
 from probe_kit.suite.converters.filters import picture_problem, text_problem
-from probe_kit.suite.validation.near_duplicates import look_of
+from probe_kit.suite.pictures import look_of
 
 OPTIONS = ConvertOptions()
 

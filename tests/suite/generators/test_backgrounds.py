@@ -11,8 +11,8 @@ import pytest
 from probe_kit.hashing import sha256_json
 from probe_kit.suite import build_suite
 from probe_kit.suite.generators import GENERATORS
-from probe_kit.suite.generators.couples import draw_couples
-from probe_kit.suite.generators.drawing.palette import COLORS, INK_CONTRAST, background_for, lightness
+from probe_kit.suite.generators.generator import draw_couples
+from probe_kit.suite.generators.palette import COLORS, INK_CONTRAST, background_for, lightness
 from probe_kit.suite.generators.twins import draw_twins
 
 COLOURFUL = ("attribute", "color", "shape", "traffic")

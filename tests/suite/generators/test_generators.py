@@ -1,8 +1,9 @@
 """What every embedded category promises, and the rules of each."""
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
-from itertools import islice
+from itertools import combinations, islice
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +12,20 @@ import pytest
 from PIL import Image
 
 from probe_kit.suite import CATEGORIES
-from probe_kit.suite.generators import GENERATORS, vocabulary
+from probe_kit.suite.generators import GENERATORS, Concept, vocabulary
+from probe_kit.suite.generators.art import FOLDER as ART
+from probe_kit.suite.generators.art import color_icon, mask_icon
+from probe_kit.suite.generators.canvas import Canvas, Placement, Points
+from probe_kit.suite.generators.categories.attribute import GRADABLES
+from probe_kit.suite.generators.categories.counting import GLYPHS
+from probe_kit.suite.generators.categories.living_world import CREATURES, THINGS
+from probe_kit.suite.generators.categories.public_info import PICTOGRAMS
+from probe_kit.suite.generators.categories.state import TWO_STATES
 from probe_kit.suite.generators.categories.symmetry import mirror_overlap
-from probe_kit.suite.generators.couples import Couple, draw_couples
-from probe_kit.suite.generators.drawing.art import FOLDER as ART
-from probe_kit.suite.generators.drawing.art import color_icon, mask_icon
-from probe_kit.suite.generators.drawing.canvas import Canvas, Placement
-from probe_kit.suite.generators.drawing.creatures import CREATURES, THINGS
-from probe_kit.suite.generators.drawing.glyphs import GLYPHS
-from probe_kit.suite.generators.drawing.gradable import GRADABLES
-from probe_kit.suite.generators.drawing.palette import COLORS, INK_CONTRAST, lightness
-from probe_kit.suite.generators.drawing.pictograms import PICTOGRAMS
-from probe_kit.suite.generators.drawing.road_signs import ROAD_SIGN_ICONS, ROAD_SIGNS
-from probe_kit.suite.generators.drawing.two_states import TWO_STATES
+from probe_kit.suite.generators.categories.traffic import ROAD_SIGN_ICONS, ROAD_SIGNS
+from probe_kit.suite.generators.generator import Couple, draw_couples, visiting_order
+from probe_kit.suite.generators.outlines import OUTLINES
+from probe_kit.suite.generators.palette import COLORS, INK_CONTRAST, background_for, jittered, lightness
 from probe_kit.suite.wording import MOST_WORDS, instruction_for, side_words
 
 THUMBNAILS = Path(__file__).with_name("thumbnails.png")
@@ -343,3 +345,83 @@ def test_pictures_are_those_of_this_suite_version(tmp_path: Path) -> None:
     assert by_tile.max() <= 2, (
         f"a picture changed: raise SUITE_VERSION, then copy {tmp_path / 'thumbnails.png'} to {THUMBNAILS}"
     )
+
+
+CONCEPTS = [Concept(name, name) for name in "abcdefg"]
+PAIRS = tuple(combinations(CONCEPTS, 2))
+
+
+def visited(count: int, seed: int = 0) -> list[tuple[str, str]]:
+    order = visiting_order(PAIRS, np.random.default_rng(seed))
+    return [(left.name, right.name) for left, right in islice(order, count)]
+
+
+def test_all_pairs_are_visited_before_any_is_visited_again() -> None:
+    rounds = visited(2 * len(PAIRS))
+    for once in (rounds[: len(PAIRS)], rounds[len(PAIRS) :]):
+        assert {frozenset(pair) for pair in once} == {frozenset((a.name, b.name)) for a, b in PAIRS}
+
+
+def test_the_second_round_has_another_order() -> None:
+    rounds = visited(2 * len(PAIRS))
+    assert [set(pair) for pair in rounds[: len(PAIRS)]] != [set(pair) for pair in rounds[len(PAIRS) :]]
+
+
+def test_at_every_point_each_concept_has_lain_left_about_as_often_as_right() -> None:
+    lean: Counter[str] = Counter()
+    for left, right in visited(500):
+        lean.update({left: 1, right: -1})
+        assert max(map(abs, lean.values())) <= 3
+
+
+def test_the_order_depends_on_the_seed() -> None:
+    assert visited(20, seed=0) != visited(20, seed=1)
+
+
+def area(points: Points) -> float:
+    x, y = points.T
+    return abs(float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))) / 2
+
+
+def test_there_are_fifteen_outlines() -> None:
+    assert len(OUTLINES) == 15
+
+
+@pytest.mark.parametrize("name", list(OUTLINES))
+def test_all_outlines_have_the_same_area_and_are_centred(name: str) -> None:
+    points = OUTLINES[name]
+    assert area(points) == pytest.approx(area(OUTLINES["square"]))
+    np.testing.assert_allclose(points.min(axis=0), -points.max(axis=0), atol=1e-9)
+
+
+def test_outlines_cannot_be_changed_by_accident() -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        OUTLINES["star"][0] = 0
+
+
+@pytest.mark.parametrize("name", ["black", "white", "gray"])
+def test_a_colour_without_hue_stays_without_hue(name: str) -> None:
+    rng = np.random.default_rng(0)
+    assert all(len(set(jittered(COLORS[name], rng))) == 1 for _ in range(200))
+
+
+def test_a_shade_stays_nearest_to_its_own_name() -> None:
+    rng = np.random.default_rng(0)
+    terms = np.array(list(COLORS.values()), np.float64)
+    for number, color in enumerate(COLORS.values()):
+        shades = np.array([jittered(color, rng) for _ in range(200)])
+        nearest = np.linalg.norm(shades[:, None] - terms, axis=2).argmin(axis=1)
+        assert (nearest == number).all()
+
+
+def test_shades_differ() -> None:
+    rng = np.random.default_rng(0)
+    assert len({jittered(COLORS["red"], rng) for _ in range(100)}) > 80
+
+
+def test_backgrounds_are_pale_whatever_the_ink() -> None:
+    rng = np.random.default_rng(0)
+    for ink in COLORS.values():
+        backgrounds = np.array([background_for(ink, rng) for _ in range(100)])
+        assert backgrounds.min() >= 150 - 12
+        assert np.ptp(backgrounds, axis=1).max() <= 2 * 12

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from probe_kit._system.csv_text import csv_of_frame
+from probe_kit._system.escaping import csv_of_frame
 from probe_kit.errors import UsageError
 from probe_kit.train import Target
 

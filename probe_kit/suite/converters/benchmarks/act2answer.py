@@ -1,37 +1,102 @@
-"""Converter of sets in Act2Answer's format: `pairs.json`, `model_db.json` and a GLB per tile."""
+"""Converter of sets in Act2Answer's format: `pairs.json`, `model_db.json` and a GLB per tile.
+
+It refuses what the release would misread.
+"""
 
 import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from hashlib import sha256
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from probe_kit._system.bounded_files import read_regular
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import sha256_json
-from probe_kit.suite.card import new_suite
 from probe_kit.suite.categories import CATEGORIES, check_categories
-from probe_kit.suite.converters.benchmarks.act2answer_pairs import (
-    PAIRS,
-    REMEDY,
-    SOURCE,
-    Pair,
-    object_of,
-    read_pairs,
-)
 from probe_kit.suite.converters.benchmarks.glb import YAWS, Tile, read_tile
-from probe_kit.suite.converters.emission import TRANSFER_TYPES, StoredPicture, stored_picture
 from probe_kit.suite.converters.files import field_of, read_json
 from probe_kit.suite.converters.options import Act2AnswerOptions, options_from
 from probe_kit.suite.grouping import with_groups
-from probe_kit.suite.items import Item
-from probe_kit.suite.making import make_item
+from probe_kit.suite.items import Item, Side
+from probe_kit.suite.making import Picture, make_item, squared_picture
 from probe_kit.suite.manifest import check_foreign_folder, save_suite
-from probe_kit.suite.suite import Suite
+from probe_kit.suite.suite import Suite, new_suite
 from probe_kit.suite.wording import VERBATIM, side_words
+
+SOURCE = "act2answer"
+PAIRS = "pairs.json"
+REMEDY = "Name the folder of one set, such as carrot/test_colors, with its shapes."
+_SIDES: dict[str, Side] = {"left": "left", "right": "right"}
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One question. left, right: names of its tiles. concepts: what their pictures are called, left and right."""
+
+    index: int
+    left: str
+    right: str
+    question: str
+    answer: Side
+    concepts: tuple[str, str]
+
+
+def read_pairs(root: Path) -> list[Pair]:
+    """Every question in the order of its index.
+
+    Raises SuiteError for an answer that is no side (the release takes it for left), for one tile on both sides (it
+    has one body per name), and for indices that are not 0, 1, 2 … (it asks for them one by one).
+    """
+    path = root / PAIRS
+    records = read_json(path, SOURCE, REMEDY)
+    if not isinstance(records, list) or not records:
+        raise SuiteError(f"{SOURCE}: {path} holds {type(records).__name__}; expected a list of questions.")
+    read = (_pair(record, position, path) for position, record in enumerate(records))
+    pairs = sorted(read, key=attrgetter("index"))
+    gap = next((place for place, pair in enumerate(pairs) if pair.index != place), None)
+    if gap is not None:
+        raise SuiteError(
+            f"{SOURCE}: {path} has {len(pairs)} questions, and index {pairs[gap].index} where {gap} was "
+            "expected; the release asks for 0, 1, 2 … without a gap. Correct the file."
+        )
+    return pairs
+
+
+def _pair(record: Any, position: int, path: Path) -> Pair:
+    where = f"question {position} of {path}"
+    index = record.get("index", position) if isinstance(record, dict) else position
+    if not isinstance(index, int) or isinstance(index, bool):
+        raise SuiteError(f"{SOURCE}: {where}: index is {index!r}; expected a whole number.")
+    left, right, question, answer = (
+        field_of(record, name, str, SOURCE, where) for name in ("left", "right", "question", "answer")
+    )
+    side = answer.strip().lower()
+    if side not in _SIDES:
+        raise SuiteError(
+            f"{SOURCE}: {where}: answer is {answer!r}; expected Left or Right. The release would take it for left."
+        )
+    if left == right:
+        raise SuiteError(
+            f"{SOURCE}: {where}: the tile {left!r} lies on both sides; the release has one body per name."
+        )
+    if not question.strip() or len(question.splitlines()) != 1:
+        raise SuiteError(f"{SOURCE}: {where}: question is {question!r}; expected one line of words.")
+    labels = tuple(str(record.get(f"{side}_label") or "").strip() for side in _SIDES)
+    concepts = (labels[0], labels[1]) if all(labels) and labels[0] != labels[1] else (left, right)
+    return Pair(index, left, right, question, _SIDES[side], concepts)
+
+
+def object_of(question: str) -> tuple[str, str]:
+    """What a question asks for, and its article: the words behind "on"; all words where there is no "on"."""
+    _, found, behind = question.partition(" on ")
+    phrase = (behind if found else question).strip().rstrip(".").strip()
+    article, space, noun = phrase.partition(" ")
+    return (noun.strip(), "the") if space and article.lower() == "the" else (phrase, "none")
+
 
 VERSION = "1.0.0"
 TILES = "model_db.json"
@@ -95,7 +160,7 @@ class _Assets:
 
     def __init__(self, root: Path, options: Act2AnswerOptions) -> None:
         self._root, self._options = root, options
-        self._tiles: dict[str, tuple[Tile, StoredPicture]] = {}
+        self._tiles: dict[str, tuple[Tile, Picture]] = {}
         self.files: dict[str, bytes] = {}
         self.notes: list[str] = []
 
@@ -127,22 +192,18 @@ class _Assets:
         }
         phrase, article = object_of(pair.question)
         return make_item(
-            SOURCE,
+            f"{SOURCE}-{category}-{sha256_json(content)[:10]}",
             category,
             pair.answer,
             (left, right),
-            content,
-            transfer_type=TRANSFER_TYPES[category],
             construction="native_pair",
             instruction=pair.question,
             object_phrase=phrase,
             object_article=article,
-            polarity="none",
             target_concept=pair.concepts[right_side],
             distractor_concept=pair.concepts[1 - right_side],
             pair_id=f"{SOURCE}-{category}-{sha256_json(sorted([left.pixels_sha256, right.pixels_sha256]))[:12]}",
             rule_id=VERBATIM,
-            curation_status="rules-only",
             license=self._options.license,
             attribution=f"tiles of the set {self._root.resolve().name}; no licence is stated with them",
             redistributable=False,
@@ -160,11 +221,10 @@ class _Assets:
                 "right_original_pixels_sha256": right.original_pixels,
                 "picture_operation": left.operation,
             },
-            gen={},
             side_word=bool(side_words(pair.question)),
         )
 
-    def _stored(self, name: str, pair: Pair) -> StoredPicture:
+    def _stored(self, name: str, pair: Pair) -> Picture:
         if name not in self._tiles:
             if name not in self._records:
                 raise SuiteError(
@@ -175,9 +235,9 @@ class _Assets:
             operation = (
                 "texture of the face that looks up, turned as it lies before the viewer, flattened on white"
             )
-            stored = stored_picture("", tile.picture, operation)
+            stored = squared_picture("", tile.picture, operation)
             # Tile names repeat from set to set; what ties questions together is the picture.
-            stored = stored_picture(f"{SOURCE}/{stored.original_pixels[:16]}", tile.picture, operation)
+            stored = replace(stored, image_id=f"{SOURCE}/{stored.original_pixels[:16]}")
             self._tiles[name] = tile, stored
             self.files[stored.file_name] = stored.png
         return self._tiles[name][1]

@@ -10,11 +10,10 @@ from itertools import combinations
 
 import numpy as np
 
-from probe_kit.suite.generators.drawing.canvas import Placement
-from probe_kit.suite.generators.drawing.figure import Figure, colored_outline, random_figure
-from probe_kit.suite.generators.drawing.outlines import OUTLINES
-from probe_kit.suite.generators.drawing.palette import COLORS, INK_CONTRAST, RGB, jittered, lightness
+from probe_kit.suite.generators.canvas import Placement
 from probe_kit.suite.generators.generator import Concept, Generator
+from probe_kit.suite.generators.outlines import OUTLINES, Figure, colored_outline, random_figure
+from probe_kit.suite.generators.palette import COLORS, INK_CONTRAST, RGB, jittered, lightness
 
 _SHRUNK = (0.5, 0.75)
 """Of the size of a drawing; half a tile is legible for a plain outline."""

@@ -1,16 +1,93 @@
 """Living World: "picture of the fox" against another animal or plant, "living thing" against a thing."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from PIL import Image
 
-from probe_kit.suite.generators.drawing.art import color_icon, mean_color
-from probe_kit.suite.generators.drawing.canvas import Canvas, Placement, random_placement
-from probe_kit.suite.generators.drawing.creatures import CREATURES, LOOK_ALIKES, THINGS, Creature
-from probe_kit.suite.generators.drawing.palette import RGB, background_for
-from probe_kit.suite.generators.generator import Concept, Generator
-from probe_kit.suite.generators.pairing import half_within, none_alike, spread_pairs
+from probe_kit.suite.generators.art import color_icon, mean_color
+from probe_kit.suite.generators.canvas import Canvas, Placement, Tile, random_placement
+from probe_kit.suite.generators.generator import Concept, Generator, half_within, none_alike, spread_pairs
+from probe_kit.suite.generators.palette import background_for
+
+
+@dataclass(frozen=True)
+class Creature:
+    """An animal or plant; `view` is how much of it the icon shows."""
+
+    name: str
+    icon: str
+    family: str
+    view: Literal["whole", "face"]
+
+
+def _family(family: str, names: str, view: Literal["whole", "face"] = "whole") -> list[Creature]:
+    """Creatures of one family from words like `fox` or, where the icon has another name, `bee=honeybee`."""
+    creatures = []
+    for word in names.split():
+        name, _, icon = word.partition("=")
+        creatures.append(Creature(name.replace("-", " "), icon or name, family, view))
+    return creatures
+
+
+CREATURES: tuple[Creature, ...] = (
+    *_family(
+        "mammal",
+        "cat dog monkey gorilla tiger leopard horse deer bison cow pig sheep=ewe goat camel llama giraffe "
+        "elephant rhinoceros hippopotamus mouse rabbit squirrel=chipmunk beaver hedgehog bat sloth otter "
+        "skunk kangaroo badger donkey",
+    ),
+    *_family("mammal", "raccoon boar fox lion bear panda koala wolf hamster moose", "face"),
+    *_family("bird", "turkey penguin eagle duck owl flamingo peacock parrot chick=baby-chick goose"),
+    *_family(
+        "sea animal",
+        "whale dolphin seal tropical-fish blowfish shark octopus jellyfish crab lobster shrimp squid oyster",
+    ),
+    *_family("reptile", "crocodile turtle lizard snake"),
+    *_family(
+        "small animal",
+        "snail butterfly caterpillar=bug ant bee=honeybee beetle ladybug=lady-beetle grasshopper=cricket spider "
+        "scorpion mosquito fly worm",
+    ),
+    *_family("flower", "rose tulip sunflower hibiscus cherry-blossom daisy=blossom hyacinth lotus"),
+    *_family(
+        "plant",
+        "seedling potted-plant pine-tree=evergreen-tree leafy-tree=deciduous-tree palm-tree cactus "
+        "rice=sheaf-of-rice herb clover=shamrock mushroom",
+    ),
+)
+
+# Too much alike on a small tile, or one name covers both.
+LOOK_ALIKES: tuple[set[str], ...] = (
+    {"cat", "dog"},
+    {"monkey", "gorilla"},
+    {"tiger", "leopard"},
+    {"sheep", "goat", "llama"},
+    {"horse", "donkey"},
+    {"rhinoceros", "hippopotamus"},
+    {"beaver", "hedgehog", "otter"},
+    {"skunk", "badger"},
+    {"bear", "panda", "koala", "hamster"},
+    {"raccoon", "wolf"},
+    {"duck", "goose"},
+    {"whale", "dolphin", "seal"},
+    {"tropical fish", "blowfish"},
+    {"octopus", "jellyfish", "squid"},
+    {"crab", "lobster", "shrimp", "scorpion"},
+    {"ant", "spider", "beetle"},
+    {"bee", "fly", "mosquito"},
+    {"caterpillar", "worm", "snake", "grasshopper"},
+    {"hibiscus", "cherry blossom"},
+    {"pine tree", "leafy tree"},
+    {"seedling", "potted plant", "herb"},
+)
+
+THINGS: tuple[str, ...] = (
+    *("chair", "bed", "bicycle", "automobile", "bus", "rocket", "hammer", "scissors", "key", "umbrella"),
+    *("teapot", "bell", "guitar", "trumpet", "telephone", "laptop", "camera", "backpack", "toilet", "broom"),
+    *("bucket", "anchor", "tractor", "house", "crown", "drum", "spoon"),
+)
+
 
 _ICON_HEIGHT = 1.6  # turned by 8 degrees and moved by 5 %, its corners stay on the tile
 _TURN = 8
@@ -25,24 +102,20 @@ class Depicted(Concept):
 
 
 @dataclass(frozen=True)
-class Portrait:
+class Portrait(Tile):
     """Everything the picture is drawn from: one icon; `ink` is its average colour."""
 
     icon: str
-    ink: RGB
-    background: RGB
     placement: Placement
 
-    def draw(self) -> Image.Image:
-        """The tile, RGB."""
-        canvas = Canvas(self.background)
+    def _paint(self, canvas: Canvas) -> None:
         canvas.pen(self.placement).stamp(color_icon(self.icon), 0, 0, _ICON_HEIGHT)
-        return canvas.picture()
 
 
 def _portrait(concept: Depicted, rng: np.random.Generator) -> Portrait:
     ink = mean_color(concept.icon)
-    return Portrait(concept.icon, ink, background_for(ink, rng), random_placement(rng, (0.9, 1.0), turn=_TURN))
+    background = background_for(ink, rng)
+    return Portrait(concept.icon, random_placement(rng, (0.9, 1.0), turn=_TURN), ink=ink, background=background)
 
 
 def _tiles(left: Depicted, right: Depicted, rng: np.random.Generator) -> tuple[Portrait, Portrait]:

@@ -4,22 +4,91 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from PIL import Image
 
-from probe_kit.suite.generators.drawing.art import mask_icon
-from probe_kit.suite.generators.drawing.canvas import (
+from probe_kit.suite.generators.art import mask_icon
+from probe_kit.suite.generators.canvas import (
     Canvas,
     Pen,
     Placement,
     Points,
+    Tile,
     ellipse,
     random_placement,
     tinted,
 )
-from probe_kit.suite.generators.drawing.palette import RGB, background_for, jittered
-from probe_kit.suite.generators.drawing.pictograms import LOOK_ALIKES, PICTOGRAMS
-from probe_kit.suite.generators.generator import Concept, Generator
-from probe_kit.suite.generators.pairing import none_alike, spread_pairs
+from probe_kit.suite.generators.generator import Concept, Generator, none_alike, spread_pairs
+from probe_kit.suite.generators.palette import background_for, jittered
+
+
+@dataclass(frozen=True)
+class Pictogram:
+    """A public sign; a forbidden one is drawn under a red ring and bar.
+
+    shows: what is drawn, where the name says what it stands for instead.
+    """
+
+    name: str
+    icon: str
+    forbidden: bool = False
+    shows: str = ""
+
+
+PICTOGRAMS: tuple[Pictogram, ...] = (
+    Pictogram("escalator", "escalator"),
+    Pictogram("elevator", "elevator"),
+    Pictogram("stairs", "stairs"),
+    Pictogram("restroom", "wc", shows="man and woman"),
+    Pictogram("wi-fi", "wifi"),
+    Pictogram("restaurant", "restaurant", shows="fork and knife"),
+    Pictogram("cafe", "local-cafe", shows="cup"),
+    Pictogram("wheelchair", "accessible"),
+    Pictogram("baby changing", "baby-changing-station"),
+    Pictogram("medical kit", "medical-services"),
+    Pictogram("pharmacy", "local-pharmacy", shows="mortar"),
+    Pictogram("information", "info", shows="letter i"),
+    Pictogram("baggage", "luggage", shows="suitcase"),
+    Pictogram("post office", "mail", shows="envelope"),
+    Pictogram("hairdresser", "content-cut", shows="scissors"),
+    Pictogram("shower", "shower"),
+    Pictogram("cash machine", "local-atm", shows="banknote"),
+    Pictogram("taxi", "local-taxi", shows="car"),
+    Pictogram("train station", "train", shows="train"),
+    Pictogram("airport", "flight", shows="airplane"),
+    Pictogram("hotel", "hotel", shows="bed"),
+    Pictogram("gas station", "local-gas-station", shows="fuel pump"),
+    Pictogram("laundry", "local-laundry-service", shows="washing machine"),
+    Pictogram("telephone", "phone", shows="handset"),
+    Pictogram("library", "local-library", shows="open book"),
+    Pictogram("fire extinguisher", "fire-extinguisher"),
+    Pictogram("swimming pool", "pool", shows="swimmer"),
+    Pictogram("gym", "fitness-center", shows="dumbbell"),
+    Pictogram("trash bin", "delete"),
+    Pictogram("recycling", "recycling", shows="three arrows"),
+    Pictogram("museum", "museum", shows="building"),
+    Pictogram("theater", "theater-comedy", shows="two masks"),
+    Pictogram("drinking water", "local-drink", shows="glass"),
+    Pictogram("ice cream", "icecream"),
+    Pictogram("supermarket", "shopping-cart", shows="shopping cart"),
+    Pictogram("ferry", "directions-boat", shows="boat"),
+    Pictogram("cloakroom", "checkroom", shows="clothes hanger"),
+    Pictogram("no smoking", "smoking-rooms", forbidden=True, shows="crossed-out cigarette"),
+    Pictogram("no photography", "photo-camera", forbidden=True, shows="crossed-out camera"),
+    Pictogram("no pets", "pets", forbidden=True, shows="crossed-out paw"),
+    Pictogram("no phones", "smartphone", forbidden=True, shows="crossed-out phone"),
+    Pictogram("no food", "lunch-dining", forbidden=True, shows="crossed-out burger"),
+    Pictogram("no drinks", "local-bar", forbidden=True, shows="crossed-out cocktail glass"),
+    Pictogram("no touching", "back-hand", forbidden=True, shows="crossed-out hand"),
+    Pictogram("no strollers", "stroller", forbidden=True, shows="crossed-out stroller"),
+)
+
+LOOK_ALIKES: tuple[set[str], ...] = (
+    {"escalator", "stairs"},
+    {"cafe", "drinking water"},
+    {"taxi", "train station"},
+    {"medical kit", "pharmacy"},
+    {"trash bin", "drinking water"},
+)
+
 
 # dark: white on a coloured field; light: coloured on a white field; plain: no field; ring: forbidden
 Style = Literal["dark", "light", "plain", "ring"]
@@ -36,18 +105,14 @@ _SHOWS = {pictogram.icon: pictogram.shows for pictogram in PICTOGRAMS}
 
 
 @dataclass(frozen=True)
-class Board:
+class Board(Tile):
     """Everything the picture is drawn from: a pictogram and the field it lies on."""
 
     icon: str
     style: Style
-    ink: RGB
-    background: RGB
     placement: Placement
 
-    def draw(self) -> Image.Image:
-        """The tile, RGB."""
-        canvas = Canvas(self.background)
+    def _paint(self, canvas: Canvas) -> None:
         pen = canvas.pen(self.placement)
         mask = mask_icon(self.icon)
         if self.style == "ring":
@@ -62,7 +127,6 @@ class Board:
             pen.fill(_rounded_square(0.8), self.ink)
             pen.fill(_rounded_square(0.74), field)
             pen.stamp(tinted(mask, glyph), 0, 0, 1.3)
-        return canvas.picture()
 
 
 def _bar(pen: Pen) -> None:
@@ -82,7 +146,9 @@ def _board(concept: Concept, style: Style, rng: np.random.Generator) -> Board:
     ink = jittered(_INKS[name], rng)
     placement = random_placement(rng, (0.9, 1.0), turn=6, mirrored=False)
     background = background_for(ink, rng, _CONTRAST)
-    return Board(pictogram.icon, "ring" if pictogram.forbidden else style, ink, background, placement)
+    return Board(
+        pictogram.icon, "ring" if pictogram.forbidden else style, placement, ink=ink, background=background
+    )
 
 
 def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Board, Board]:

@@ -4,11 +4,9 @@ from itertools import combinations
 
 import numpy as np
 
-from probe_kit.suite.generators.backgrounds import on_hues
-from probe_kit.suite.generators.drawing.figure import Figure, colored_outline, random_figure
-from probe_kit.suite.generators.drawing.outlines import OUTLINES
-from probe_kit.suite.generators.drawing.palette import COLORS
 from probe_kit.suite.generators.generator import Concept, Generator
+from probe_kit.suite.generators.outlines import OUTLINES, Figure, colored_outline, random_figure
+from probe_kit.suite.generators.palette import COLORS, on_hues
 
 _HOLLOW_SHARE = 0.3
 _CONFUSABLE = (

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from PIL import Image, ImageChops, ImageDraw, ImageStat
 
-from probe_kit.suite.generators.drawing.canvas import Canvas, Placement, Points, random_placement
-from probe_kit.suite.generators.drawing.palette import COLORS, RGB, background_for, jittered
+from probe_kit.suite.generators.canvas import Canvas, Placement, Points, Tile, random_placement
 from probe_kit.suite.generators.generator import Concept, Generator
+from probe_kit.suite.generators.palette import COLORS, RGB, background_for, jittered
 
 _MOST_OVERLAP = 0.78  # of an asymmetric shape with its best mirror image, or with itself upside down
 _EDGE: RGB = (38, 38, 38)
@@ -23,27 +23,22 @@ _MASK_PIXELS = 128
 
 
 @dataclass(frozen=True)
-class Outline:
+class Outline(Tile):
     """Everything the picture is drawn from; the widths run along the axis, one list for each of its sides."""
 
     color: str
     one_side: tuple[float, ...]
     other_side: tuple[float, ...]
     lying: bool
-    ink: RGB
-    background: RGB
     placement: Placement
 
-    def draw(self) -> Image.Image:
-        """The tile, RGB."""
-        canvas = Canvas(self.background)
+    def _paint(self, canvas: Canvas) -> None:
         pen = canvas.pen(self.placement)
         corners = _corners(self.one_side, self.other_side)
         if self.lying:
             corners = corners[:, ::-1]
         pen.fill(corners, self.ink)
         pen.outline(corners, _EDGE, _EDGE_WIDTH)
-        return canvas.picture()
 
 
 def _corners(one_side: tuple[float, ...], other_side: tuple[float, ...]) -> Points:
@@ -94,7 +89,8 @@ def _outline(concept: Concept, rng: np.random.Generator) -> Outline:
     ink = jittered(COLORS[color], rng)
     one, other = _sides(concept.name == "symmetric", rng)
     placement = random_placement(rng, (0.88, 1.0), turn=7)
-    return Outline(color, one, other, bool(rng.integers(2)), ink, background_for(ink, rng), placement)
+    lying = bool(rng.integers(2))
+    return Outline(color, one, other, lying, placement, ink=ink, background=background_for(ink, rng))
 
 
 def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Outline, Outline]:

@@ -5,20 +5,20 @@ from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from PIL import Image
 
-from probe_kit.suite.generators.drawing.canvas import (
+from probe_kit.suite.generators.canvas import (
     FULL_DISK,
     Canvas,
     Pen,
     Placement,
     Points,
+    Tile,
     ellipse,
     polygon,
     random_placement,
 )
-from probe_kit.suite.generators.drawing.palette import COLORS, RGB, background_for
 from probe_kit.suite.generators.generator import Concept, Generator
+from probe_kit.suite.generators.palette import COLORS, RGB, background_for
 
 # all: twelve numerals; quarters: 12, 3, 6 and 9; mark: ticks and a wedge at twelve, which a turned clock needs
 Numerals = Literal["all", "quarters", "mark"]
@@ -50,20 +50,16 @@ class Reading(Concept):
 
 
 @dataclass(frozen=True)
-class Clock:
+class Clock(Tile):
     """Everything the picture is drawn from; `ink` is the colour of the rim."""
 
     hour: int
     minute: int
     numerals: Numerals
     face: RGB
-    ink: RGB
-    background: RGB
     placement: Placement
 
-    def draw(self) -> Image.Image:
-        """The tile, RGB."""
-        canvas = Canvas(self.background)
+    def _paint(self, canvas: Canvas) -> None:
         pen = canvas.pen(self.placement)
         pen.fill(ellipse(0, 0, 0.95, 0.95), self.ink)
         pen.fill(ellipse(0, 0, 0.85, 0.85), self.face)
@@ -72,7 +68,6 @@ class Clock:
         pen.line(_hand(reading.hour_angle, 0.42), _HANDS, 0.13)
         pen.line(_hand(reading.minute_angle, 0.76), _HANDS, 0.07)
         pen.fill(ellipse(0, 0, 0.1, 0.1), _HANDS)
-        return canvas.picture()
 
 
 def _direction(angle: float) -> Points:

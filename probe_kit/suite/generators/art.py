@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from probe_kit.suite.generators.drawing.palette import RGB
+from probe_kit.suite.generators.palette import RGB
 from probe_kit.suite.pictures import stored_picture
 
-FOLDER = Path(__file__).parents[2] / "art"
+FOLDER = Path(__file__).parents[1] / "art"
 CELL_PIXELS = 128
 COLUMNS = 12
 

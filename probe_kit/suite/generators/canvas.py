@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, ImageDraw, ImageFont
 
-from probe_kit.suite.generators.drawing.palette import RGB
+from probe_kit.suite.generators.palette import RGB
 
 TILE_PIXELS = 256
 _SUPERSAMPLING = 3
@@ -111,6 +111,26 @@ class Canvas:
     def picture(self) -> Image.Image:
         """The finished tile, RGB, 256 by 256 pixels."""
         return self._image.resize((TILE_PIXELS, TILE_PIXELS), Image.Resampling.LANCZOS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tile:
+    """Everything one picture is drawn from: plain values, and so a record of it.
+
+    ink: a colour from which the background stands apart.
+    """
+
+    ink: RGB
+    background: RGB
+
+    def draw(self) -> Image.Image:
+        """The picture, RGB; equal tiles give equal pixels."""
+        canvas = Canvas(self.background)
+        self._paint(canvas)
+        return canvas.picture()
+
+    def _paint(self, canvas: Canvas) -> None:
+        raise NotImplementedError
 
 
 class Pen:

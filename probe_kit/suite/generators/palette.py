@@ -1,6 +1,13 @@
-"""The eleven basic colour terms, and backgrounds that let a colour stand out."""
+"""The eleven basic colour terms, and backgrounds that let a colour stand out.
+
+Concepts recur in other pictures, so a probe can learn by itself which pixels answer which word (see the control
+`random-features`). What recurs should be the concept and little else: the background has any hue, and where size
+means nothing, drawings have other sizes anywhere on their tile.
+"""
 
 import colorsys
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -60,3 +67,28 @@ def background_for(ink: RGB, rng: np.random.Generator, contrast: float = INK_CON
         red, green, blue = (int(channel) for channel in np.clip(np.rint(tinted), 0, 255))
         if abs(lightness((red, green, blue)) - lightness(ink)) >= contrast:
             return red, green, blue
+
+
+_LEAST_LIGHTNESS = 110
+"""Of a background: dark edges must stand out from it."""
+
+
+def hued_background(ink: RGB, rng: np.random.Generator, contrast: float = INK_CONTRAST) -> RGB:
+    """A background of any hue, from pale to vivid, at least `contrast` levels lighter or darker than `ink`."""
+    while True:
+        shade = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(0, 0.9), rng.uniform(0.5, 1))
+        red, green, blue = (round(255 * channel) for channel in shade)
+        found = red, green, blue
+        if lightness(found) >= _LEAST_LIGHTNESS and abs(lightness(found) - lightness(ink)) >= contrast:
+            return found
+
+
+def on_hues[T: Any](one: T, other: T, rng: np.random.Generator) -> tuple[T, T]:
+    """The two tiles on backgrounds of any hue, from which each tile's `ink` stands out.
+
+    Drawn after both tiles, whose pale backgrounds stay in the stream of `rng`: suite 2.0.0 is drawn in this order.
+    """
+    return (
+        replace(one, background=hued_background(one.ink, rng)),
+        replace(other, background=hued_background(other.ink, rng)),
+    )

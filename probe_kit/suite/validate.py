@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.suite.categories import category_of
-from probe_kit.suite.checks.leakage import Baseline, run_baselines, save_baselines
+from probe_kit.suite.leakage import Baseline, run_baselines, save_baselines
 from probe_kit.suite.manifest import read_suite
 from probe_kit.suite.suite import missing_categories
-from probe_kit.suite.validation.findings import Finding, listing, warning
+from probe_kit.suite.validation.records import Finding, listing, warning
 from probe_kit.suite.validation.rules import DECODING_RULES
 from probe_kit.suite.validation.warnings import WARNING_RULES
 

@@ -10,7 +10,7 @@ import pytest
 
 from probe_kit.statistics.folds import assign_folds
 from probe_kit.suite import Item, Suite, build_suite, load_suite, validate_suite
-from probe_kit.suite.checks.leakage import Baseline, limit_for, run_baselines
+from probe_kit.suite.leakage import Baseline, limit_for, run_baselines
 
 
 def part(suite: Suite, keep: Callable[[Item], bool]) -> Suite:
@@ -52,7 +52,7 @@ def test_text_gives_the_answer_away_if_a_layout_is_tied_to_it(embedded: Suite) -
 
 
 def test_folds_never_separate_layouts_or_twins(embedded: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
-    from probe_kit.suite.checks import leakage as baselines
+    from probe_kit.suite import leakage as baselines
 
     made = []
 
@@ -94,7 +94,7 @@ def test_a_suite_with_errors_gets_no_baselines(copied: Path) -> None:
 
 def test_a_leak_is_a_warning_that_makes_the_report_not_ok(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     leak = Baseline("color", "pixels", 0.71, (0.6, 0.8), 0.58, 150, 75, "group_id")
-    monkeypatch.setattr("probe_kit.suite.checks.validate.run_baselines", lambda *_: (leak,))
+    monkeypatch.setattr("probe_kit.suite.validate.run_baselines", lambda *_: (leak,))
     report = validate_suite(copied, baselines=True)
     assert not report.ok
     assert "W05 Color: pixels 0.71 [0.60, 0.80] (limit 0.58)" in report.to_text()

@@ -1,8 +1,15 @@
-"""Fifteen outlines as polygons of equal area, so that the area of ink does not identify the outline."""
+"""Fifteen outlines as polygons of equal area, and the tile that shows one: the picture of Color and Shape items.
+
+Equal areas, so that the area of ink does not identify the outline.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from probe_kit.suite.generators.drawing.canvas import Points, ellipse, polygon
+from probe_kit.suite.generators.canvas import Canvas, Placement, Points, Tile, ellipse, polygon, random_placement
+from probe_kit.suite.generators.palette import COLORS, background_for, jittered
 
 _AREA = 0.95**2  # in drawing units; the most that keeps every placement of every outline on its tile
 
@@ -62,3 +69,44 @@ _DRAWN: dict[str, Points] = {
     "arrow": polygon((-1.1, -0.36), (0.1, -0.36), (0.1, -0.9), (1.1, 0), (0.1, 0.9), (0.1, 0.36), (-1.1, 0.36)),
 }
 OUTLINES: dict[str, Points] = {name: _matched(points) for name, points in _DRAWN.items()}
+
+
+# edged: filled, with a thin dark edge; plain: filled; hollow: a thick line only
+Style = Literal["edged", "plain", "hollow"]
+
+_EDGE = (38, 38, 38)
+_EDGE_WIDTH = 0.025
+_HOLLOW_WIDTH = 0.15
+
+
+@dataclass(frozen=True)
+class Figure(Tile):
+    """Everything the picture is drawn from."""
+
+    color: str
+    outline: str
+    style: Style
+    placement: Placement
+
+    def _paint(self, canvas: Canvas) -> None:
+        pen = canvas.pen(self.placement)
+        corners = OUTLINES[self.outline]
+        if self.style == "hollow":
+            inner = corners * (1 - _HOLLOW_WIDTH / 2)  # half of the line lies outside of its corners
+            pen.outline(inner, self.ink, _HOLLOW_WIDTH)
+        else:
+            pen.fill(corners, self.ink)
+        if self.style == "edged":
+            pen.outline(corners, _EDGE, _EDGE_WIDTH)
+
+
+def colored_outline(figure: Figure) -> str:
+    """The figure in words, such as "red circle"."""
+    return f"{figure.color} {figure.outline}"
+
+
+def random_figure(color: str, outline: str, style: Style, rng: np.random.Generator) -> Figure:
+    """A figure of this colour and outline with everything else drawn from `rng`."""
+    ink = jittered(COLORS[color], rng)
+    background = background_for(ink, rng)
+    return Figure(color, outline, style, random_placement(rng), ink=ink, background=background)

@@ -1,4 +1,4 @@
-"""CSV output in which a spreadsheet program evaluates no cell as a formula."""
+"""CSV and Markdown in which a spreadsheet computes no cell, and a cell ends no row."""
 
 import csv
 import io
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import pandas as pd
+
 
 _FORMULA = re.compile(r"'*(?:[\t\r\n]|\s*[=+\-@＝＋－＠])")
 """How a cell begins that spreadsheets compute or cut, or one that `escaped` made."""
@@ -59,3 +60,33 @@ class _Lines(io.StringIO):
 
     def write(self, line: str) -> int:
         return super().write(line.removesuffix(self.END) + "\n")
+
+
+_MARKUP = re.compile(
+    r"""
+    [\\*|$]                        # escapes, emphasis, cells, mathematics
+    | (?<![^\W_])_ | _(?![^\W_])   # emphasis; not inside a word, where it means nothing
+    | ~(?=~) | (?<=~)~             # struck out
+    | <(?=[A-Za-z/!?])             # HTML and links in angle brackets
+    | &(?=\#?\w+;)                 # entities
+    | \](?=[(\[:])                 # links, pictures and their definitions
+    | ^\s*(?:\#|>|[-+](?=[-\s]|$)|=+\s*$|```|~~~)   # headings, quotations, lists, rules, code
+    | ^\s*\d{1,9}[.)](?=\s|$)      # numbered lists
+    | (?<=:)/(?=/)                 # addresses, which become links by themselves
+    | (?<=www)\.
+    | (?<=\w)@(?=[\w.-]*\.[a-z])
+    """,
+    re.VERBOSE | re.IGNORECASE,
+)
+
+
+def markdown_safe(text: str) -> str:
+    """Return one line of Markdown that shows `text`; line ends become spaces."""
+    return _MARKUP.sub(_escaped, re.sub(r"\s*[\r\n\u2028\u2029]+\s*", " ", text))
+
+
+def _escaped(found: re.Match[str]) -> str:
+    sign = found[0].lstrip()
+    if sign[0].isdigit():
+        return f"{found[0][:-1]}\\{sign[-1]}"
+    return found[0][: len(found[0]) - len(sign)] + f"\\{sign}"

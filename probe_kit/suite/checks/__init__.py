@@ -1,1 +1,0 @@
-"""Checks of a whole suite: rules and leakage."""

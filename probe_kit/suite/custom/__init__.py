@@ -1,1 +1,0 @@
-"""Suites from a user's own questions and pictures."""

@@ -1,0 +1,350 @@
+"""Suites of a user's own questions: from a table with a row per question, or from pairs of pictures.
+
+instruction,correct,wrong,group,category
+Put the cube on the ripe fruit,banana-3.jpg,banana-1.jpg,banana,ripeness
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import count
+from pathlib import Path
+
+from probe_kit._system.table_cells import group_names, problem_of
+from probe_kit._system.text_tables import TextTable, open_table
+from probe_kit.errors import SuiteError, UsageError
+from probe_kit.hashing import sha256_json
+from probe_kit.suite.categories import check_slug
+from probe_kit.suite.grouping import with_groups
+from probe_kit.suite.items import Item, Side
+from probe_kit.suite.making import Picture, make_item, squared_picture
+from probe_kit.suite.manifest import check_foreign_folder, save_suite
+from probe_kit.suite.pictures import RESTORE, load_picture
+from probe_kit.suite.suite import Suite, new_suite
+from probe_kit.suite.validation.records import listing
+from probe_kit.suite.validation.rules import LOADING_RULES, pictures_unchanged
+from probe_kit.suite.wording import instruction_for, side_words
+
+COLUMNS = ("instruction", "correct", "wrong")
+FURTHER = ("group", "category", "object", "other_object")
+DEFAULT_CATEGORY = "questions"
+_SIDES: tuple[Side, Side] = ("left", "right")
+
+
+@dataclass(frozen=True)
+class Terms:
+    """The terms of use of the pictures; the names are those of an item's fields."""
+
+    license: str
+    attribution: str
+    redistributable: bool = False
+    contains_real_face: bool = False
+
+
+@dataclass(frozen=True)
+class PicturePair:
+    """Two pictures that lie side by side, and what each of them is called.
+
+    category: one of the paper's or any name of your own, such as `ripe-fruit`; the row of a table in which the
+    questions are counted.
+    phrase, other_phrase: complete "Put the cube on the …", such as `fox` or `open door`.
+    picture, other_picture: files that Pillow reads; they are padded to a white square of 224 to 512 pixels.
+    """
+
+    category: str
+    phrase: str
+    picture: Path
+    other_phrase: str
+    other_picture: Path
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    line: its number in the file, from 1. instruction: the imperative. correct, wrong: files, beside the table.
+    group: rows of one group are never in training and test at once; empty where pictures alone decide. object:
+    what the correct picture is called, part of the instruction. other_object: what the wrong one is called; empty
+    for its file's name.
+    """
+
+    line: int
+    instruction: str
+    correct: Path
+    wrong: Path
+    group: str
+    category: str
+    object: str
+    other_object: str
+
+
+class _Questions:
+    """The questions of one suite, and their pictures by file name."""
+
+    def __init__(self, folder: Path, name: str, version: str, rule: str, terms: Terms) -> None:
+        check_foreign_folder(folder)
+        self._folder, self._name, self._version, self._rule, self._terms = folder, name, version, rule, terms
+        self._pictures: dict[str, bytes] = {}
+        self.items: list[Item] = []
+
+    def picture(self, path: Path) -> Picture:
+        """The picture in a file as it is stored. Raises SuiteError if it is missing or Pillow cannot decode it."""
+        stored = squared_picture("", load_picture(path))
+        self._pictures[stored.file_name] = stored.png
+        return replace(stored, image_id=f"{path.name}-{stored.pixels_sha256[:16]}")
+
+    def pair_id(self, category: str, content: Sequence[object]) -> str:
+        """The id of the twins with this content."""
+        return f"{self._name}-{category}-{sha256_json(content)[:12]}"
+
+    def ask(
+        self, item_id: str, pair_id: str, category: str, instruction: str, article: str, side: Side,
+        correct: tuple[Picture, str], wrong: tuple[Picture, str],
+    ) -> None:  # fmt: skip
+        """Add a question. article: as in `instruction_for`. correct, wrong: picture, and what it is called."""
+        source = {
+            "benchmark": self._name, "version": self._version, "split": "eval", "source_id": pair_id, "url": "",
+        }  # fmt: skip
+        item = make_item(
+            item_id,
+            category,
+            side,
+            (correct[0], wrong[0]) if side == "left" else (wrong[0], correct[0]),
+            construction="native_pair",
+            instruction=instruction,
+            object_phrase=correct[1],
+            object_article=article,
+            target_concept=correct[1],
+            distractor_concept=wrong[1],
+            pair_id=pair_id,
+            rule_id=self._rule,
+            curation_status="accepted",
+            side_word=bool(side_words(correct[1])),
+            source=source,
+            **asdict(self._terms),
+        )
+        self.items.append(item)
+
+    def save(
+        self, options: Mapping[str, int], groups: Mapping[str, str] | None = None,
+        places: Mapping[str, str] | None = None,
+    ) -> Suite:  # fmt: skip
+        """Write the suite. groups, places: by item id, the group that a user gave and where he wrote the question.
+
+        Raises SuiteError for a broken rule of the format, before anything is written.
+        """
+        suite = new_suite(self._name, self._version, with_groups(self.items, groups), options)
+        findings = [
+            replace(finding, where=(places or {}).get(finding.where.removeprefix("item "), finding.where))
+            for rule in LOADING_RULES
+            if rule is not pictures_unchanged  # no file is written yet
+            for finding in rule(suite)
+        ]
+        if findings:
+            raise SuiteError(
+                f"these questions break the rules of the format:\n{listing(findings)}\n"
+                "Change the phrases or the pictures. Nothing was written"
+            )
+        stats = {category: {"pool": n, "emitted": n} for category, n in suite.card["counts"].items()}
+        return save_suite(suite, self._pictures, stats, self._folder)
+
+
+def suite_from_pictures(
+    folder: Path | str,
+    pairs: Sequence[PicturePair],
+    *,
+    name: str,
+    version: str = "1.0.0",
+    license: str,  # noqa: A002 -- as the field of an item is called
+    attribution: str,
+    redistributable: bool = False,
+    contains_real_face: bool = False,
+) -> Suite:
+    """A suite in `folder` in which every pair is asked for both ways: neither pictures nor words alone tell.
+
+    The first picture lies left and right in turn. license: an SPDX name, or whatever says what others may do with
+    the pictures. Pairs that share a file share a group, and folds never separate them.
+    Raises UsageError for no pair, a pair asked twice or an impossible category name, and SuiteError for a picture
+    that cannot be read, for questions that break a rule of the format, or if `folder` holds anything else. Nothing
+    is written then.
+
+    pair = PicturePair("living-world", "fox", Path("fox.jpg"), "hare", Path("hare.jpg"))
+    suite = suite_from_pictures("suites/mine", [pair], name="mine", license="CC-BY-4.0", attribution="me")
+    """
+    _check_pairs(pairs)
+    terms = Terms(license, attribution, redistributable, contains_real_face)
+    questions = _Questions(Path(folder), name, version, "own-pictures", terms)
+    for number, pair in enumerate(pairs):
+        both = [
+            (questions.picture(path), phrase)
+            for path, phrase in ((pair.picture, pair.phrase), (pair.other_picture, pair.other_phrase))
+        ]
+        left, right = both if number % 2 == 0 else both[::-1]
+        content = sorted((phrase, picture.pixels_sha256) for picture, phrase in both)
+        pair_id = questions.pair_id(pair.category, content)
+        for side, correct, wrong in zip(_SIDES, (left, right), (right, left), strict=True):
+            instruction = instruction_for(correct[1], "the")
+            questions.ask(f"{pair_id}-{side}", pair_id, pair.category, instruction, "the", side, correct, wrong)
+    return questions.save({"pairs": len(pairs)})
+
+
+def _check_pairs(pairs: Sequence[PicturePair]) -> None:
+    if not pairs:
+        raise UsageError("no pair of pictures given; expected at least one PicturePair")
+    for category in {pair.category for pair in pairs}:
+        check_slug(category)
+    met: set[frozenset[tuple[str, str]]] = set()
+    for pair in pairs:
+        content = frozenset({(pair.phrase, str(pair.picture)), (pair.other_phrase, str(pair.other_picture))})
+        if content in met:
+            raise UsageError(f"{pair} is given twice; every pair is asked both ways by itself. Leave one out")
+        met.add(content)
+
+
+def suite_from_csv(
+    table: Path | str,
+    folder: Path | str,
+    *,
+    name: str | None = None,
+    version: str = "1.0.0",
+    category: str = DEFAULT_CATEGORY,
+    terms: Terms,
+) -> Suite:
+    """The suite in `folder` that asks what the rows of `table` say; the answer lies left and right in turn.
+
+    Columns `instruction`, `correct` and `wrong` are needed; `group`, `category` (otherwise `category`), `object`
+    (otherwise what follows "on the" in the instruction) and `other_object` may be there. name: of the suite; None
+    for the table's. Two rows over the same two pictures that ask the other way round are twins.
+    Raises UsageError naming the line for a table that cannot be used, and SuiteError for a picture that cannot be
+    read, questions that break a rule, or a `folder` that holds anything else. Nothing is written then.
+    """
+    table = Path(table)
+    rows = read_rows(table, category)
+    questions = _Questions(Path(folder), name or table.stem, version, "own-table", terms)
+    drawn = [
+        (row, _picture(questions, table, row, "correct"), _picture(questions, table, row, "wrong")) for row in rows
+    ]
+    _ask_rows(questions, drawn)
+    ids = [item.item_id for item in questions.items]
+    groups = {item_id: row.group for item_id, row in zip(ids, rows, strict=True) if row.group}
+    lines = {item_id: f"{table}, line {row.line}" for item_id, row in zip(ids, rows, strict=True)}
+    return questions.save({"rows": len(rows)}, groups, lines)
+
+
+def _ask_rows(questions: _Questions, drawn: Sequence[tuple[Row, Picture, Picture]]) -> None:
+    pixels = [(row.category, correct.pixels_sha256, wrong.pixels_sha256) for row, correct, wrong in drawn]
+    together = Counter((category, frozenset(both)) for category, *both in pixels)
+    orders, turns = set(pixels), dict[str, Iterator[int]]()
+    for (row, correct, wrong), (category, right_pixels, wrong_pixels) in zip(drawn, pixels, strict=True):
+        twins = (
+            together[category, frozenset((right_pixels, wrong_pixels))] == 2
+            and (category, wrong_pixels, right_pixels) in orders
+        )
+        content = sorted((right_pixels, wrong_pixels)) + ([] if twins else [row.instruction])
+        pair_id = questions.pair_id(category, content)
+        side: Side = "right" if next(turns.setdefault(category, count())) % 2 else "left"
+        if twins:  # the pictures lie where they lay when they were asked the other way round
+            side = "left" if right_pixels < wrong_pixels else "right"
+        article = "the" if f"the {row.object}" in row.instruction else "none"
+        item_id = f"{pair_id}-{sha256_json([row.instruction, right_pixels])[:8]}"
+        questions.ask(
+            item_id, pair_id, category, row.instruction, article, side, (correct, row.object),
+            (wrong, row.other_object),
+        )  # fmt: skip
+
+
+def _picture(questions: _Questions, table: Path, row: Row, column: str) -> Picture:
+    """A row's picture. Raises SuiteError naming line, column and the folder that was searched."""
+    path = row.correct if column == "correct" else row.wrong
+    where = f"{table}, line {row.line}, column {column}"
+    if not path.is_file():
+        written = path.relative_to(table.parent) if path.is_relative_to(table.parent) else path
+        raise SuiteError(
+            f"{where}: there is no picture {written} in {path.parent.resolve()}. Paths are relative to the table"
+        )
+    try:
+        return questions.picture(path)
+    except SuiteError as error:
+        raise SuiteError(f"{where}: {str(error).replace(RESTORE, 'Give another file.')}") from error
+
+
+def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> list[Row]:
+    """The rows of the table, one per question. Raises UsageError, naming the line that cannot be used."""
+    opened = open_table(table, COLUMNS)
+    headings = [column for column in opened.names if column]
+    missing = [column for column in COLUMNS if column not in headings]
+    unknown = [column for column in headings if column not in (*COLUMNS, *FURTHER)]
+    if missing or unknown:
+        wrong = [f"lacks {', '.join(missing)}"] * bool(missing)
+        wrong += [f"has {', '.join(map(repr, unknown))}, which no table has"] * bool(unknown)
+        raise UsageError(
+            f"{table}, line {opened.line}, {' and '.join(wrong)}; expected {', '.join(COLUMNS)} and, where "
+            f"wanted, {', '.join(FURTHER)}"
+        )
+    rows = [_row(cells, line, opened, category) for line, cells in opened.rows()]
+    if not rows:
+        raise UsageError(f"{table} has no line below its heading; expected one per question")
+    _check_contradictions(rows, table)
+    return _with_group_names(rows, opened)
+
+
+def _check_contradictions(rows: Sequence[Row], table: Path) -> None:
+    """Raise UsageError for a question that is asked twice, or with another answer."""
+    lines: dict[tuple[str, Path, Path], int] = {}
+    for row in rows:
+        first = lines.setdefault((row.instruction, row.correct, row.wrong), row.line)
+        if first != row.line:
+            raise UsageError(f"{table}, lines {first} and {row.line} are the same question. Leave one out")
+        opposite = lines.get((row.instruction, row.wrong, row.correct))
+        if opposite is not None and row.correct != row.wrong:
+            raise UsageError(
+                f"{table}, lines {opposite} and {row.line} are the same question with opposite answers. Correct "
+                "one, or leave it out"
+            )
+
+
+def _with_group_names(rows: Sequence[Row], opened: TextTable) -> list[Row]:
+    """The rows with one spelling of every group, such as 7 for 7.0."""
+    grouped = [row for row in rows if row.group]
+    names = group_names(
+        [row.group for row in grouped], lambda number: opened.where(grouped[number].line, "group"), UsageError
+    )
+    by_line = {row.line: name for row, name in zip(grouped, names, strict=True)}
+    return [replace(row, group=by_line.get(row.line, "")) for row in rows]
+
+
+def _row(record: Mapping[str, str | None], line: int, opened: TextTable, category: str) -> Row:
+    where, table = opened.where(line), opened.path
+    cells = {column: cell or "" for column, cell in record.items()}
+    empty = [column for column in COLUMNS if not cells[column]]
+    if empty:
+        columns = f"{'column' if len(empty) == 1 else 'columns'} {' and '.join(empty)}"
+        raise UsageError(f"{where}, {columns}: it is empty; every question needs {', '.join(COLUMNS)}")
+    for column, cell in cells.items():
+        if problem := problem_of(cell):
+            raise UsageError(f"{where}, column {column}: {problem}")
+    asked = cells.get("object") or _object_of(cells["instruction"])
+    if asked is None or asked not in cells["instruction"]:
+        raise UsageError(
+            f"{where}, column instruction: no target can be parsed from {cells['instruction']!r}. Write it as "
+            "'Put the cube on the …', or name the words in a column `object`"
+        )
+    correct, wrong = (table.parent / cells[column] for column in ("correct", "wrong"))
+    other = cells.get("other_object") or f"what {wrong.stem} shows"
+    try:
+        slug = check_slug(cells.get("category") or category)
+    except UsageError as error:
+        if not cells.get("category"):
+            raise
+        raise UsageError(f"{where}, column category: {error}") from error
+    return Row(line, cells["instruction"], correct, wrong, cells.get("group", ""), slug, asked, other)
+
+
+def _object_of(instruction: str) -> str | None:
+    """The words behind the first "on" or "onto", without their article."""
+    words = instruction.split()
+    for number, word in enumerate(words):
+        if word.lower() in ("on", "onto"):
+            rest = words[number + 1 :]
+            return " ".join(rest[1:] if rest and rest[0].lower() in ("the", "a", "an") else rest) or None
+    return None
