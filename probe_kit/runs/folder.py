@@ -144,7 +144,8 @@ class Folder(Location):
         path = self._inner(key)
         for left in reversed(range(_TRIES)):
             try:
-                path.parent.mkdir(parents=True, exist_ok=True)
+                with suppress(FileExistsError):  # another process removed it just after it existed
+                    path.parent.mkdir(parents=True, exist_ok=True)
                 with _draft(path, content, durable) as draft:
                     give_name(draft, path)
                 return
