@@ -28,7 +28,7 @@ from probe_kit.extract.plan import Plan, PlannedEpisode, make_plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
 from probe_kit.runs import open_run, seal, verify_run
-from probe_kit.runs.commits import commit_key, write_commit
+from probe_kit.runs.commits import Commit, commit_key, write_commit
 from probe_kit.runs.layout import DATA, StoredStream
 from probe_kit.runs.records import HASH
 from probe_kit.runs.seconds import NOT_MEASURED, write_seconds
@@ -187,7 +187,7 @@ def large_run(suite: Suite, run: Path, episodes: int) -> None:
             os.link(run / DATA / key, run / DATA / new)
         one = {**commit, "episode": number, "episode_id": many[number].episode.episode_id, "objects": objects}
         write_seconds(writer.root, number, replace(NOT_MEASURED, inference=0.0, simulation=0.0))
-        write_commit(writer.location, number, one)
+        write_commit(writer.location, Commit.model_validate(one))
 
 
 def _of_many(plan: Plan, episodes: tuple[PlannedEpisode, ...]) -> Plan:

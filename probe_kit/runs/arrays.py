@@ -3,7 +3,6 @@
 Arrays of tokens and of later inferences hold the bits of bfloat16 as uint16, because Zarr v3 has no bfloat16.
 """
 
-import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,15 +33,17 @@ _ONE_AT_A_TIME = Lock()
 _BLOSC_SIZE = slice(4, 8)
 """Place of the size, unpacked, in the header of a chunk that blosc wrote."""
 _ABSENT = (1 << 64) - 1
+ROOM = 1_000_000
+"""Episodes that an array has room for; one chunk holds one episode, and no chunk exists before its episode."""
 NOT_A_NUMBER = 0x7FC0
 """Bits of bfloat16 where nothing was captured."""
 
 
 def create_arrays(
-    store: Store, streams: list[StoredStream], episodes: int, calls: int, with_tokens: bool, codec: str,
+    store: Store, streams: list[StoredStream], calls: int, with_tokens: bool, codec: str,
     later_views: LaterViews = "all",
 ) -> None:  # fmt: skip
-    """Create every array; afterwards chunks are written, and `at_extent` gives them room for more episodes.
+    """Create every array with `ROOM` for episodes, so that metadata never changes; afterwards chunks are written.
 
     Pooled rows: float32 (episode, call, [iteration,] layer, view, feature), one chunk per episode, NaN where
     nothing was captured. Tokens: uint16, one shard per episode, inner chunks of one layer x 128 tokens. With
@@ -56,7 +57,7 @@ def create_arrays(
         pooled = (*stream.lead, len(stream.views), stream.width)
         group.create_array(
             "pooled",
-            shape=(episodes, full, *pooled),
+            shape=(ROOM, full, *pooled),
             chunks=(1, full, *pooled),
             dtype="float32",
             fill_value=np.nan,
@@ -69,7 +70,7 @@ def create_arrays(
             later = (*stream.lead, stream.width)
             group.create_array(
                 LATER,
-                shape=(episodes, calls - 1, *later),
+                shape=(ROOM, calls - 1, *later),
                 chunks=(1, calls - 1, *later),
                 dtype="uint16",
                 fill_value=NOT_A_NUMBER,
@@ -82,7 +83,7 @@ def create_arrays(
             tokens = (*stream.lead, stream.stored_tokens, stream.width)
             group.create_array(
                 "tokens",
-                shape=(episodes, calls, *tokens),
+                shape=(ROOM, calls, *tokens),
                 shards=(1, calls, *tokens),
                 chunks=(1, 1, *(1 for _ in stream.lead), stream.token_block, stream.width),
                 dtype="uint16",
@@ -92,27 +93,6 @@ def create_arrays(
                 attributes={"probe_kit:dtype": "bfloat16", "tokens": stream.tokens},
                 config={"write_empty_chunks": True},
             )
-
-
-def at_extent(metadata: bytes, episodes: int) -> bytes:
-    """The `zarr.json` of an array with room for so many episodes; that of a group stays as it is.
-
-    One chunk holds one episode, so nothing else of an array depends on their number. Raises ValueError for what
-    describes no array or group.
-    """
-    content = json.loads(metadata)
-    if content.get("node_type") == "array":
-        content["shape"][0] = episodes
-    return json.dumps(content, indent=2).encode()
-
-
-def extent_of(metadata: bytes) -> int | None:
-    """Episodes that an array has room for by its `zarr.json`; None for that of a group.
-
-    Raises ValueError as `at_extent`.
-    """
-    content = json.loads(metadata)
-    return int(content["shape"][0]) if content.get("node_type") == "array" else None
 
 
 def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:

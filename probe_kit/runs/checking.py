@@ -18,18 +18,15 @@ _BLOCK = 2 * BLOCK_BYTES
 class CheckedStore(WrapperStore[Store]):
     """Reads objects that are known by their sums; whatever else lies in the store does not exist for it.
 
-    where: full name of an object, for messages. advice: what to do if one is wrong. held: objects that were read
-    before, by key; they are not read again, because metadata changes while a run grows.
+    where: full name of an object, for messages. advice: what to do if one is wrong.
     A wrong or missing object raises RunDamagedError. Of a shard, only the parts that are read are checked. Of
     several wrong objects that are read at once, the one that was asked for first is named, whichever comes first.
     """
 
     def __init__(
-        self, store: Store, sums: Mapping[str, Sum], where: Callable[[str], str], advice: Callable[[str], str],
-        held: Mapping[str, bytes] = {},
-    ) -> None:  # fmt: skip
+        self, store: Store, sums: Mapping[str, Sum], where: Callable[[str], str], advice: Callable[[str], str]
+    ) -> None:
         super().__init__(store)
-        self._held = held
         self._sums, self._where, self._advice = sums, where, advice
         self._indexes: dict[str, dict[tuple[int, int], str]] = {}
         self._numbers = count()
@@ -41,7 +38,7 @@ class CheckedStore(WrapperStore[Store]):
         return False
 
     def _with_store(self, store: Store) -> "CheckedStore":
-        return CheckedStore(store, self._sums, self._where, self._advice, self._held)
+        return CheckedStore(store, self._sums, self._where, self._advice)
 
     async def exists(self, key: str) -> bool:
         """Whether there is such an object, wrong or not."""
@@ -53,8 +50,6 @@ class CheckedStore(WrapperStore[Store]):
         """One object or a part of it."""
         if key not in self._sums:
             return None
-        if key in self._held and byte_range is None:
-            return prototype.buffer.from_bytes(self._held[key])
         number = next(self._numbers)
         self._underway[number] = key
         try:
@@ -88,8 +83,6 @@ class CheckedStore(WrapperStore[Store]):
         if key not in self._sums:
             return None
         prototype = prototype or default_buffer_prototype()
-        if key in self._held and byte_range is None:
-            return prototype.buffer.from_bytes(self._held[key])
         self._check_size(key)
         value = super().get_sync(key, prototype=prototype, byte_range=byte_range)
         return self._checked(key, value, byte_range)

@@ -13,8 +13,8 @@ not committed any more shows that the run lost it.
 """
 
 import re
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from probe_kit.runs.arrays import bounded_codecs, decode_bfloat16, open_array
 from probe_kit.runs.checking import CheckedStore
 from probe_kit.runs.commits import Commit, commit_key, stamp_of
 from probe_kit.runs.layout import COLUMNS, LATER, SEALED, StoredStream
-from probe_kit.runs.records import Sum, as_record, check_sums, expect, read_record, read_sums
+from probe_kit.runs.records import Record, Sum, Sums
 from probe_kit.runs.root import Root
 from probe_kit.runs.store import Location
 
@@ -39,6 +39,16 @@ if TYPE_CHECKING:
 STAMP_DIGITS = 16
 METADATA = "zarr.json"
 _NAMED = re.compile(rf"[0-9a-f]{{{STAMP_DIGITS}}}\.json")
+
+
+class Seal(Record):
+    """Of which commits the columns were made, and the hashes of all their objects by key in their folder."""
+
+    kind: ClassVar[str] = "seal"
+    run: str
+    stamp: str
+    episodes: list[int]
+    objects: Sums
 
 
 class Columns:
@@ -97,14 +107,6 @@ class Columns:
             )
         return dataset["pooled"].drop_attrs()
 
-    def problems(self) -> Iterator[str]:
-        """What is missing or has another size, without reading it."""
-        sizes = self._location.sizes(self.folder, self.sums)
-        for key, known in self.sums.items():
-            if sizes.get(key) != known.length:
-                seen = f"has {sizes[key]} bytes; {known.length} were written" if key in sizes else "is missing"
-                yield f"{self.folder}/{key} {seen}. {self.advice}"
-
 
 def find_columns(root: Root, commits: Mapping[int, Commit]) -> Columns | None:
     """The columns of a run if they were sealed from exactly these commits.
@@ -113,10 +115,10 @@ def find_columns(root: Root, commits: Mapping[int, Commit]) -> Columns | None:
     gone or others, or if a part of the columns is gone.
     """
     location, stamp = root.location, stamp_of(commits)
-    sums = {seal["stamp"]: read_sums(seal["objects"]) for seal in _read_seals(root, commits)}.get(stamp)
-    if sums is None:
+    seal = next((seal for seal in _read_seals(root, commits) if seal.stamp == stamp), None)
+    if seal is None:
         return None
-    found = Columns(location, location.derived(COLUMNS, stamp), sums)
+    found = Columns(location, location.derived(COLUMNS, stamp), seal.objects)
     if not location.exists(f"{found.folder}/{METADATA}"):
         if not (location.keys(found.folder) and location.exists(seal_key(stamp))):
             return None  # all of them were removed, as is allowed, or are being built again
@@ -131,50 +133,42 @@ def seal_key(stamp: str) -> str:
 
 def write_seal(root: Root, commits: Mapping[int, Commit], sums: Mapping[str, Sum]) -> None:
     """Note the hashes of the columns, and the episodes they are of, which makes them count."""
-    stamp, objects = stamp_of(commits), {key: one.to_json() for key, one in sums.items()}
-    seal = {"run": root.identity, "stamp": stamp, "episodes": sorted(commits), "objects": objects}
-    root.location.write(seal_key(stamp), as_record(seal))
+    seal = Seal(run=root.identity, stamp=stamp_of(commits), episodes=sorted(commits), objects=dict(sums))
+    root.location.write(seal_key(seal.stamp), seal.to_bytes())
 
 
-def _read_seals(root: Root, commits: Mapping[int, Commit]) -> Iterator[dict[str, Any]]:
-    """All that count, each checked."""
+def _read_seals(root: Root, commits: Mapping[int, Commit]) -> list[Seal]:
+    """All seals, each checked."""
+    seals = []
+    advice = f"Delete it; `probe-kit run verify {root.location} --seal` builds the columns again"
     for file, raw in root.location.read_all(SEALED, ".json").items():
         if not _NAMED.fullmatch(file):
             continue  # a copy under another name
         name = f"{root.location}/{SEALED}/{file}"
-        advice = f"Delete it; `probe-kit run verify {root.location} --seal` builds the columns again"
-        seal = read_record(raw, name, advice)
-        expect(seal, {"run": str, "stamp": str, "objects": dict}, name, advice)
-        check_sums(seal["objects"], name, advice)
-        if seal["run"] != root.identity or seal_key(seal["stamp"]) != f"{SEALED}/{file}":
-            raise RunDamagedError(f"{name} belongs to another run or to other episodes. {advice}")
-        if lost := _metadata(root) - {*seal["objects"]}:
+        seal = Seal.parse(raw, name, advice, run=root.identity)
+        if seal_key(seal.stamp) != f"{SEALED}/{file}":
+            raise RunDamagedError(f"{name} belongs to other episodes. {advice}")
+        if lost := _metadata(root) - {*seal.objects}:
             raise RunDamagedError(f"{name} names no hash of {min(lost)}. {advice}")
-        if "episodes" in seal:  # seals of before this was noted say less
-            _check_lost(root, commits, seal, name, advice)
-        yield seal
+        _check_lost(root, commits, seal, name, advice)
+        seals.append(seal)
+    return seals
 
 
 def _metadata(root: Root) -> set[str]:
-    """What columns have for every episode."""
+    """Keys of the metadata that columns always have."""
     arrays = [f"{stream}/{kind}" for stream in root.streams for kind in root.vector_kinds]
     return {METADATA, *(f"{array}/{METADATA}" for array in arrays)}
 
 
-def _check_lost(
-    root: Root, commits: Mapping[int, Commit], seal: Mapping[str, Any], name: str, advice: str
-) -> None:
+def _check_lost(root: Root, commits: Mapping[int, Commit], seal: Seal, name: str, advice: str) -> None:
     """Raise RunDamagedError if a seal was made of commits that are gone, or are others by now."""
-    expect(seal, {"episodes": list}, name, advice)
-    numbers = seal["episodes"]
-    if not all(type(number) is int for number in numbers):
-        raise RunDamagedError(f"{name} names other episodes than by number. {advice}")
-    absent = [number for number in numbers if number not in commits]
+    absent = [number for number in seal.episodes if number not in commits]
     if lost := [number for number in absent if not root.location.exists(commit_key(number))]:
         raise RunDamagedError(
-            f"{root.location}/{commit_key(lost[0])} is missing: {name} was made of {len(numbers)} episodes, of "
-            f"which {len(lost)} are gone. Restore the commits, or run the same `probe-kit extract` again to redo "
-            f"them; to continue without them, delete {SEALED} and {COLUMNS}"
+            f"{root.location}/{commit_key(lost[0])} is missing: {name} was made of {len(seal.episodes)} episodes, "
+            f"of which {len(lost)} are gone. Restore the commits, or run the same `probe-kit extract` again to "
+            f"redo them; to continue without them, delete {SEALED} and {COLUMNS}"
         )
-    if not absent and stamp_of({number: commits[number] for number in numbers}) != seal["stamp"]:
+    if not absent and stamp_of({number: commits[number] for number in seal.episodes}) != seal.stamp:
         raise RunDamagedError(f"{name} was made of other commits than the run has. {advice}")

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from probe_kit._system.drafts import draft_of, full_disk_in_words, move_draft
 from probe_kit.errors import UsageError
+from probe_kit.runs.contents import record_keys, stored_objects
 from probe_kit.runs.folder import Folder
 from probe_kit.runs.layout import (
     DATA,
@@ -15,8 +16,7 @@ from probe_kit.runs.layout import (
     RUN_FILE,
     TRAJECTORY,
 )
-from probe_kit.runs.left_out import is_left_out, left_out_record
-from probe_kit.runs.orphans import known_keys
+from probe_kit.runs.root import LeftOut, is_left_out
 from probe_kit.runs.run import Run, open_run
 from probe_kit.runs.store import Location, locate
 
@@ -60,8 +60,9 @@ def copy_run(
 
 def _copied_keys(run: Run, arrays: Collection[str], pictures: bool, directions: bool) -> Iterator[str]:
     """The keys of all objects of a copy but its root, in order. arrays: those that are left out."""
-    commits = {commit["episode"]: commit for commit in run.commits()}
-    for key in sorted({*known_keys(run.root, commits, None, run.stamp)} - {RUN_FILE}):
+    commits = {commit.episode: commit for commit in run.commits()}
+    objects = (stored.key for stored in stored_objects(run.root, commits, None))
+    for key in sorted({*record_keys(run.root, commits, None), *objects} - {RUN_FILE, LEFT_OUT_FILE}):
         inside = key.removeprefix(f"{DATA}/")
         left_out = inside != key and is_left_out(inside, arrays)
         if left_out or (not pictures and key.partition("/")[0] in ILLUSTRATIONS):
@@ -74,5 +75,5 @@ def _copied_keys(run: Run, arrays: Collection[str], pictures: bool, directions: 
 def _write_copy(run: Run, target: Location, keys: Sequence[str], left_out: Collection[str]) -> None:
     for key in keys:
         target.write(key, run.location.read(key))
-    target.write(LEFT_OUT_FILE, left_out_record(run.root.identity, left_out))
+    target.write(LEFT_OUT_FILE, LeftOut(run=run.root.identity, arrays=sorted(left_out)).to_bytes())
     target.write(RUN_FILE, run.location.read(RUN_FILE))  # last: without it there is no run

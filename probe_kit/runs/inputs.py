@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from zarr.abc.store import Store
 from zarr.core.array_spec import ArrayConfigLike
 
-from probe_kit.runs.arrays import codecs, open_array
+from probe_kit.runs.arrays import ROOM, codecs, open_array
 from probe_kit.runs.layout import INPUTS, TRUTHS
 from probe_kit.runs.rows import Rows
 
@@ -26,14 +26,14 @@ _TYPES = {"columns": "float64", "pixels": "uint8"}
 
 
 def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], codec: str) -> None:
-    """Create the arrays for no rows yet. shapes: by kind, of one inference."""
+    """Create the arrays. shapes: by kind, of one inference."""
     root = zarr.open_group(store, mode="a", zarr_format=3)
     group = root.create_group(INPUTS)
     for name, shape in shapes.items():
         dtype = np.dtype(_TYPES.get(name, "float32"))
         group.create_array(
             name,
-            shape=(0, calls, *shape),
+            shape=(ROOM, calls, *shape),
             chunks=(1, calls, *shape),
             dtype=dtype,
             fill_value=0 if dtype.kind == "u" else np.nan,

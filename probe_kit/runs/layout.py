@@ -29,7 +29,7 @@ import numpy as np
 
 from probe_kit.hooks.contract.sites import QUANTITIES, Part, Site, Stream
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 """The only one that is written and read."""
 TOKEN_BLOCK = 128
 RUN_FILE, PLANS, CERTIFICATE_FILE = "run.json", "plan", "certificate.json"

@@ -12,22 +12,22 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+
+from pydantic import ConfigDict
 
 import probe_kit.version
 from probe_kit.errors import RunDamagedError, SettingsMismatchError
 from probe_kit.hashing import sha256_json, sha256_text
-from probe_kit.runs.commits import create_once
 from probe_kit.runs.layout import PROVENANCE
-from probe_kit.runs.records import HASH, expect, read_record
+from probe_kit.runs.location import Location
+from probe_kit.runs.records import RESTORE, Record
 from probe_kit.runs.root import Root
-from probe_kit.runs.store import Location
 
 Provenance = Mapping[str, Any]
 
 DIGITS = 16
 _NAMED = re.compile(rf"[0-9a-f]{{{DIGITS}}}\.json")
-_RESTORE = "Restore it from a copy, or extract the run again"
 _LIBRARIES = ("torch", "lerobot", "transformers", "timm", "pybullet", "zarr", "numcodecs", "numpy", "pillow")
 DECISIVE = (
     "device",
@@ -79,34 +79,46 @@ def code_sha256() -> str:
     )
 
 
+class ProvenanceRecord(Record):
+    """The provenance of one process, see `provenance_here`."""
+
+    model_config = ConfigDict(extra="allow")
+    kind: ClassVar[str] = "provenance"
+    device: str
+    versions: dict[str, str | None]
+
+
 def name_of(provenance: Provenance) -> str:
-    """What commits call it."""
+    """The name by which commits refer to it."""
     return sha256_json(provenance)[:DIGITS]
 
 
 def keep_provenance(location: Location, provenance: Provenance) -> None:
     """Store it in the run, unless another process did."""
-    create_once(location, f"{PROVENANCE}/{name_of(provenance)}.json", provenance)
+    record = ProvenanceRecord.model_validate(dict(provenance))
+    location.create(f"{PROVENANCE}/{name_of(provenance)}.json", record.to_bytes())
 
 
 def read_provenances(root: Root) -> dict[str, Provenance]:
-    """Every provenance of a run by its name.
+    """Every provenance of a run by its name. Raises RunDamagedError for one of another content."""
+    provenances: dict[str, Provenance] = {}
+    for file, raw in root.location.read_all(PROVENANCE, ".json").items():
+        if _NAMED.fullmatch(file):  # else a copy under another name
+            where = f"{root.location}/{PROVENANCE}/{file}"
+            content = ProvenanceRecord.parse(raw, where, RESTORE).content
+            if f"{name_of(content)}.json" != file:
+                raise RunDamagedError(f"{where} was changed after it was written. {RESTORE}")
+            provenances[name_of(content)] = content
+    return provenances
 
-    Raises RunDamagedError if one is not what its name says.
-    """
-    found: dict[str, Provenance] = {}
-    location = root.location
-    for file, raw in location.read_all(PROVENANCE, ".json").items():
-        if not _NAMED.fullmatch(file):
-            continue  # a copy under another name
-        where, name = f"{location}/{PROVENANCE}/{file}", file.removesuffix(".json")
-        content = read_record(raw, where, _RESTORE)
-        del content[HASH]
-        expect(content, {"device": str, "versions": dict}, where, _RESTORE)
-        if name_of(content) != name:
-            raise RunDamagedError(f"{where} was changed after it was written. {_RESTORE}")
-        found[name] = content
-    return found
+
+def check_provenances(stored: Mapping[str, Provenance], named: Iterable[str], location: Location) -> None:
+    """Raise RunDamagedError unless all provenances that commits name are stored."""
+    if missing := sorted({*named} - {*stored}):
+        raise RunDamagedError(
+            f"{location}/{PROVENANCE}/{missing[0]}.json is missing, though episodes name it; it was there when "
+            f"they were committed. {RESTORE}"
+        )
 
 
 def differences(provenances: Iterable[Provenance]) -> tuple[str, ...]:

@@ -1,38 +1,38 @@
-"""Hashes that bind every object of a run to its place.
+"""Records: the JSON objects of a run, each a pydantic model with a hash over its values.
 
-    run.json ── zarr.json of every array, at no episodes
-       └── plan ── the plan record before it
-              └── commits ── the objects of their episode, their provenance
-                     └── stamp ── columns, probes
+    run.json ── zarr.json of every array
+       └── plan ── commits ── the objects of their episode
+                      └── stamp ── columns, probes
 
-`run.json` hashes the metadata; a plan record says whose it is; a commit hashes its objects, and says whose it is
-and which record planned it; what is derived says from which commits. A record is JSON that carries the hash of all
-its other bytes, so that any change is seen.
-Every content has one spelling: a record in other bytes than `as_record` writes is damaged, whatever its hash says.
+The hash is that of the canonical JSON of the parsed content: another spelling of the same values is the same
+record; any other value, a key that is named twice, and a part that the model does not know are damage. A record
+names the run it belongs to by the hash of `run.json`, so none counts in another run.
 Hashes detect accidents. They are no protection against an attacker who recomputes them: see `docs/storage.md`.
 """
 
 import json
-import re
 from collections.abc import Iterable, Mapping
 from hashlib import blake2b
-from typing import Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, PrivateAttr, ValidationError
 
 from probe_kit._system.bounded_json import parse_strict_json
 from probe_kit.errors import RunDamagedError
+from probe_kit.runs.location import Location
 
 HASH = "blake2b"
 DIGEST_BYTES, BLOCK_BYTES = 32, 8
 _HEX, _BLOCK_HEX = 2 * DIGEST_BYTES, 2 * BLOCK_BYTES
-_HEXADECIMAL = re.compile(r"[0-9a-f]+")
-_BEFORE, _AFTER = f'{{\n "{HASH}": "'.encode(), b'",'
+_HEXADECIMAL = frozenset("0123456789abcdef")
+RESTORE = "Restore it from a copy, or extract the run again"
 
 
 class Sum(NamedTuple):
-    """What is known of an object: its length in bytes, and the blake2b of them as 64 hex digits.
+    """Length in bytes of an object, and the blake2b of them as 64 hex digits.
 
     blocks: of a shard, 16 hex digits per inner chunk in the order of its index, then those of the index; so
-    that a part can be checked without reading the rest. Empty for everything else.
+    that a part can be checked without reading the others. Empty for everything else.
     """
 
     length: int
@@ -41,7 +41,7 @@ class Sum(NamedTuple):
 
     @classmethod
     def of(cls, content: bytes) -> "Sum":
-        """That of an object that is always read whole."""
+        """That of an object that is always read at once."""
         return cls(len(content), digest(content))
 
     def to_json(self) -> list[int | str]:
@@ -49,43 +49,86 @@ class Sum(NamedTuple):
         return list(self) if self.blocks else [self.length, self.digest]
 
     def problem(self, content: bytes) -> str | None:
-        """What is wrong with an object that should have this sum, or None."""
+        """The difference between this sum and that of `content`, in words; None if there is none."""
         if len(content) != self.length:
             return f"has {len(content)} bytes; {self.length} were written"
         return None if digest(content) == self.digest else "has other bytes than were written"
 
 
-def read_sums(stored: Mapping[str, Any]) -> dict[str, Sum]:
-    """By key, as `Sum.to_json` stored them; of a record that `check_sums` looked at."""
-    return {key: Sum(*values) for key, values in stored.items()}
-
-
-def check_sums(stored: Mapping[str, Any], name: str, advice: str) -> None:
-    """Raise RunDamagedError unless every value is what `Sum.to_json` gives."""
-    for key, values in stored.items():
-        if not is_sum(values):
-            raise RunDamagedError(
-                f"{name} has {str(values)[:40]!r} as length and hash of {key!r}; expected a number of bytes and "
-                f"{_HEX} hex digits. {advice}"
-            )
-
-
-def is_sum(values: Any) -> bool:
-    """Whether this is what `Sum.to_json` gives."""
+def parse_sum(values: Any) -> Sum:
+    """The sum that `Sum.to_json` stored. Raises ValueError for anything else."""
     match values:
-        case [length, str(known)]:
-            return _is_length(length) and _are_digits(known, _HEX) and len(known) == _HEX
-        case [length, str(known), str(blocks)]:
-            return is_sum([length, known]) and _are_digits(blocks, _BLOCK_HEX)
-    return False
+        case [int(length), str(known)] | [int(length), str(known), str()] if type(length) is int and length >= 0:
+            blocks = "".join(values[2:])
+            digits = _HEXADECIMAL.issuperset(known + blocks)
+            if digits and len(known) == _HEX and len(blocks) % _BLOCK_HEX == 0:
+                return Sum(length, known, blocks)
+    raise ValueError(f"expected a number of bytes and {_HEX} hex digits")
 
 
-def _is_length(value: Any) -> bool:
-    return type(value) is int and value >= 0
+Sums = dict[str, Annotated[Sum, BeforeValidator(parse_sum), PlainSerializer(Sum.to_json)]]
+"""Length and hash of objects by key, as a record holds them."""
 
 
-def _are_digits(text: str, several: int) -> bool:
-    return len(text) % several == 0 and bool(_HEXADECIMAL.fullmatch(text))
+class Record(BaseModel):
+    """One JSON object of a run. Reading checks type and value of its parts, and refuses unknown ones."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, ser_json_inf_nan="constants")
+    kind: ClassVar[str] = "record"
+    _hash: str = PrivateAttr("")
+
+    @property
+    def hash(self) -> str:
+        """The hash over the values, 64 hex digits."""
+        return self._hash or digest(canonical(self.content))
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """The values as stored, without their hash."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
+    def to_bytes(self) -> bytes:
+        """The record as it is stored."""
+        return as_record(self.content)
+
+    @classmethod
+    def parse(cls, raw: bytes, name: str, advice: str, /, **expected: object) -> Self:
+        """The record in these bytes. Raises RunDamagedError if it was changed, or belongs elsewhere.
+
+        name, advice: the place and the remedy, for the message. expected: values by part, such as the run's
+        identity.
+        """
+        content = read_record(raw, name, advice)
+        own = content.pop(HASH)
+        try:
+            record = cls.model_validate(content)
+        except ValidationError as error:
+            wrong = first_error(error)
+            raise RunDamagedError(f"{name} is no {cls.kind} as probe_kit writes it: {wrong}. {advice}") from None
+        if other := [part for part, value in expected.items() if content.get(part) != value]:
+            stored, right = (
+                ", ".join(f"{part} {values.get(part)}" for part in other) for values in (content, expected)
+            )
+            raise RunDamagedError(f"{name} is the {cls.kind} of {stored}; here belongs that of {right}. {advice}")
+        record._hash = own
+        return record
+
+    @classmethod
+    def read(cls, location: Location, key: str, advice: str, /, **expected: object) -> Self:
+        """The record at `key`. Raises RunDamagedError if it is missing, was changed, or belongs elsewhere."""
+        name = f"{location}/{key}"
+        try:
+            raw = location.read(key)
+        except FileNotFoundError:
+            raise RunDamagedError(f"{name} is missing. {advice}") from None
+        return cls.parse(raw, name, advice, **expected)
+
+
+def first_error(error: ValidationError) -> str:
+    """The first complaint of pydantic, with the place and the value."""
+    first = error.errors(include_url=False)[0]
+    place = ".".join(map(str, first["loc"]))
+    return f"{place or 'it'} is {str(first['input'])[:40]!r} ({first['msg']})"
 
 
 def digest(content: bytes) -> str:
@@ -94,7 +137,7 @@ def digest(content: bytes) -> str:
 
 
 def digest_of(pieces: Iterable[bytes | memoryview], most: int | None = None) -> tuple[int, str]:
-    """Length and blake2b of what these pieces are together, or of their beginning beyond `most` bytes."""
+    """Length and blake2b of these pieces together, or of their beginning beyond `most` bytes."""
     running, length = blake2b(digest_size=DIGEST_BYTES), 0
     for piece in pieces:
         running.update(piece)
@@ -109,63 +152,41 @@ def block_digest(content: bytes) -> str:
     return blake2b(content, digest_size=BLOCK_BYTES).hexdigest()
 
 
+def canonical(content: Mapping[str, Any]) -> bytes:
+    """The spelling that is hashed: keys sorted, no spaces, ASCII."""
+    return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
+
+
 def as_json(content: Mapping[str, Any]) -> bytes:
-    """The one way JSON is written in a run: keys sorted, a line each."""
+    """JSON as it is written in a run: keys sorted, a line each."""
     return json.dumps(content, sort_keys=True, indent=1, allow_nan=False).encode()
 
 
 def as_record(content: Mapping[str, Any]) -> bytes:
-    """JSON that begins with the hash of the rest: of the same JSON without that line."""
-    plain = as_json(content)
-    return _BEFORE + digest(plain).encode() + _AFTER + plain[1:]
-
-
-def record_hash(record: bytes) -> str:
-    """The hash that bytes of `as_record` carry."""
-    return record[len(_BEFORE) : len(_BEFORE) + _HEX].decode()
-
-
-def is_record(raw: bytes) -> bool:
-    """Whether these bytes claim to be a record."""
-    return raw.startswith(_BEFORE)
+    """JSON that carries the hash of its other values."""
+    return as_json({**content, HASH: digest(canonical(content))})
 
 
 def read_record(raw: bytes, name: str, advice: str) -> dict[str, Any]:
-    """What a record says, with the hash that was computed of it. Raises RunDamagedError for any other bytes than
-    `as_record` gives for that content.
+    """The content of a record, with its hash. Raises RunDamagedError unless the hash is that of the values.
 
-    name, advice: what it is and what to do, for the message.
+    name, advice: the place and the remedy, for the message.
     """
-    start = len(_BEFORE)
-    carried, rest = raw[start : start + _HEX], raw[start + _HEX + len(_AFTER) :]
-    if is_record(raw) and digest(b"{" + rest).encode() != carried:
-        raise RunDamagedError(f"{name} was changed after it was written: its hash is another one. {advice}")
     content = read_plain(raw, name, advice)
-    content.pop(HASH, None)
+    carried = content.pop(HASH, None)
     try:
-        written = as_record(content)
+        own = digest(canonical(content))
     except RecursionError:
         raise RunDamagedError(f"{name} was changed after it was written: it nests too deeply. {advice}") from None
-    if raw != written:
-        raise RunDamagedError(f"{name} was changed after it was written: {_difference(raw, written)}. {advice}")
-    return {HASH: written[start : start + _HEX].decode(), **content}
-
-
-def _difference(raw: bytes, written: bytes) -> str:
-    """How bytes differ from the ones that probe_kit writes for their content."""
-    place = next((at for at, pair in enumerate(zip(raw, written, strict=False)) if pair[0] != pair[1]), None)
-    place = min(len(raw), len(written)) if place is None else place
-    seen, expected = (content[place : place + 20] for content in (raw, written))
-    return (
-        f"from byte {place} on it has {seen!r}; probe_kit writes {expected!r} for that content (spaces, order of "
-        "keys, spelling of numbers and the hash are part of a record)"
-    )
+    if carried != own:
+        raise RunDamagedError(f"{name} was changed after it was written: its hash is another one. {advice}")
+    return {HASH: own, **content}
 
 
 def read_plain(raw: bytes, name: str, advice: str) -> dict[str, Any]:
-    """What an object of JSON says. Raises RunDamagedError if it is none, or names a key twice.
+    """The object of JSON in these bytes. Raises RunDamagedError if it is none, or names a key twice.
 
-    Of bytes that carry no hash; what they are compared with lies elsewhere.
+    Of bytes that carry no hash; their sum lies elsewhere.
     """
     try:
         content = parse_strict_json(raw)
@@ -180,5 +201,5 @@ def expect(content: Mapping[str, Any], parts: Mapping[str, type], name: str, adv
     """Raise RunDamagedError unless `content` has these parts, each of its type."""
     for part, kind in parts.items():
         if type(content.get(part)) is not kind:  # a boolean is no number
-            seen = type(content[part]).__name__ if part in content else "nothing"
-            raise RunDamagedError(f"{name} has {seen} as {part!r}; expected {kind.__name__}. {advice}")
+            held = type(content[part]).__name__ if part in content else "nothing"
+            raise RunDamagedError(f"{name} has {held} as {part!r}; expected {kind.__name__}. {advice}")

@@ -10,15 +10,17 @@ Files are never written over: what changes gets another name, and counts when th
 """
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import PurePosixPath
-from typing import Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, ClassVar
+
+from pydantic import BeforeValidator, ConfigDict, PlainSerializer
 
 from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.runs.layout import INTERVENTIONS, PROBES
-from probe_kit.runs.records import HASH, Sum, as_record, digest_of, expect, is_sum, read_record
+from probe_kit.runs.records import Record, Sum, digest_of, parse_sum
 from probe_kit.runs.root import find_root
 from probe_kit.runs.store import Location
 
@@ -28,6 +30,39 @@ _MAKERS = {PROBES: "train", INTERVENTIONS: "intervene"}
 HEAD, TIMES, PARTIAL = "settings.json", "times.json", ".partial"
 _KEY = re.compile(r"[0-9a-f]{12}")
 _SHORT = 8
+
+
+def _parse_file(values: Any) -> tuple[str, Sum]:
+    """The actual name and the sum of a file, as a head stores them. Raises ValueError for anything else."""
+    match values:
+        case [str(actual), *known]:
+            return actual, parse_sum(known)
+    raise ValueError("expected name, length and hash of a file")
+
+
+def _file_json(file: tuple[str, Sum]) -> list[str | int]:
+    return [file[0], *file[1].to_json()]
+
+
+class Head(Record):
+    """`settings.json`. files: actual name, length and hash by name. Producers add parts of their own."""
+
+    model_config = ConfigDict(extra="allow")
+    kind: ClassVar[str] = "head"
+    key: str
+    run: str | None
+    settings: dict[str, Any]
+    files: dict[str, Annotated[tuple[str, Sum], BeforeValidator(_parse_file), PlainSerializer(_file_json)]]
+
+
+class Times(Record):
+    """`times.json`: times of events by name, UTC in ISO 8601."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, str]
+    kind: ClassVar[str] = "record of times"
+    key: str
+    run: str | None
 
 
 @dataclass(frozen=True)
@@ -80,26 +115,6 @@ class Bundle:
         if digest != self.files[name][1].digest:
             raise self.damaged(name, "has other bytes than were written")
 
-    def problems(self, deep: bool, left_out: Collection[str] = ()) -> Iterator[str]:
-        """What is missing or has another size; with `deep` whose bytes are others.
-
-        left_out: files that a copy of the run was made without.
-        """
-        names = {actual: name for name, (actual, _) in self.files.items()}
-        sizes = self.location.sizes(self.folder, names)
-        for actual, name in names.items():
-            known = self.files[name][1]
-            if name in left_out and actual not in sizes:
-                continue
-            try:
-                if sizes.get(actual) != known.length:
-                    seen = f"{sizes[actual]} bytes; {known.length} were written" if actual in sizes else None
-                    raise self.damaged(name, f"has {seen}" if seen else "is missing")
-                if deep:
-                    self.check(name)
-            except RunDamagedError as error:
-                yield str(error)
-
     def _place(self, name: str) -> str:
         if name not in self.files:
             raise self.head_damaged(f"names no file {name}")
@@ -124,11 +139,11 @@ class Bundle:
 
     def head_damaged(self, problem: str) -> RunDamagedError:
         """What is raised about the head."""
-        return RunDamagedError(f"{self.location}/{self.folder}/{HEAD} {problem}. {_advice(self.folder)}")
+        return RunDamagedError(f"{self.location}/{self.folder}/{HEAD} {problem}. {advice_for(self.folder)}")
 
     def damaged(self, name: str, problem: str) -> RunDamagedError:
         """What is raised about one file."""
-        return RunDamagedError(f"{self.location}/{self._place(name)} {problem}. {_advice(self.folder)}")
+        return RunDamagedError(f"{self.location}/{self._place(name)} {problem}. {advice_for(self.folder)}")
 
 
 def write_bundle(
@@ -162,24 +177,24 @@ def _write_bundle(
     files: Mapping[str, bytes],
     times: Mapping[str, str],
 ) -> None:
-    before = read_bundle(location, home, key) if location.exists(f"{home}/{key}/{HEAD}") else None
-    kept = dict(before.files) if before else {}
-    named = dict(kept)
+    folder, run = f"{home}/{key}", _identity(location)
+    before = read_bundle(location, home, key) if location.exists(f"{folder}/{HEAD}") else None
+    former = dict(before.files) if before else {}
+    named = dict(former)
     for name, content in files.items():
         known = Sum.of(content)
-        if name not in kept or kept[name][1] != known:
+        if name not in former or former[name][1] != known:
             actual = name if before is None else _renamed(name, known)
-            location.write(f"{home}/{key}/{actual}", content)
+            location.write(f"{folder}/{actual}", content)
             named[name] = actual, known
+    location.write(f"{folder}/{TIMES}", Times.model_validate({**times, "key": key, "run": run}).to_bytes())
     stored = {name: [actual, *known.to_json()] for name, (actual, known) in named.items()}
-    whose = {"key": key, "run": _identity(location)}
-    location.write(f"{home}/{key}/{TIMES}", as_record({**times, **whose}))
-    record = as_record({**head, **whose, "files": stored})
-    if before is None or location.read(f"{home}/{key}/{HEAD}") != record:
-        location.write(f"{home}/{key}/{HEAD}", record)
-    for name, (actual, _) in kept.items():
+    record = Head.model_validate({**head, "key": key, "run": run, "files": stored}).to_bytes()
+    if before is None or location.read(f"{folder}/{HEAD}") != record:
+        location.write(f"{folder}/{HEAD}", record)
+    for name, (actual, _) in former.items():
         if named[name][0] != actual:
-            location.delete(f"{home}/{key}/{actual}")
+            location.delete(f"{folder}/{actual}")
 
 
 def _renamed(name: str, known: Sum) -> str:
@@ -190,40 +205,18 @@ def _renamed(name: str, known: Sum) -> str:
 def read_bundle(location: Location, home: str, key: str) -> Bundle:
     """The bundle `key`. Raises RunDamagedError if its head or times are missing, changed, or of another run."""
     folder = f"{home}/{key}"
-    name, advice = f"{location}/{folder}/{HEAD}", _advice(folder)
-    head = _read_own(location, home, key, HEAD)
-    times = _read_own(location, home, key, TIMES)
-    if strange := [part for part, value in times.items() if not isinstance(value, str)]:
-        raise RunDamagedError(f"{location}/{folder} has no time as {strange[0]!r}. {advice}")
-    expect(head, {"settings": dict, "files": dict}, name, advice)
-    stored = head.pop("files")
-    if wrong := [one for one, known in stored.items() if not _is_file(known)]:
-        raise RunDamagedError(f"{name} has no name, length and hash of {wrong[0]!r}. {advice}")
-    files = {one: (actual, Sum(*known)) for one, (actual, *known) in stored.items()}
-    if strange := sorted(actual for actual, _ in files.values() if "/" in actual or actual in ("", ".", "..")):
-        raise RunDamagedError(f"{name} names {strange[0]!r}, which is not a file in the same folder. {advice}")
-    return Bundle(location, home, key, head, times, files)
-
-
-def _read_own(location: Location, home: str, key: str, file: str) -> dict[str, Any]:
-    """A record of the bundle `key`, without what only says whose it is."""
-    folder = f"{home}/{key}"
-    name, advice = f"{location}/{folder}/{file}", _advice(folder)
-    try:
-        raw = location.read(f"{folder}/{file}")
-    except FileNotFoundError:
-        raise RunDamagedError(f"{name} is missing, though the folder is there. {advice}") from None
-    record, run = read_record(raw, name, advice), _identity(location)
-    if (record.get("key"), record.get("run", "")) != (key, run):
+    expected = {"key": key, "run": _identity(location)}
+    head = Head.read(location, f"{folder}/{HEAD}", advice_for(folder), **expected)
+    times = Times.read(location, f"{folder}/{TIMES}", advice_for(folder), **expected)
+    if strange := sorted(
+        actual for actual, _ in head.files.values() if "/" in actual or actual in ("", ".", "..")
+    ):
         raise RunDamagedError(
-            f"{name} is {record.get('key')} of run {record.get('run')}; this is run {run}. {advice}"
+            f"{location}/{folder}/{HEAD} names {strange[0]!r}, which is not a file in the same folder. "
+            f"{advice_for(folder)}"
         )
-    return {part: value for part, value in record.items() if part not in (HASH, "key", "run")}
-
-
-def _is_file(stored: Any) -> bool:
-    """Whether a head says [name, length, hash] of a file."""
-    return isinstance(stored, list) and len(stored) == 3 and isinstance(stored[0], str) and is_sum(stored[1:])
+    own = {part: value for part, value in head.content.items() if part not in ("key", "run", "files")}
+    return Bundle(location, home, key, own, times.model_extra or {}, head.files)
 
 
 def bundle_keys(location: Location, home: str) -> list[str]:
@@ -254,18 +247,6 @@ def read_bundles(location: Location, home: str) -> dict[str, Bundle]:
     return {key: read_bundle(location, home, key) for key in bundle_keys(location, home)}
 
 
-def bundle_problems(location: Location, deep: bool, left_out: Collection[str] = ()) -> Iterator[str]:
-    """What is wrong with the bundles of a run; with `deep` every byte of them is read. left_out: of a copy."""
-    for home in BUNDLES:
-        for key in bundle_keys(location, home):
-            try:
-                bundle = read_bundle(location, home, key)
-            except RunDamagedError as error:
-                yield str(error)
-            else:
-                yield from bundle.problems(deep, left_out)
-
-
 def _identity(location: Location) -> str | None:
     """That of the run; None for one that nothing protects.
 
@@ -275,5 +256,6 @@ def _identity(location: Location) -> str | None:
     return None if root is None else root.identity
 
 
-def _advice(folder: str) -> str:
+def advice_for(folder: str) -> str:
+    """The remedy for a damaged result."""
     return f"Remove {folder} and run the same `probe-kit {_MAKERS[folder.partition('/')[0]]}` again"

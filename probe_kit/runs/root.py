@@ -1,14 +1,14 @@
-"""The root of a run: `run.json`, and what belongs to every run.
+"""The root of a run: `run.json`, and the parts that belong to every run.
 
-It carries settings and streams, the hash of every array's metadata at no episodes, and its own hash, which is the
-run's identity: plans and commits name it, so that none counts in another run. The selection of episodes may grow
-and is in `plans`.
+It holds settings and streams, the hash of every array's metadata, and its own hash, which is the run's identity:
+plans and commits name it, so that none counts in another run. Nothing in it grows: the selection of episodes is in
+`plans`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 from probe_kit.errors import (
     ActivationsLeftOutError,
@@ -16,14 +16,13 @@ from probe_kit.errors import (
     RunNotFoundError,
 )
 from probe_kit.hashing import sha256_json
-from probe_kit.runs.arrays import at_extent, extent_of
 from probe_kit.runs.layout import (
     DATA,
     DATASET,
     ENVIRONMENT,
     INPUTS,
+    LEFT_OUT_FILE,
     MEAN_VIEW,
-    PLANS,
     RUN_FILE,
     SCHEMA_VERSION,
     LaterViews,
@@ -31,26 +30,14 @@ from probe_kit.runs.layout import (
     VectorKind,
     stored_inputs_of,
 )
-from probe_kit.runs.left_out import read_left_out
-from probe_kit.runs.plans import RESTORE, Row, StoredPlan, plan_key, read_plans
-from probe_kit.runs.records import (
-    HASH,
-    Sum,
-    as_record,
-    check_sums,
-    expect,
-    is_record,
-    read_plain,
-    read_record,
-    read_sums,
-)
-from probe_kit.runs.store import Location
+from probe_kit.runs.location import Location
+from probe_kit.runs.plans import Row, StoredPlan, plan_key, read_plans
+from probe_kit.runs.records import RESTORE, Record, Sum, Sums, expect, read_plain
 from probe_kit.runs.summary import what_to_open
 
-_PARTS = {"settings": dict, "settings_sha256": str, "streams": list, "objects": dict}
 _SETTINGS = {"model": str, "captured_calls": int, "tokens": str, "codec": str}
 _FURTHER = {"random_weights": bool, "suite": dict, "later_views": str}
-"""What the settings of every extracted run say besides, and those of a run that other code wrote may not."""
+"""Further settings of every extracted run; a run that other code wrote may lack them."""
 _EPISODE = {
     **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "layout", "side_correct"), str),
     "item_content_sha256": str,
@@ -68,24 +55,65 @@ _PLAYED = {
 """The same of a run in an environment of the user's own."""
 _INPUTS = {"inputs": dict, "columns": list, "names": dict}
 _OF_SOURCES = {DATASET: {"meta_blake2b": str, **_INPUTS}, ENVIRONMENT: {"revision": str, **_INPUTS}}
-"""What settings say of recordings, or of an environment."""
+"""The settings of recordings, or of an environment."""
+_CHUNKS = "/c/"
+
+
+class Card(Record):
+    """`run.json`. streams: without T, unless every token is stored. objects: metadata of the arrays."""
+
+    kind: ClassVar[str] = "card"
+    schema_version: int
+    settings: dict[str, Any]
+    settings_sha256: str
+    streams: list[dict[str, Any]]
+    objects: Sums
+
+
+class LeftOut(Record):
+    """`left-out.json`, only in a copy without activations, where objects are missing on purpose.
+
+    arrays: those of `data.zarr` whose objects were not copied; also `directions.npz` where the weights of probes
+    were not. Commits still hold the hash of every object.
+    """
+
+    kind: ClassVar[str] = "note of what was left out"
+    run: str
+    arrays: list[str]
+
+
+def is_left_out(key: str, arrays: Iterable[str]) -> bool:
+    """Whether an object of `data.zarr` belongs to one of these arrays; their metadata always exists."""
+    array, chunks, _ = key.partition(_CHUNKS)
+    return bool(chunks) and array in arrays
 
 
 @dataclass(frozen=True)
 class Root:
-    """What `run.json` says, checked, and the plan that goes with it.
+    """`run.json`, checked, and the plan that goes with it.
 
-    card: as it is stored. own_settings: those of the card, without what a selection decides. identity:
-    the hash that was computed of it. own_streams: as it stores them, by name. sums: of the arrays' metadata, at no
-    episodes.
+    own_settings: those of the card, without the parts that a selection decides. identity: hash of the card.
+    own_streams: as it stores them, by name. sums: of the arrays' metadata.
     """
 
     location: Location
-    card: Mapping[str, Any]
-    own_settings: dict[str, Any]
-    identity: str
+    card: Card
     own_streams: Mapping[str, StoredStream]
-    sums: Mapping[str, Sum]
+
+    @property
+    def identity(self) -> str:
+        """The hash of the card, 64 hex digits."""
+        return self.card.hash
+
+    @property
+    def own_settings(self) -> dict[str, Any]:
+        """The settings of the card."""
+        return self.card.settings
+
+    @property
+    def sums(self) -> Mapping[str, Sum]:
+        """Length and hash of the arrays' metadata, by key in the run."""
+        return self.card.objects
 
     def check_continuable(self) -> None:
         """Raise ActivationsLeftOutError for a copy without activations."""
@@ -95,7 +123,10 @@ class Root:
     @cached_property
     def left_out(self) -> frozenset[str]:
         """The arrays that this run, if it is such a copy, was copied without. Raises RunDamagedError."""
-        return read_left_out(self.location, self.identity)
+        if not self.location.exists(LEFT_OUT_FILE):
+            return frozenset()
+        advice = "Make the copy again, with `probe-kit run copy`"
+        return frozenset(LeftOut.read(self.location, LEFT_OUT_FILE, advice, run=self.identity).arrays)
 
     def refuse_left_out(self, why: str) -> NoReturn:
         """Raise ActivationsLeftOutError. why: what is not possible, in words."""
@@ -104,81 +135,21 @@ class Root:
             "the run that it was copied from"
         )
 
-    # -- what belongs to every run ---------------------------------------------------------------------
-
-    def read(self, key: str) -> bytes:
-        """An object that belongs to every run, as stored.
-
-        Raises RunDamagedError if it is missing or was changed.
-        """
-        name = f"{self.location}/{key}"
-        try:
-            content = self.location.read(key)
-        except FileNotFoundError:
-            raise RunDamagedError(f"{name} is missing. {RESTORE}") from None
-        if problem := self._problem(key, content):
-            raise RunDamagedError(f"{name} {problem}. {RESTORE}")
-        return content
-
-    def _problem(self, key: str, content: bytes) -> str | None:
-        """What is wrong with an object. An array may still have the room of a former plan record."""
-        try:
-            extent, begun = extent_of(content), at_extent(content, 0)
-            spelt = at_extent(content, extent or 0) == content
-        except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError):
-            return "has other bytes than were written"
-        if problem := self.sums[key].problem(begun):
-            return problem
-        if spelt and extent is not None and extent > len(self.plan):
-            return (
-                f"has room for {extent} episodes, and {len(self.plan)} are planned; either it was changed, or a "
-                f"file of {PLANS} is missing, which the `probe-kit extract` that let the run grow writes again"
-            )
-        known = spelt and extent in (None, 0, *self.stored_plan.extents)
-        return None if known else "has other bytes than were written"
-
     def check(self) -> None:
         """Raise RunDamagedError unless the plan and all metadata are what was written."""
-        _ = self.plan, self._stored
+        _ = self.plan
+        for key in self.sums:
+            self.check_metadata(key)
 
-    @cached_property
-    def _stored(self) -> Mapping[str, bytes]:
-        """What `read` gives, by key."""
-        return {key: self.read(key) for key in self.sums}
-
-    @cached_property
-    def metadata(self) -> dict[str, bytes]:
-        """The arrays' metadata with room for every planned episode, by key in `data.zarr`.
-
-        Raises RunDamagedError if stored metadata is missing or was changed.
-        """
-        inside, planned = f"{DATA}/", len(self.plan)
-        stored = {key.removeprefix(inside): one for key, one in self._stored.items() if key.startswith(inside)}
-        return {key: at_extent(content, planned) for key, content in stored.items()}
-
-    def widened(self) -> Mapping[str, bytes]:
-        """By key in the run, what to write over metadata that has room for fewer episodes than are planned."""
-        return {key: at_extent(self._stored[key], len(self.plan)) for key in self.narrow}
-
-    @cached_property
-    def narrow(self) -> Mapping[str, int]:
-        """Metadata on the disk that has room for fewer episodes than are planned, by key in the run, and how many.
-
-        So it is between a plan record and the rewriting of the metadata. `metadata` is not concerned.
-        """
-        inside, planned = f"{DATA}/", len(self.plan)
-        extents = {key: extent_of(one) for key, one in self._stored.items() if key.startswith(inside)}
-        return {key: room for key, room in extents.items() if room is not None and room < planned}
-
-    def check_room(self, numbers: Iterable[int]) -> None:
-        """Raise RunDamagedError if an episode of these numbers has no room in an array, as the disk has it."""
-        highest = max(numbers, default=-1)
-        for key, room in self.narrow.items():
-            if room <= highest:
-                raise RunDamagedError(
-                    f"{self.location}/{key} has room for {room} episodes, and episode {highest} is committed. The "
-                    "same `probe-kit extract` writes it again"
-                )
+    def check_metadata(self, key: str) -> None:
+        """Raise RunDamagedError if the metadata of an array is missing or was changed."""
+        name = f"{self.location}/{key}"
+        try:
+            problem = self.sums[key].problem(self.location.read(key))
+        except FileNotFoundError:
+            problem = "is missing"
+        if problem:
+            raise RunDamagedError(f"{name} {problem}. {RESTORE}")
 
     # -- the plan --------------------------------------------------------------------------------------
 
@@ -214,9 +185,7 @@ class Root:
         Raises RunDamagedError if the plan lacks the number of tokens of one.
         """
         tokens = self.stored_plan.tokens
-        lacking = [
-            one["name"] for one in self.card["streams"] if "tokens" not in one and one["name"] not in tokens
-        ]
+        lacking = [one["name"] for one in self.card.streams if "tokens" not in one and one["name"] not in tokens]
         if lacking and self.plan:
             name = f"{self.location}/{plan_key(len(self.stored_plan.extents) - 1)}"
             raise RunDamagedError(f"{name} says no number of tokens of {lacking[0]}. {RESTORE}")
@@ -263,19 +232,17 @@ class Root:
         return ("pooled",) if self.later_views == "all" else ("pooled", "later")
 
 
-def new_root(settings: Mapping[str, Any], streams: list[dict[str, Any]], objects: Mapping[str, bytes]) -> bytes:
-    """The `run.json` of a run that begins with these arrays' metadata, at no episodes.
+def new_root(settings: Mapping[str, Any], streams: list[dict[str, Any]], objects: Mapping[str, bytes]) -> Card:
+    """The card of a run that begins with these arrays' metadata.
 
     streams: without the number of tokens, which a selection decides, unless every token is stored.
     """
-    return as_record(
-        {
-            "schema_version": SCHEMA_VERSION,
-            "settings": settings,
-            "settings_sha256": sha256_json(settings),
-            "streams": streams,
-            "objects": {key: Sum.of(content).to_json() for key, content in objects.items()},
-        }
+    return Card(
+        schema_version=SCHEMA_VERSION,
+        settings=dict(settings),
+        settings_sha256=sha256_json(settings),
+        streams=streams,
+        objects={key: Sum.of(content) for key, content in objects.items()},
     )
 
 
@@ -297,35 +264,29 @@ def find_root(location: Location) -> Root | None:
         raw = location.read(RUN_FILE)
     except FileNotFoundError:
         return None
-    card = _read_card(raw, name)
-    expect(card, _PARTS, name, RESTORE)
-    if sha256_json(card["settings"]) != card["settings_sha256"]:
-        raise RunDamagedError(f"{name}: the settings do not have the hash stored beside them. {RESTORE}")
-    settings = dict(card["settings"])
-    there = {part: kind for part, kind in _FURTHER.items() if part in settings}
-    expect(settings, {**_SETTINGS, **there}, f"{name}: the settings", RESTORE)
-    for source, parts in _OF_SOURCES.items():
-        if source in settings:
-            expect(settings, {source: dict}, f"{name}: the settings", RESTORE)
-            expect(settings[source], parts, f"{name}: the {source}", RESTORE)
-    check_sums(card["objects"], name, RESTORE)
-    streams = _read_streams(card["streams"], name)
-    root = Root(location, card, settings, card[HASH], streams, read_sums(card["objects"]))
-    if lost := {f"{DATA}/{array}/zarr.json" for array in root.arrays} - {*root.sums}:
-        raise RunDamagedError(f"{name} names no hash of {min(lost)}. {RESTORE}")
-    return root
-
-
-def _read_card(raw: bytes, name: str) -> dict[str, Any]:
-    """The content of `run.json`. Raises RunDamagedError, which names the schema where it is another one."""
-    card = read_record(raw, name, RESTORE) if is_record(raw) else read_plain(raw, name, RESTORE)
-    schema = card.get("schema_version")
+    schema = read_plain(raw, name, RESTORE).get("schema_version")
     if type(schema) is not int or schema != SCHEMA_VERSION:
         raise RunDamagedError(
             f"{name} has schema {schema}; this version of probe_kit reads schema {SCHEMA_VERSION}. Extract the "
             "run again, or read it with the version that made it"
         )
-    return read_record(raw, name, RESTORE)
+    card = Card.parse(raw, name, RESTORE)
+    if sha256_json(card.settings) != card.settings_sha256:
+        raise RunDamagedError(f"{name}: the settings do not have the hash stored beside them. {RESTORE}")
+    _check_settings(card.settings, name)
+    root = Root(location, card, _read_streams(card.streams, name))
+    if lost := {f"{DATA}/{array}/zarr.json" for array in root.arrays} - {*root.sums}:
+        raise RunDamagedError(f"{name} names no hash of {min(lost)}. {RESTORE}")
+    return root
+
+
+def _check_settings(settings: Mapping[str, Any], name: str) -> None:
+    further = {part: kind for part, kind in _FURTHER.items() if part in settings}
+    expect(settings, {**_SETTINGS, **further}, f"{name}: the settings", RESTORE)
+    for source, parts in _OF_SOURCES.items():
+        if source in settings:
+            expect(settings, {source: dict}, f"{name}: the settings", RESTORE)
+            expect(settings[source], parts, f"{name}: the {source}", RESTORE)
 
 
 def _read_streams(stored: list[Any], name: str) -> dict[str, StoredStream]:

@@ -53,7 +53,12 @@ class Rows:
 
     def _block(self, positions: range) -> Iterator[NDArray[Any]]:
         try:
-            block = np.asarray(self.array.oindex[np.array([self.numbers[position] for position in positions])])
+            numbers = [self.numbers[position] for position in positions]
+            # Of an array with much room, a slice is quick; other indexing makes a table of all its chunks.
+            consecutive = numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+            block = np.asarray(
+                self.array[numbers[0] : numbers[-1] + 1] if consecutive else self.array.oindex[np.array(numbers)]
+            )
         except (*_DAMAGE, RunDamagedError):
             yield from (self[position] for position in positions)  # up to the damaged one, which is then named
         else:

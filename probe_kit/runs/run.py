@@ -15,7 +15,6 @@ from zarr.abc.store import Store
 from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import (
     NoTrajectoryError,
-    RunDamagedError,
     RunIncompleteError,
     UnknownSiteError,
     UsageError,
@@ -27,7 +26,6 @@ from probe_kit.runs.certificates import read_certificate
 from probe_kit.runs.checking import CheckedStore
 from probe_kit.runs.columns import Columns, find_columns
 from probe_kit.runs.commits import (
-    LENS_MARGINS,
     Commit,
     committed_sums,
     read_commits,
@@ -43,7 +41,6 @@ from probe_kit.runs.layout import (
     ENVIRONMENT,
     INPUTS,
     MEAN_VIEW,
-    PROVENANCE,
     TRAJECTORY,
     ArrayKind,
     StoredStream,
@@ -51,9 +48,9 @@ from probe_kit.runs.layout import (
     stored_inputs_of,
 )
 from probe_kit.runs.outcomes_by_rule import Watched, judged, watch, with_outcomes
-from probe_kit.runs.plans import RESTORE, while_growing
-from probe_kit.runs.provenance import Provenance, differences, read_provenances
-from probe_kit.runs.records import Sum
+from probe_kit.runs.plans import while_growing
+from probe_kit.runs.provenance import Provenance, check_provenances, differences, read_provenances
+from probe_kit.runs.records import RESTORE, Sum
 from probe_kit.runs.root import read_root
 from probe_kit.runs.rows import Rows, TokenBlock, role_mask, token_blocks
 from probe_kit.runs.seconds import Seconds, read_seconds
@@ -130,7 +127,7 @@ class Run:
                 f"{location} was begun and has no plan yet. Run the same `probe-kit extract` again"
             )
         self.settings: dict[str, Any] = self.root.settings
-        self.settings_sha256: str = self.root.card["settings_sha256"]
+        self.settings_sha256: str = self.root.card.settings_sha256
         self._streams = self.root.streams
 
     def check_records(self) -> None:
@@ -289,12 +286,8 @@ class Run:
         Raises RunDamagedError if a commit names one that is not there.
         """
         stored = read_provenances(self.root)
-        named = sorted({commit["provenance"] for commit in self.commits()})
-        if missing := [name for name in named if name not in stored]:
-            raise RunDamagedError(
-                f"{self.location}/{PROVENANCE}/{missing[0]}.json is missing, though episodes name it; it was "
-                f"there when they were committed. {RESTORE}"
-            )
+        named = sorted({commit.provenance for commit in self.commits()})
+        check_provenances(stored, named, self.location)
         return {name: stored[name] for name in named}
 
     @property
@@ -414,7 +407,7 @@ class Run:
         """
         plan = self.root.planned
         rows = [
-            {**plan[number], **self._commits[number]["outcome"], **self._seconds_columns(number)}
+            {**plan[number], **self._commits[number].outcome, **self._seconds_columns(number)}
             for number in self._numbers
         ]
         return pd.DataFrame(rows or None, columns=None if rows else [*self.root.plan[0], *_OUTCOME, *_SECONDS])
@@ -436,7 +429,7 @@ class Run:
         inferences of an episode; 0 for scripts. Captured inference `call` is column `call`. An episode in which
         nothing moves (`ask`, or without acting) has one inference, at step 0.
         """
-        stored = [commit["control_steps"] for commit in self.commits()]
+        stored = [commit.control_steps for commit in self.commits()]
         steps = np.full((len(stored), max((len(own) for own in stored), default=0)), -1, np.int64)
         for row, own in enumerate(stored):
             steps[row, : len(own)] = own
@@ -449,7 +442,7 @@ class Run:
         Of questions that are answered by letter, with left named first. The last layer gives the model's answer.
         None for every other run; NaN for episodes without one.
         """
-        stored = [commit.get(LENS_MARGINS, []) for commit in self.commits()]
+        stored = [commit.lens_margins or [] for commit in self.commits()]
         layers = max(map(len, stored), default=0)
         if not layers:
             return None
@@ -520,7 +513,7 @@ class Run:
 
     def instruction_ids(self, episode: str | int) -> tuple[int, ...] | None:
         """The instruction of one episode as the policy was delivered it; None where nothing was stored."""
-        ids = self.commits()[self._position(episode)].get("instruction_ids")
+        ids = self.commits()[self._position(episode)].instruction_ids
         return None if ids is None else tuple(ids)
 
     def _position(self, episode: str | int) -> int:
@@ -569,7 +562,7 @@ class Run:
 
     def reached(self, call: int) -> NDArray[np.bool_]:
         """(E,) whether an episode got as far as captured inference `call`."""
-        return np.array([len(commit["roles"]) > call for commit in self.commits()], bool)
+        return np.array([len(commit.roles) > call for commit in self.commits()], bool)
 
     def _check(self, site: Site, call: int) -> StoredStream:
         stored = self.stored(site.stream)
@@ -649,9 +642,7 @@ class Run:
     def data(self) -> Store:
         """The arrays of the committed episodes as Zarr reads them; every object is checked as it is read."""
         store = self.location.store(DATA, read_only=True)
-        return CheckedStore(
-            store, self._sums, lambda key: f"{self.location}/{DATA}/{key}", self._advice, self.root.metadata
-        )
+        return CheckedStore(store, self._sums, lambda key: f"{self.location}/{DATA}/{key}", self._advice)
 
     @cached_property
     def _sums(self) -> dict[str, Sum]:
@@ -659,7 +650,7 @@ class Run:
 
     def _advice(self, key: str) -> str:
         """What to do about a damaged object of `data.zarr`."""
-        of = next((number for number, commit in self._commits.items() if key in commit["objects"]), None)
+        of = next((number for number, commit in self._commits.items() if key in commit.objects), None)
         return RESTORE if of is None else redo(of)
 
     def _kept(self, stream: str, kind: VectorKind) -> NDArray[Any]:
@@ -743,7 +734,7 @@ class Run:
         stored = self._check(site, call)
         if self.settings["tokens"] != "all":
             raise UnknownSiteError(f"{self.location} stores pooled views only; extract with --tokens all")
-        calls = [commit["roles"] for commit in self.commits()]
+        calls = [commit.roles for commit in self.commits()]
         spans = [own[call][site.stream] if call < len(own) else [] for own in calls]
         mask = role_mask(spans, stored.stored_tokens, role)
         if not mask[self.reached(call)].any(axis=1).all():

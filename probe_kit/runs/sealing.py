@@ -54,7 +54,7 @@ def _seal(run: Run) -> bool:
         group.attrs["stamp"] = run.stamp
     folder = run.location.derived(COLUMNS, run.stamp)
     run.location.flush(f"{folder}/{key}" for key in store.sums)
-    commits = {commit["episode"]: commit for commit in run.commits()}
+    commits = {commit.episode: commit for commit in run.commits()}
     write_seal(run.root, commits, store.sums)  # what makes them count, so last
     return True
 
@@ -121,7 +121,7 @@ def _slabs(cells: list[tuple[int, ...]], bytes_per_cell: int) -> Iterator[list[t
 
 
 def _write_roles(run: "Run", name: str, group: zarr.Group) -> None:
-    spans = [[call[name] for call in commit["roles"]] for commit in run.commits()]
+    spans = [[call[name] for call in commit.roles] for commit in run.commits()]
     names = [PADDING, *sorted({role for calls in spans for call in calls for role, _, _ in call} - {PADDING})]
     codes = np.zeros((run.settings["captured_calls"], len(spans), run.stored(name).stored_tokens), np.uint8)
     for episode, calls in enumerate(spans):

@@ -3,18 +3,23 @@
     times/<n>.json    a record per committed episode, written before its commit, which does not name it
 
 Two runs of one identity take different times, so no other record holds the hash of these. No number of a table
-comes from them, and the whole folder may be deleted. A record that is missing beside others is damage.
+comes from them, and the folder may be deleted as a unit. A record that is missing among others is damage.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
-from math import isfinite
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from pydantic import Field
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.runs.commits import Commit, numbered
 from probe_kit.runs.layout import TIMES
-from probe_kit.runs.records import as_record, expect, read_record
+from probe_kit.runs.records import Record
 from probe_kit.runs.root import Root
+
+_ADVICE = f"Restore it from a copy, or delete the folder {TIMES}: no other number comes from it"
+_Count = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -32,72 +37,54 @@ class Seconds:
 NOT_MEASURED = Seconds(float("nan"), float("nan"))
 
 
+class SecondsRecord(Record):
+    """The seconds of one episode, see `Seconds`."""
+
+    kind: ClassVar[str] = "record of seconds"
+    run: str
+    episode: int
+    inference: _Count
+    simulation: _Count
+
+
 def seconds_key(number: int) -> str:
-    """Where the seconds of episode `number` lie."""
+    """The key of the seconds of episode `number`."""
     return f"{TIMES}/{number:08d}.json"
 
 
 def write_seconds(root: Root, number: int, seconds: Seconds) -> None:
     """Store them; those of an earlier try of the episode are replaced."""
-    rounded = {name: round(value, 6) for name, value in asdict(seconds).items()}
-    root.location.write(seconds_key(number), as_record({"run": root.identity, "episode": number, **rounded}))
+    record = SecondsRecord(
+        run=root.identity,
+        episode=number,
+        inference=round(seconds.inference, 6),
+        simulation=round(seconds.simulation, 6),
+    )
+    root.location.write(seconds_key(number), record.to_bytes(), durable=False)
 
 
 def read_seconds(root: Root, commits: Mapping[int, Commit]) -> dict[int, Seconds]:
     """By episode number, NaN for all where none are stored. Raises RunDamagedError for the first that is wrong."""
-    found: dict[int, Seconds] = {}
-    for number, seconds in _stored(root, commits):
-        if isinstance(seconds, str):
-            raise RunDamagedError(seconds)
-        found[number] = seconds
-    if problem := next(_missing(root, commits, found), None):
+    if problem := next(seconds_problems(root, commits), None):
         raise RunDamagedError(problem)
-    return {number: found.get(number, NOT_MEASURED) for number in commits}
+    records = {number: _parse(root, number, key, raw) for number, key, raw in numbered(root.location, TIMES)}
+    stored = {number: Seconds(record.inference, record.simulation) for number, record in records.items()}
+    return {number: stored.get(number, NOT_MEASURED) for number in commits}
 
 
 def seconds_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
-    """What is wrong with them, a sentence each."""
-    found = dict(_stored(root, commits))
-    yield from (one for one in found.values() if isinstance(one, str))
-    yield from _missing(root, commits, found)
-
-
-def _stored(root: Root, commits: Mapping[int, Commit]) -> Iterator[tuple[int, Seconds | str]]:
-    """Seconds by episode number, or what is wrong with them."""
-    for number, key, raw in _raw(root, commits):
+    """Records that were changed or are missing, a sentence each."""
+    stored = set()
+    for number, key, raw in numbered(root.location, TIMES):
+        stored.add(number)
         try:
-            yield number, _read(root, number, key, raw)
+            _parse(root, number, key, raw)
         except RunDamagedError as error:
-            yield number, str(error)
-
-
-def _raw(root: Root, commits: Mapping[int, Commit]) -> Iterator[tuple[int, str, bytes]]:
-    """Number, key and content of every record; a listing that lags behind is completed by asking for the key."""
-    listed = list(numbered(root.location, TIMES))
-    yield from listed
-    for number in commits.keys() - {number for number, _, _ in listed} if listed else ():
-        try:
-            yield number, seconds_key(number), root.location.read(seconds_key(number))
-        except FileNotFoundError:
-            continue
-
-
-def _missing(root: Root, commits: Mapping[int, Commit], found: Mapping[int, object]) -> Iterator[str]:
-    for number in sorted(commits):
-        if found and number not in found:
+            yield str(error)
+    for number in sorted(commits) if stored else ():
+        if number not in stored:
             yield f"{root.location}/{seconds_key(number)} is missing. {_ADVICE}"
 
 
-def _read(root: Root, number: int, key: str, raw: bytes) -> Seconds:
-    name = f"{root.location}/{key}"
-    record = read_record(raw, name, _ADVICE)
-    expect(record, {"run": str, "episode": int, "inference": float, "simulation": float}, name, _ADVICE)
-    if (record["run"], record["episode"]) != (root.identity, number):
-        raise RunDamagedError(f"{name} belongs to another run or episode. {_ADVICE}")
-    seconds = Seconds(record["inference"], record["simulation"])
-    if not all(isfinite(value) and value >= 0 for value in (seconds.inference, seconds.simulation)):
-        raise RunDamagedError(f"{name} says {seconds}; expected seconds of at least 0. {_ADVICE}")
-    return seconds
-
-
-_ADVICE = f"Restore it from a copy, or delete the whole folder {TIMES}: no other number comes from it"
+def _parse(root: Root, number: int, key: str, raw: bytes) -> SecondsRecord:
+    return SecondsRecord.parse(raw, f"{root.location}/{key}", _ADVICE, run=root.identity, episode=number)

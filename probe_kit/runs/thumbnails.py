@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.runs.commits import FRAME_COUNT, pictures_of, read_own_commit, redo_picture
+from probe_kit.runs.commits import Commit, commit_key, redo, redo_picture
 from probe_kit.runs.layout import FRAME_COLUMNS, FRAMES, FrameChoice
 from probe_kit.runs.small_frames import SmallFrames, shrink
 from probe_kit.runs.store import Location, locate
@@ -82,19 +82,20 @@ def read_sheet(run: Path | Location, number: int) -> FrameSheet | None:
     Pictures of arrays that are no run are bound to nothing.
     """
     location, key = locate(run), thumbnail_key(number)
-    commit = read_own_commit(location, number)
-    promised = None if commit is None else pictures_of(commit)
-    if promised is not None and key not in promised:
-        return None
+    commit, name = None, f"{location}/{commit_key(number)}"
+    if location.exists(commit_key(number)):
+        commit = Commit.parse(location.read(commit_key(number)), name, redo(number), episode=number)
+        if key not in commit.pictures:
+            return None
     try:
         content = location.read(key)
     except FileNotFoundError:
-        if promised is None or not location.keys(FRAMES):
+        if commit is None or not location.keys(FRAMES):
             return None
         raise RunDamagedError(f"{location}/{key} is missing. {redo_picture(number)}") from None
-    if promised is not None and (problem := promised[key].problem(content)):
+    if commit is not None and (problem := commit.pictures[key].problem(content)):
         raise RunDamagedError(f"{location}/{key} {problem}. {redo_picture(number)}")
-    return FrameSheet(content, None if commit is None else commit.get(FRAME_COUNT))
+    return FrameSheet(content, None if commit is None else commit.frames)
 
 
 def thumbnail_key(number: int) -> str:

@@ -5,7 +5,7 @@
 Frames and channels are those of `probe_kit.env.scoring.trajectory`.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -16,18 +16,19 @@ from zarr.core.array_spec import ArrayConfigLike
 
 from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
 from probe_kit.errors import RunDamagedError
-from probe_kit.runs.arrays import codecs
-from probe_kit.runs.layout import TRAJECTORY
+from probe_kit.runs.arrays import ROOM, codecs
+from probe_kit.runs.commits import Commit
+from probe_kit.runs.layout import DATA, TRAJECTORY
 from probe_kit.runs.root import Root
 from probe_kit.runs.rows import Rows
 
 
-def create_trajectories(store: Store, episodes: int, frames: int, codec: str) -> None:
-    """Create the array at its final size: `frames` is one more than an episode has actions at most."""
+def create_trajectories(store: Store, frames: int, codec: str) -> None:
+    """Create the array: `frames` is one more than an episode has actions at most."""
     zarr.create_array(
         store,
         name=TRAJECTORY,
-        shape=(episodes, frames, len(CHANNELS)),
+        shape=(ROOM, frames, len(CHANNELS)),
         chunks=(1, frames, len(CHANNELS)),
         dtype="float32",
         fill_value=np.nan,
@@ -40,12 +41,12 @@ def create_trajectories(store: Store, episodes: int, frames: int, codec: str) ->
 
 def has_trajectories(root: Root) -> bool:
     """Whether the run was begun with room for them."""
-    return f"{TRAJECTORY}/zarr.json" in root.metadata
+    return f"{DATA}/{TRAJECTORY}/zarr.json" in root.sums
 
 
-def names_trajectory(commit: Mapping[str, Any]) -> bool:
+def names_trajectory(commit: Commit) -> bool:
     """Whether an episode's commit names a trajectory; one that did not act has none."""
-    return any(key.startswith(f"{TRAJECTORY}/") for key in commit["objects"])
+    return any(key.startswith(f"{TRAJECTORY}/") for key in commit.objects)
 
 
 def write_trajectory(store: Store, number: int, frames: NDArray[np.float32], config: ArrayConfigLike) -> None:

@@ -1,40 +1,52 @@
-"""Verification of a run: everything that the root and the commits list is compared with what is stored."""
+"""Verification of a run: every record, every object that records name, and with `deep` every reader.
 
-from collections.abc import Callable, Iterator, Mapping
+Reading refuses more than other bytes, such as probes in the folder of interventions. So deep verification calls
+the functions that read: it says no wherever one of them would.
+"""
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from itertools import batched
 from pathlib import Path
 
-from probe_kit.errors import RunDamagedError
+import numpy as np
+
+from probe_kit.errors import MissingExtraError, ProbeKitError, RunDamagedError
+from probe_kit.hooks.family import imported
+from probe_kit.runs.arrays import open_array
 from probe_kit.runs.certificates import read_certificate
-from probe_kit.runs.columns import Columns, find_columns
-from probe_kit.runs.commits import (
-    Commit,
-    committed_sizes,
-    numbered,
-    picture_problems,
-    read_commit,
-    read_failures,
-    redo,
-    stamp_of,
-    wrong_size,
-)
-from probe_kit.runs.deep import content_problems, reading_problems
+from probe_kit.runs.columns import find_columns
+from probe_kit.runs.commits import Commit, numbered, read_commit, read_failures
+from probe_kit.runs.contents import StoredObject, sizes_of, stored_objects, stray_keys
 from probe_kit.runs.label import read_label
-from probe_kit.runs.layout import COMMITS, DATA, PROVENANCE
-from probe_kit.runs.left_out import is_left_out
-from probe_kit.runs.orphans import stray_keys
-from probe_kit.runs.plans import RESTORE, count_plans
-from probe_kit.runs.provenance import read_provenances
-from probe_kit.runs.results import bundle_problems
+from probe_kit.runs.layout import COMMITS
+from probe_kit.runs.plans import count_plans
+from probe_kit.runs.provenance import check_provenances, read_provenances
+from probe_kit.runs.records import RESTORE, digest_of
+from probe_kit.runs.results import BUNDLES, bundle_keys, read_bundle
 from probe_kit.runs.root import Root, read_root
+from probe_kit.runs.rows import Rows
+from probe_kit.runs.run import Run
+from probe_kit.runs.sealing import columns_of_rows
 from probe_kit.runs.seconds import seconds_problems
 from probe_kit.runs.store import Location, locate
+
+_READERS = min(8, max(4, os.cpu_count() or 1))
+"""Objects that are read and hashed at once: both let other threads work."""
+_BATCH = 256
+_RESULT_READERS = (
+    "probe_kit.train.every_result:readers_of_results",
+    "probe_kit.intervene.results.inventory:readers_of_results",
+)
+"""Functions that give a reader per stored result of a run. They lie in folders above."""
 
 
 @dataclass(frozen=True)
 class Audit:
-    """What was found.
+    """The result of a verification.
 
     committed, planned: episodes. problems: one sentence each. sealed: whether columns belong to these commits.
     deep: whether every byte was read, not only sizes. strays: objects that belong to no part of the run and that
@@ -63,103 +75,157 @@ class Audit:
 
 
 def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
-    """Compare a run with what it says of itself.
+    """Compare a run with its records.
 
-    Structure, plan, metadata, commits, sizes, and what is derived; with `deep` every byte, columns against rows,
-    and every reader of the run and of its stored results. Problems are collected, not raised.
+    Records, the sizes of all objects, and their owners; with `deep` every byte, columns against rows, and every
+    reader of the run and of its stored results. Problems are collected, not raised.
     Raises RunNotFoundError if there is no run at `path`.
     """
     location = locate(path)
     while True:
         before = count_plans(location)
-        found = _audit(location, deep)
-        if found.ok or count_plans(location) == before:  # else it grew while it was compared
-            return found
+        audit = _audit(location, deep)
+        if audit.ok or count_plans(location) == before:  # else it grew while it was compared
+            return audit
 
 
 def _audit(location: Location, deep: bool) -> Audit:
     try:
         root = read_root(location)
         planned, _ = len(root.plan), root.streams
-    except RunDamagedError as error:  # nothing can be said of the rest
+    except RunDamagedError as error:  # nothing can be said of the other parts
         return Audit(str(location), 0, 0, 0, False, deep, (str(error),))
-    problems = list(_root_problems(root))
-    commits: dict[int, Commit] = {}
-    for number, key, raw in numbered(location, COMMITS):
+    problems: list[str] = []
+
+    def checked[T](read: Callable[[], T], otherwise: T) -> T:
+        """The part of the run that `read` reads; its error is kept as a problem."""
         try:
-            commits[number] = read_commit(root, number, key, raw)
+            return read()
         except RunDamagedError as error:
             problems.append(str(error))
-    problems += [] if problems else _caught(partial(root.check_room, commits))
-    problems += _commit_problems(root, commits)
-    problems += picture_problems(location, commits)
+            return otherwise
+
+    commits: dict[int, Commit] = {}
+    for number, key, raw in numbered(location, COMMITS):
+        if commit := checked(partial(read_commit, root, number, key, raw), None):
+            commits[number] = commit
+    try:
+        left_out = root.left_out
+    except RunDamagedError as error:  # whether objects are missing on purpose is not known
+        return Audit(str(location), len(commits), planned, 0, False, deep, (*problems, str(error)))
+    checked(lambda: _check_records(root, commits), None)
     problems += seconds_problems(root, commits)
-    problems += _caught(partial(read_label, root))
-    problems += _caught(lambda: root.left_out)
-    problems += _provenance_problems(root, commits)
-    if not planned:
-        return Audit(str(location), 0, 0, 0, False, deep, tuple(problems))
-    if commits:
-        problems += _caught(partial(read_certificate, root))
-    failures: dict[str, str] = {}
-    problems += _caught(lambda: failures.update(read_failures(root)))
-    columns = _columns(root, commits, problems)
-    if columns is not None:
-        problems += columns.problems()
-    problems += bundle_problems(location, deep, root.left_out)
-    if deep:
-        problems += content_problems(root, commits, columns, sound=not problems)
-        problems += [] if problems else reading_problems(root)
+    failures = checked(lambda: len(read_failures(root)), 0)
+    columns = checked(lambda: find_columns(root, commits), None)
+    for home in BUNDLES:
+        for key in bundle_keys(location, home):
+            checked(partial(read_bundle, location, home, key), None)
+    objects = list(stored_objects(root, commits, columns))
+    sizes = sizes_of(location, objects)
+    problems += filter(None, (stored.problem(sizes.get(stored.key)) for stored in objects))
+    problems += _content_problems(location, objects) if deep else _metadata_problems(root)
+    if deep and not problems and planned:
+        problems += _differences(Run(location)) if columns is not None else ()
+        problems += _reading_problems(root)
     return Audit(
         path=str(location),
         committed=len(commits),
         planned=planned,
-        failed=len(failures),
+        failed=failures,
         sealed=columns is not None,
         deep=deep,
         problems=tuple(problems),
-        strays=() if problems else tuple(stray_keys(root, commits, columns, stamp_of(commits))),
-        left_out=tuple(sorted(root.left_out)),
+        strays=() if problems else tuple(stray_keys(root, commits, columns)),
+        left_out=tuple(sorted(left_out)),
     )
 
 
-def _caught(look: Callable[[], object]) -> list[str]:
-    """What a look at a part of the run complains of."""
-    try:
-        look()
-    except RunDamagedError as error:
-        return [str(error)]
-    return []
+def _check_records(root: Root, commits: Mapping[int, Commit]) -> None:
+    """Raise RunDamagedError if label, provenances or certificates were changed or are lost."""
+    read_label(root)
+    check_provenances(read_provenances(root), {commit.provenance for commit in commits.values()}, root.location)
+    if commits:
+        read_certificate(root)
 
 
-def _root_problems(root: Root) -> Iterator[str]:
+def _metadata_problems(root: Root) -> Iterator[str]:
+    """Arrays whose metadata was changed; it is small and read by every opening."""
     for key in root.sums:
-        yield from _caught(partial(root.read, key))
+        try:
+            root.check_metadata(key)
+        except RunDamagedError as error:
+            yield str(error)
 
 
-def _commit_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
-    sizes = committed_sizes(root.location, commits)
-    for number, commit in commits.items():
-        for key, (length, *_) in commit["objects"].items():
-            problem = wrong_size(sizes, key, length)
-            if problem and not is_left_out(key, root.left_out):
-                yield f"{DATA}/{key} of episode {commit['episode_id']} {problem}. {redo(number)}"
+def _content_problems(location: Location, objects: Iterable[StoredObject]) -> Iterator[str]:
+    """Objects with other bytes than were written, in the order of `objects`. Other sizes were named before."""
+
+    def problem(stored: StoredObject) -> str | None:
+        try:
+            length, digest = digest_of(location.pieces(stored.key), stored.known.length)
+        except FileNotFoundError:
+            return None
+        if length != stored.known.length or digest == stored.known.digest:
+            return None
+        return f"{stored.key}{stored.owner} has other bytes than were written. {stored.advice}"
+
+    with ThreadPoolExecutor(_READERS) as readers:
+        for batch in batched(objects, _BATCH):
+            yield from filter(None, readers.map(problem, batch))
 
 
-def _provenance_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
-    try:
-        stored = read_provenances(root)
-    except RunDamagedError as error:
-        yield str(error)
+def _differences(run: Run) -> Iterator[str]:
+    """Columns that are not what the rows give, and what cannot be read."""
+    columns = run.columns
+    assert columns is not None
+    for stream in run.streams:
+        try:
+            for kind in run.root.vector_kinds:
+                array = columns.array(f"{stream}/{kind}")
+                for index, expected in columns_of_rows(run, stream, kind):
+                    if not np.array_equal(np.asarray(array[index]), expected, equal_nan=True):
+                        chunk = f"{columns.folder}/{stream}/{kind} at {index}"
+                        yield f"{chunk} is not what the rows give. {columns.advice}"
+        except RunDamagedError as error:
+            yield str(error)
+
+
+def _reading_problems(root: Root) -> Iterator[str]:
+    """The complaints of all readers of a run and of the results that are stored with it."""
+    run = Run(root.location)
+    yield from _complaints(run.check_records)
+    yield from _complaints(lambda: (run.episodes, run.items, run.failed))
+    if not run.commits():
         return
-    for name in sorted({commit["provenance"] for commit in commits.values()}):
-        if name not in stored:
-            yield f"{PROVENANCE}/{name}.json is missing; episodes name it as what they were made with. {RESTORE}"
+    for name in root.arrays:
+        if name not in root.left_out:
+            # Metadata of others may claim what no run has. One row shows that; the others have their hashes.
+            yield from _complaints(partial(_read_first, run, name))
+    if run.has_trajectories:
+        for row in range(len(run.episodes)):
+            yield from _complaints(partial(run.trajectory, row))
+    for name in _RESULT_READERS:
+        listing: Callable[[Run], Iterator[Callable[[], object]]] = imported(name)
+        try:
+            readers = list(listing(run))
+        except RunDamagedError as error:
+            yield str(error)
+            continue
+        for reader in readers:
+            yield from _complaints(reader)
 
 
-def _columns(root: Root, commits: Mapping[int, Commit], problems: list[str]) -> Columns | None:
+def _read_first(run: Run, name: str) -> None:
+    Rows(open_array(run.data, name), [min(commit.episode for commit in run.commits())])[0]
+
+
+def _complaints(reader: Callable[[], object]) -> Iterator[str]:
+    """The error of a reader, if it raises one. A library that is not installed is none of the run's."""
     try:
-        return find_columns(root, commits)
-    except RunDamagedError as error:
-        problems.append(str(error))
-        return None
+        reader()
+    except MissingExtraError:
+        return
+    except ProbeKitError as error:
+        yield str(error)
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, OSError) as error:
+        yield f"a stored result cannot be read ({type(error).__name__}: {error}). {RESTORE}"

@@ -17,21 +17,12 @@ from zarr.storage import MemoryStore
 
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.hashing import canonical_json
-from probe_kit.runs.arrays import at_extent, create_arrays
+from probe_kit.runs.arrays import ROOM, create_arrays
 from probe_kit.runs.certificates import write_certificate
-from probe_kit.runs.commits import (
-    FRAME_COUNT,
-    LENS_MARGINS,
-    Commit,
-    commit_key,
-    read_commit,
-    read_commits,
-    write_commit,
-    write_failure,
-)
+from probe_kit.runs.commits import Commit, commit_key, read_commit, read_commits, write_commit, write_failure
 from probe_kit.runs.growth import check_other_settings, further_rows
 from probe_kit.runs.inputs import create_inputs, write_inputs
-from probe_kit.runs.label import label_record
+from probe_kit.runs.label import Label
 from probe_kit.runs.layout import (
     COMMITS,
     DATA,
@@ -42,7 +33,7 @@ from probe_kit.runs.layout import (
     StoredStream,
     stored_inputs_of,
 )
-from probe_kit.runs.plans import grown_record, plan_key, while_growing
+from probe_kit.runs.plans import PlanRecord, grown_record, plan_key, while_growing
 from probe_kit.runs.provenance import (
     Provenance,
     check_other_provenance,
@@ -52,7 +43,7 @@ from probe_kit.runs.provenance import (
     read_provenances,
 )
 from probe_kit.runs.recording import RecordingStore
-from probe_kit.runs.records import Sum, as_record, record_hash
+from probe_kit.runs.records import Sum
 from probe_kit.runs.root import Root, new_root, read_root
 from probe_kit.runs.seconds import Seconds, write_seconds
 from probe_kit.runs.store import Location
@@ -163,18 +154,19 @@ class RunWriter[PlanT: WrittenPlan]:
         arrays: dict[str, Buffer] = {}
         store = MemoryStore(arrays)
         create_arrays(
-            store, list(self.plan.streams), 0, self.settings["captured_calls"], self._with_tokens,
+            store, list(self.plan.streams), self.settings["captured_calls"], self._with_tokens,
             self.settings["codec"], self.settings.get("later_views", "all"),
         )  # fmt: skip
         still = "ask" in self.settings or bool(self.settings.get("capture_only"))
         if "scene" in self.settings and not still:  # who is asked or captured does not move
             frames = self.settings["scene"]["max_steps"] + 1
-            create_trajectories(store, 0, frames, self.settings["codec"])
+            create_trajectories(store, frames, self.settings["codec"])
         if source := stored_inputs_of(self.settings):
             create_inputs(store, self.settings["captured_calls"], source["inputs"], self.settings["codec"])
-        objects = {f"{DATA}/{key}": at_extent(value.to_bytes(), 0) for key, value in arrays.items()}
-        root = new_root(self.settings, [self._without_length(one) for one in self.plan.streams], objects)
-        return {**objects, LABEL_FILE: label_record(record_hash(root), self._label), RUN_FILE: root}
+        objects = {f"{DATA}/{key}": value.to_bytes() for key, value in arrays.items()}
+        card = new_root(self.settings, [self._without_length(stream) for stream in self.plan.streams], objects)
+        label = Label(run=card.hash, label=self._label)
+        return {**objects, LABEL_FILE: label.to_bytes(), RUN_FILE: card.to_bytes()}
 
     def _without_length(self, stream: StoredStream) -> dict[str, Any]:
         """A stream as `run.json` has it: without its number of tokens, unless arrays are as long as that."""
@@ -187,7 +179,7 @@ class RunWriter[PlanT: WrittenPlan]:
         root.check_continuable()
         check_other_settings(root.own_settings, self.settings, str(self.location))
         self._check_lengths(root)
-        if self._lacks(root) or root.narrow:
+        if self._lacks(root):
             with self.location.held(lambda: None), self.location.tended(PLANS):
                 root = self._grown()
         root.check()
@@ -199,19 +191,20 @@ class RunWriter[PlanT: WrittenPlan]:
         return not root.plan or bool(further_rows(root.plan, rows, str(self.location)))
 
     def _grown(self) -> Root:
-        """The root, once the run plans all of this writer's episodes and has room for them. Room is only added."""
+        """The root, once the run plans all of this writer's episodes."""
         root = read_root(self.location)
         while self._lacks(root):
-            self.location.create(plan_key(len(root.stored_plan.extents)), self._record(root))
+            self.location.create(plan_key(len(root.stored_plan.extents)), self._record(root).to_bytes())
             root = read_root(self.location)  # ours, or that of a process that was first
-        while root.narrow:
-            for key, content in root.widened().items():
-                self.location.write(key, content)
-            root = read_root(self.location)  # another process may have let it grow further
         return root
 
     def _check_lengths(self, root: Root) -> None:
-        """Raise SettingsMismatchError for instructions that the arrays of all tokens are too short for."""
+        """Raise SettingsMismatchError for more episodes, or longer instructions, than the arrays have room for."""
+        if len(self.plan.episodes) > ROOM:
+            raise SettingsMismatchError(
+                f"a run holds at most {ROOM:,} episodes; this command plans {len(self.plan.episodes):,}. Ask for "
+                "fewer --items, or divide them between several runs"
+            )
         for stream in self.plan.streams if self._with_tokens else ():
             room = root.own_streams[stream.name].tokens
             if stream.tokens > room:
@@ -221,7 +214,7 @@ class RunWriter[PlanT: WrittenPlan]:
                     "than it began with. Choose another --out"
                 )
 
-    def _record(self, root: Root) -> bytes:
+    def _record(self, root: Root) -> PlanRecord:
         """The plan record that adds this writer's plan to the one of the run."""
         plan = self.plan.to_json()
         tokens = {} if self._with_tokens else {stream.name: stream.tokens for stream in self.plan.streams}
@@ -283,7 +276,7 @@ class RunWriter[PlanT: WrittenPlan]:
         self.write_certificate({})
         commit = self._write_objects(episode)
         write_seconds(self.root, number, episode.seconds)
-        if not write_commit(self.location, number, commit):
+        if not write_commit(self.location, commit):
             self._settle(episode, commit)
 
     def _settle(self, episode: EpisodeRecord, commit: Commit) -> None:
@@ -295,8 +288,8 @@ class RunWriter[PlanT: WrittenPlan]:
         key = commit_key(episode.planned.index)
         with self.location.tended(COMMITS):
             theirs = read_commit(self.root, episode.planned.index, key, self.location.read(key))
-            if any(theirs[part] != commit[part] for part in ("objects", "pictures")):
-                self.location.write(key, as_record(self._write_objects(episode)))
+            if (theirs.objects, theirs.pictures) != (commit.objects, commit.pictures):
+                self.location.write(key, self._write_objects(episode).to_bytes())
 
     def _write_objects(self, episode: EpisodeRecord) -> Commit:
         """Everything of an episode but its commit, which is returned."""
@@ -317,21 +310,25 @@ class RunWriter[PlanT: WrittenPlan]:
             self.location.write(key, content)
         pictures = {key: Sum.of(content) for key, content in episode.pictures.items()}
         self.location.flush(f"{DATA}/{key}" for key in store.sums)
-        return {
+        parts = {
             "run": self.root.identity,
             "episode": planned.index,
             "episode_id": planned.episode_id,
             "plan": self.root.stored_plan.hash_of(planned.index),
-            "outcome": episode.outcome,
-            "roles": episode.roles,
+            "outcome": dict(episode.outcome),
+            "roles": json.loads(json.dumps(episode.roles)),
             "provenance": name_of(self.provenance),
-            **({} if episode.instruction_ids is None else {"instruction_ids": list(episode.instruction_ids)}),
             "control_steps": [int(step) for step in episode.control_steps],
-            **({} if episode.lens_margins is None else {LENS_MARGINS: list(episode.lens_margins)}),
-            "objects": {key: one.to_json() for key, one in store.sums.items()},
-            "pictures": {key: one.to_json() for key, one in pictures.items()},
-            **({} if episode.frames is None else {FRAME_COUNT: episode.frames}),
+            "objects": {key: known.to_json() for key, known in store.sums.items()},
+            "pictures": {key: known.to_json() for key, known in pictures.items()},
         }
+        optional = {
+            "instruction_ids": None if episode.instruction_ids is None else list(episode.instruction_ids),
+            "lens_margins": None if episode.lens_margins is None else list(episode.lens_margins),
+            "frames": episode.frames,
+        }
+        stored = {name: value for name, value in optional.items() if value is not None}
+        return Commit.model_validate({**parts, **stored})
 
     def write_certificate(self, certificate: dict[str, Any]) -> None:
         """Record what was loaded and checked by this process, once; the whole of it stays from the first one."""

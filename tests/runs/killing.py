@@ -18,7 +18,8 @@ from zarr.storage import LocalStore
 from probe_kit.extract.plan import Plan, make_plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
-from probe_kit.runs import commits, sealing, writer
+from probe_kit.runs import sealing, writer
+from probe_kit.runs.commits import Commit
 from probe_kit.runs.layout import StoredStream
 from probe_kit.runs.store import Location, locate
 from probe_kit.suite import load_suite
@@ -57,7 +58,7 @@ def extract(run: str, plan: Plan) -> None:
 def die_at(point: str) -> None:
     """Arrange for a SIGKILL before or after an object or a commit of the third episode is written."""
     when, what = point.split("-")
-    put, commit = LocalStore.set, commits.create_once
+    put, commit = LocalStore.set, writer.write_commit
     calls = {"put": 0, "commit": 0}
 
     def reached(here: str, thing: str) -> None:
@@ -70,15 +71,15 @@ def die_at(point: str) -> None:
         await put(store, key, value)
         reached("after", "put")
 
-    def deadly_commit(location: Location, key: str, content: dict[str, object]) -> bool:
+    def deadly_commit(location: Location, content: Commit) -> bool:
         calls["commit"] += 1
         reached("before", "commit")
-        written = commit(location, key, content)
+        written = commit(location, content)
         reached("after", "commit")
         return written
 
     LocalStore.set = deadly_put
-    commits.create_once = deadly_commit
+    writer.write_commit = deadly_commit
 
 
 # Of four objects and one commit per episode.

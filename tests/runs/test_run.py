@@ -71,8 +71,8 @@ def test_bfloat16_bits_decode_exactly() -> None:
 
 def test_plain_zarr_and_plain_xarray_read_the_store(recorded_run: Run) -> None:
     pooled = zarr.open(recorded_run.path / "data.zarr", mode="r")["expert/pooled"]
-    assert pooled.shape == (48, 1, 10, recorded_run.streams["expert"].layers, 4, 64)
-    np.testing.assert_array_equal(pooled[:, 0, 7, 3, 0], recorded_run.column(Site("expert", 3, iteration=7)))
+    assert pooled.shape[1:] == (1, 10, recorded_run.streams["expert"].layers, 4, 64)
+    np.testing.assert_array_equal(pooled[:48, 0, 7, 3, 0], recorded_run.column(Site("expert", 3, iteration=7)))
     dataset = xr.open_zarr(recorded_run.path / "data.zarr", group="backbone", consolidated=False, chunks=None)
     assert dataset["pooled"].dims == ("episode", "call", "layer", "view", "feature")
 
@@ -109,7 +109,7 @@ def test_a_flipped_bit_is_an_error_and_never_a_number(damaged: Path) -> None:
 def test_a_missing_or_truncated_object_is_noticed_on_opening(damaged: Path) -> None:
     chunk = max((damaged / "data.zarr/expert/tokens/c/5").rglob("*"), key=lambda path: path.is_file())
     chunk.write_bytes(chunk.read_bytes()[:-1])
-    with pytest.raises(RunDamagedError, match="its commit says"):
+    with pytest.raises(RunDamagedError, match="were written"):
         open_run(damaged)
     chunk.unlink()
     with pytest.raises(RunDamagedError, match="is missing"):

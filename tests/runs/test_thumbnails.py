@@ -186,7 +186,7 @@ def test_a_commit_with_another_number_of_frames_is_damage(filmed: Run) -> None:
     commit = json.loads(stored)
     del commit[HASH]
     path.write_bytes(as_record({**commit, "frames": 0}))
-    with pytest.raises(RunDamagedError, match="0 as the number of its frames"):
+    with pytest.raises(RunDamagedError, match="frames is "):
         open_run(filmed.path)
     path.write_bytes(stored)
     assert verify_run(filmed.path, deep=True).ok

@@ -38,7 +38,7 @@ def test_every_episode_keeps_its_trajectory(recorded_run: Run) -> None:
 
 def test_a_trajectory_takes_a_few_kilobytes(recorded_run: Run) -> None:
     for commit in recorded_run.commits():
-        sizes = [size for key, (size, *_) in commit["objects"].items() if key.startswith("trajectory/")]
+        sizes = [size for key, (size, *_) in commit.objects.items() if key.startswith("trajectory/")]
         assert len(sizes) == 1
         assert sizes[0] < 4000
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.hashing import sha256_json
-from probe_kit.runs.arrays import at_extent, inner_chunks
+from probe_kit.runs.arrays import inner_chunks
 from probe_kit.runs.records import BLOCK_BYTES, HASH, Sum, as_record, block_digest
 
 
@@ -19,16 +19,12 @@ def rehash(run: Path) -> None:
     shutil.rmtree(run / "sealed", ignore_errors=True)
     root = _content(run / "run.json")
     metadata = sorted((run / "data.zarr").rglob("zarr.json"))
-    root["objects"] = {
-        path.relative_to(run).as_posix(): Sum.of(at_extent(path.read_bytes(), 0)).to_json() for path in metadata
-    }
+    root["objects"] = {path.relative_to(run).as_posix(): _sum(path).to_json() for path in metadata}
     identity = _write(run / "run.json", root)
-    former: str | None = None
     plans: dict[int, str] = {}
     for path in sorted((run / "plan").glob("*.json")):
-        plan = {**_content(path), "run": identity, "former": former}
-        former = _write(path, plan)
-        plans |= {row["episode"]: former for row in plan["episodes"]}
+        plan = {**_content(path), "run": identity}
+        plans |= dict.fromkeys((row["episode"] for row in plan["episodes"]), _write(path, plan))
     for path in [run / "label.json", *sorted((run / "times").glob("*.json"))]:
         _write(path, {**_content(path), "run": identity})
     for path in sorted((run / "commits").glob("*.json")):

@@ -10,7 +10,6 @@ from probe_kit._system.machine import same_scheduling
 from probe_kit._system.optional_dependencies import require
 from probe_kit.env.scoring.trajectory import MOTION, STATE
 from probe_kit.errors import UsageError
-from probe_kit.runs.commits import FRAME_COUNT
 from probe_kit.runs.run import Run
 from probe_kit.runs.small_frames import SmallFrames
 from probe_kit.runs.thumbnails import decode_frames, read_sheet
@@ -73,9 +72,9 @@ def _filmed_episodes(run: Run) -> Iterator[tuple[dict[str, Any], SmallFrames]]:
     """
     rows = run.episodes.to_dict("records")
     for commit in run.commits():
-        if FRAME_COUNT not in commit:
+        if commit.frames is None:
             raise UsageError(
-                f"{run.location} does not keep every frame of episode {commit['episode_id']}. Extract it again to "
+                f"{run.location} does not keep every frame of episode {commit.episode_id}. Extract it again to "
                 "another --out, with --frames all"
             )
     for row in rows:

@@ -99,16 +99,16 @@ def blocks(run: Run, choices: Sequence[StreamChoice]) -> Iterator[Block]:
         for choice in choices:
             own = {kind: rows[choice.name, kind] for kind in kinds if (choice.name, kind) in rows}
             if is_tokens(choice.views[0]):
-                yield from _token_blocks(own[TOKENS], choice, position, commit["roles"])
+                yield from _token_blocks(own[TOKENS], choice, position, commit.roles)
             else:
-                yield from _pooled_blocks(run, own, choice, position, len(commit["roles"]))
+                yield from _pooled_blocks(run, own, choice, position, len(commit.roles))
 
 
 def count_vectors(run: Run, choice: StreamChoice) -> int:
     """Vectors of each site, over all views. Reads no activations."""
     total = 0
     for commit in run.commits():
-        for inference, spans in enumerate(commit["roles"]):
+        for inference, spans in enumerate(commit.roles):
             for view in choice.views:
                 if is_tokens(view):
                     total += chosen_tokens(spans[choice.name], view)[0].size
@@ -151,13 +151,13 @@ def _views(run: Run, stream: str, view: str | None) -> tuple[str, ...]:
 
 
 def _plays_any(run: Run, stream: str, view: str) -> bool:
-    return any(chosen_tokens(spans[stream], view)[0].size for commit in run.commits() for spans in commit["roles"])
+    return any(chosen_tokens(spans[stream], view)[0].size for commit in run.commits() for spans in commit.roles)
 
 
 def _tokens(run: Run) -> str:
     if run.settings["tokens"] == "all":
         roles = {
-            role for one in run.commits() for spans in one["roles"] for own in spans.values() for role, *_ in own
+            role for one in run.commits() for spans in one.roles for own in spans.values() for role, *_ in own
         }
         return f", {TOKENS} and {TOKENS}:ROLE of {', '.join(sorted(roles - {PADDING}))}"
     return "; every token only in runs extracted with --tokens all"

@@ -165,10 +165,10 @@ def _delivered(run: Any, view: str) -> dict[str, tuple[Any, list[int]]]:
     """By episode, the instruction's tokens as the model was delivered them, and the positions of a view."""
     role, found = view.partition(":")[2], {}
     for commit in run.commits():
-        spans = [span for span in commit["roles"][0]["backbone"] if span[0] != PADDING]
+        spans = [span for span in commit.roles[0]["backbone"] if span[0] != PADDING]
         first = min(start for _, start, _ in spans)
         pooled = [range(start - first, end - first) for name, start, end in spans if role in ("", name)]
-        found[commit["episode_id"]] = commit.get("instruction_ids"), [at for span in pooled for at in span]
+        found[commit.episode_id] = commit.instruction_ids, [at for span in pooled for at in span]
     return found
 
 

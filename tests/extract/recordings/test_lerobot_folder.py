@@ -438,7 +438,7 @@ def test_an_interrupted_run_continues_with_the_same_bytes(
     with pytest.raises(EnoughError):
         prepare(settings(recording), policy=pi0_tiny).run(tmp_path / "run", progress=stop)
     again = prepare(settings(recording), policy=pi0_tiny).run(tmp_path / "run")
-    assert [one["objects"] for one in again.commits()] == [one["objects"] for one in run.commits()]
+    assert [one.objects for one in again.commits()] == [one.objects for one in run.commits()]
 
 
 def test_the_python_interface_is_that_of_the_command_line(recording: Path, tmp_path: Path) -> None:
