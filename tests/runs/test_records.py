@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from probe_kit.errors import DiskSpaceError, RunDamagedError
@@ -45,6 +45,7 @@ def test_another_spelling_of_the_same_values_is_the_same_record(spell) -> None:
     assert read_record(spell(content), "it", "do") == content
 
 
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.dictionaries(st.text(), VALUES, max_size=4), st.data())
 def test_a_changed_byte_is_refused_or_changes_no_value(content: dict[str, object], data: st.DataObject) -> None:
     content.pop(HASH, None)
