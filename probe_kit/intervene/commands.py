@@ -97,6 +97,33 @@ Coefficients = Annotated[
 TargetSide = Annotated[
     str | None, _inside_option("--target-side", help="Target side: wrong, correct, left or right.")
 ]
+_pairs_option = partial(typer.Option, rich_help_panel="Recordings and your own environment")
+Vary = Annotated[
+    str | None,
+    _pairs_option(
+        "--vary",
+        metavar="INPUT",
+        help="Input that the source has of another frame: instruction, picture, picture.CAMERA or state.",
+    ),
+]
+FramesEach = Annotated[
+    int | None, _pairs_option("--frames", help="Frames of each episode, evenly spaced. Default: 4.", min=1)
+]
+PairTable = Annotated[
+    Path | None,
+    _pairs_option(
+        "--pairs",
+        metavar="FILE",
+        help="Table of pairs of your own, with the columns episode, frame, donor_episode, donor_frame.",
+    ),
+]
+DatasetFolder = Annotated[
+    Path | None, _pairs_option("--dataset", metavar="FOLDER", help="Folder of the recordings, if it was moved.")
+]
+EnvOptions = Annotated[
+    list[str] | None,
+    _pairs_option("--env-option", metavar="NAME=VALUE", help="Option of the environment. Repeat for several."),
+]
 ReadoutName = Annotated[
     Readout,
     further_option(
@@ -161,6 +188,11 @@ def intervene(
     model_options: common.ModelOptions = None,
     weights_seed: WeightsSeed = None,
     scene_files: SceneFiles = None,
+    vary: Vary = None,
+    frames: FramesEach = None,
+    pairs: PairTable = None,
+    dataset: DatasetFolder = None,
+    env_options: EnvOptions = None,
     wording: common.Wording = None,
     device: common.Device = "cpu",
     style: common.Format = "table",
@@ -175,12 +207,16 @@ def intervene(
     probe-kit intervene runs/mine
     probe-kit intervene runs/mine --kind interchange --sites "backbone.*"
     """
-    from probe_kit.hooks.contract.options import read_pairs
+    from probe_kit.hooks.contract.options import read_pairs as read_options
     from probe_kit.intervene import ReplaySource
+    from probe_kit.intervene.sessions.pair_table import read_pairs
     from probe_kit.runs import open_run
 
     opened = open_run(run, allow_partial=partial).in_wording(wording)
-    of_every_kind = {"categories": categories, "items": items, "readout": readout}
+    of_every_kind: dict[str, Any] = {
+        "categories": categories, "items": items, "readout": readout, "vary": vary or "", "frames": frames,
+        "pairs": () if pairs is None else read_pairs(pairs),
+    }  # fmt: skip
     inside: dict[str, Any] = {
         "sites": sites, "roles": roles, "direction": direction, "controls": controls,
         "coefficients": coefficients, "target_side": target_side, "seed": seed or None,
@@ -189,13 +225,18 @@ def intervene(
     check_options(kind, given)
     intervention = kind_of(kind).from_options(opened, **of_every_kind, **given)
     intervention.check_run(opened)
-    files = {name: Path(str(place)) for name, place in read_pairs(scene_files or []).items()}
-    source = ReplaySource(suite, checkpoint, read_pairs(model_options or []), weights_seed, device, files)
+    files = {name: Path(str(place)) for name, place in read_options(scene_files or []).items()}
+    source = ReplaySource(
+        suite, checkpoint, read_options(model_options or []), weights_seed, device, files, dataset,
+        read_options(env_options or []),
+    )  # fmt: skip
     result = _run(opened, intervention, source)
     print_result(result, style, details)
     if style == "table":
-        say(marked("next: [bold]probe-kit retention {}[/]  use beside probes and success", run))
-    say(marked("stored as {}; next: [bold]probe-kit retention {}[/]", result.key, run))
+        following = "retention {}[/]  use beside probes and success"
+        following = following if result.outcomes.has_sides else "view {}[/]  what the run shows"
+        say(marked(f"next: [bold]probe-kit {following}", run))
+    say(marked("stored as {}", result.key))
 
 
 def check_options(name: str, options: Mapping[str, Any]) -> None:

@@ -40,9 +40,15 @@ ERASE, PROBE_ACCURACY = "erase", "probe_accuracy"
 """A kind, and what its certificate calls what probes read behind its conditions."""
 ATTENTION, RECORDED, ATTENTION_FILE = "attention", "recorded", "attention.npz"
 """A kind, its condition with recorded weights, and the file in which they are."""
-UNCHANGED = frozenset({CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, RECORDED})
+DONOR, CONTROL_INPUT = "frame_swap", "control_input"
+"""Conditions without sides: all inputs of the donor, and a change of the input that means nothing."""
+UNCHANGED = frozenset({CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, RECORDED, DONOR, CONTROL_INPUT})
 """Conditions in which nothing inside the network is changed."""
 EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
+
+
+BY_CONDITION = ("displacement", "max_action_change", "edit_log", "episode_outcomes", "toward", "size")
+"""Arrays with conditions along their first axis."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +58,9 @@ class ConditionOutcomes:
     conditions: names of the K, the clean one first. episodes, items, groups, categories, sides: (E,), `sides`
     those of the correct picture. displacement: (K, E) metres from the middle, left positive. max_action_change:
     (K, E) largest difference of any action from the clean one's. edit_log: (K, E, 5), see `LOG_FIELDS`.
-    replay_error: (E,) of the clean one from the stored one. episode_outcomes: (K, E) correct, wrong or oob, where
-    episodes were played to their end; else None.
+    replay_error: (E,) of the clean one from the stored one. toward, size: (K, E) displacement toward the source's
+    action and size of the change, in spreads of clean actions; None where whole episodes were played.
+    episode_outcomes: (K, E) correct, wrong or oob, where episodes were played to their end; else None.
     """
 
     conditions: tuple[str, ...]
@@ -67,6 +74,13 @@ class ConditionOutcomes:
     edit_log: NDArray[np.float64]
     replay_error: NDArray[np.float64]
     episode_outcomes: NDArray[np.str_] | None = None
+    toward: NDArray[np.float64] | None = None
+    size: NDArray[np.float64] | None = None
+
+    @property
+    def has_sides(self) -> bool:
+        """Whether the correct picture lies on a side; else displacements are toward the source's action."""
+        return bool(self.sides.size) and bool(self.sides[0])
 
     def of(self, condition: str) -> NDArray[np.float64]:
         """(E,) lateral of one condition."""
@@ -74,7 +88,7 @@ class ConditionOutcomes:
 
     @property
     def correct_sign(self) -> NDArray[np.float64]:
-        """(E,) +1 where the correct picture lies left, −1 where it lies right."""
+        """(E,) +1 where the correct picture lies left, −1 where it lies right, or where nothing has a side."""
         return np.where(self.sides == "left", 1.0, -1.0)
 
     def only(self, category: str) -> "ConditionOutcomes":
@@ -83,7 +97,7 @@ class ConditionOutcomes:
 
     def of_episodes(self, chosen: NDArray[np.bool_]) -> "ConditionOutcomes":
         """Some of the episodes. chosen: (E,)."""
-        axes = {"displacement": 1, "max_action_change": 1, "edit_log": 1, "episode_outcomes": 1}
+        axes = dict.fromkeys(BY_CONDITION, 1)
         cut: dict[str, Any] = {
             name: np.compress(chosen, value, axes.get(name, 0))
             for name, value in vars(self).items()

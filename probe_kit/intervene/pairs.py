@@ -30,7 +30,9 @@ class Pair:
 
     Pairs of a run have more. row, episode, category: of the run. side: of the correct picture; None without sides.
     tiles: (H, W) where each tile is seen in the clean picture. stored: (n, D) actions of the clean inference that
-    the run has, None where it does not say. step: which inference of the episode it is.
+    the run has, None where it does not say. step: which inference of the episode it is, or the recorded frame.
+    donor: of frames without sides, the other frame of which the source has one input. control: the clean one after
+    a change of that input that means nothing.
     """
 
     clean: Given
@@ -43,6 +45,8 @@ class Pair:
     episode: str = ""
     category: str = ""
     side: Side | None = None
+    donor: Given | None = None
+    control: Given | None = None
     tiles: Mapping[Side, NDArray[np.bool_]] = field(default=MappingProxyType({}), repr=False)
     stored: Chunk | None = field(default=None, repr=False)
     step: int = 0

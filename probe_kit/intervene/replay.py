@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS, EditLog
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP
+from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP
 from probe_kit.intervene.pairs import Chunk, Pair
 from probe_kit.intervene.patching.patch import Cell, patched
 
@@ -92,6 +92,30 @@ class SourceRun:
 
 
 @dataclass(frozen=True)
+class DonorRun:
+    """The donor's inference with the same seed: all inputs are its own."""
+
+    name: str = DONOR
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Infer with all of the donor's inputs."""
+        assert context.pair.donor is not None
+        return ConditionResult(context.session.act(context.pair.donor, context.pair.seed))
+
+
+@dataclass(frozen=True)
+class ControlInput:
+    """The clean inference after a change of the varied input that means nothing."""
+
+    name: str = CONTROL_INPUT
+
+    def play(self, context: ConditionContext) -> ConditionResult:
+        """Infer with the control."""
+        assert context.pair.control is not None
+        return ConditionResult(context.session.act(context.pair.control, context.pair.seed))
+
+
+@dataclass(frozen=True)
 class Patched:
     """The clean inference with activations of cells from the source's.
 
@@ -121,23 +145,25 @@ class Patched:
 
 AttentionRecord = tuple[int, int, NDArray[np.float32]]
 """The attention of one inference: row in the run's episodes, call, (B, I, H, R) shares."""
-_BY_CONDITION = ("displacement", "max_action_change", "edit_log", "episode_outcomes")
+_BY_CONDITION = ("displacement", "max_action_change", "edit_log", "episode_outcomes", "chunks")
 
 
 @dataclass(frozen=True)
 class ReplayBatch:
     """The numbers of K conditions in E episodes.
 
-    rows: (E,) in the run's episodes. displacement: (K, E) see `ReplaySession.displacement`. max_action_change:
-    (K, E) the largest difference of any action from the clean one's. edit_log: (K, E, 5) see `LOG_FIELDS`.
-    replay_error: (E,) of the clean inference from the stored one; NaN where the run does not say.
-    episode_outcomes: (K, E) where the cube ended, correct, wrong or oob, for episodes that were played to their
-    end; then `displacement` is the cube's, and `max_action_change` and `replay_error` are of the trajectory; None
-    where nothing was executed. mass: (N, B, I, H, R) the attention of N inferences, inferences: (N, 2) their rows
-    and calls; None where attention was not recorded.
+    rows: (E,) in the run's episodes. steps: (E,) of their inferences. displacement: (K, E) see
+    `ReplaySession.displacement`. max_action_change: (K, E) the largest difference of any action from the clean
+    one's. edit_log: (K, E, 5) see `LOG_FIELDS`. replay_error: (E,) of the clean inference from the stored one; NaN
+    where the run does not say. episode_outcomes: (K, E) where the cube ended, correct, wrong or oob, for episodes
+    that were played to their end; then `displacement` is the cube's, and `max_action_change` and `replay_error`
+    are of the trajectory; None where nothing was executed. mass: (N, B, I, H, R) the attention of N inferences,
+    inferences: (N, 2) their rows and calls; None where attention was not recorded. chunks: (K, E, N) all numbers
+    of the actions of first inferences.
     """
 
     rows: NDArray[np.int64]
+    steps: NDArray[np.int64]
     displacement: NDArray[np.float64]
     max_action_change: NDArray[np.float64]
     edit_log: NDArray[np.float64]
@@ -145,6 +171,7 @@ class ReplayBatch:
     episode_outcomes: NDArray[np.str_] | None = None
     mass: NDArray[np.float32] | None = None
     inferences: NDArray[np.int64] | None = None
+    chunks: NDArray[np.float32] | None = None
 
     def with_mass(self, attention_records: "Sequence[AttentionRecord]") -> "ReplayBatch":
         """Return the same with the attention of its inferences, if any was recorded."""
@@ -158,8 +185,8 @@ class ReplayBatch:
         """Return room for the numbers of these conditions in these pairs."""
         shape = len(conditions), len(pairs)
         log = np.zeros((*shape, len(LOG_FIELDS)))
-        rows = np.array([pair.row for pair in pairs], np.int64)
-        return cls(rows, np.empty(shape), np.zeros(shape), log, np.empty(len(pairs)))
+        rows, steps = (np.array([getattr(pair, name) for pair in pairs], np.int64) for name in ("row", "step"))
+        return cls(rows, steps, np.empty(shape), np.zeros(shape), log, np.empty(len(pairs)))
 
     @property
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -181,15 +208,19 @@ def replay(session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence
     """Play every condition on every pair; the first one is the clean one."""
     batch = ReplayBatch.empty(pairs, conditions)
     attention_records: list[AttentionRecord] = []
+    chunks: list[list[Chunk]] = []
     for column, pair in enumerate(pairs):
         context = ConditionContext(session, pair)
         clean = context.clean = conditions[0].play(context).chunk
         batch.replay_error[column] = session.replay_error(pair, clean)
+        chunks.append([])
         for number, condition in enumerate(conditions):
             played = condition.play(context) if number else ConditionResult(clean)
             batch.displacement[number, column] = session.displacement(played.chunk, pair) + played.estimated
             batch.max_action_change[number, column] = float(np.abs(played.chunk - clean).max())
+            chunks[-1].append(played.chunk.ravel())
             if played.edit_log is not None:
                 batch.edit_log[number, column] = played.edit_log.row()
             attention_records += [] if played.mass is None else [(pair.row, pair.step, played.mass)]
-    return batch.with_mass(attention_records)
+    by_condition = np.array(chunks, np.float32).swapaxes(0, 1) if chunks else None
+    return replace(batch.with_mass(attention_records), chunks=by_condition)

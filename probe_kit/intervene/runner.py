@@ -12,7 +12,7 @@ from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.kinds.base import ConditionName, Intervention, Measurement
 from probe_kit.intervene.kinds.image_swap import ImageSwap, tiles_apart
 from probe_kit.intervene.kinds.interchange import Interchange
-from probe_kit.intervene.outcomes import ConditionOutcomes, is_stored, save
+from probe_kit.intervene.outcomes import DONOR, IMAGE_SWAP, ConditionOutcomes, is_stored, save
 from probe_kit.intervene.places import check_roles_have_tokens, resolve_sites, unread_places
 from probe_kit.intervene.replay import Condition, ReplayBatch
 from probe_kit.intervene.results.results import InterventionResult, effects_csv, load_effects
@@ -20,7 +20,8 @@ from probe_kit.intervene.results.verdict import groups_for_not_used
 from probe_kit.intervene.rollout import evaluate_per_step
 from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.intervene.sessions.session import LoadPolicy, Progress, ReplaySession, ReplaySource
-from probe_kit.intervene.settings import PER_STEP, check_run_fits, key_of, settings_of
+from probe_kit.intervene.settings import PER_STEP, check_run_fits, has_sides, key_of, settings_of
+from probe_kit.intervene.toward import displacements_toward, sizes
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.results import tidy_bundle
 from probe_kit.runs.resume_pieces import Pieces
@@ -71,7 +72,7 @@ def _execute(
 ) -> None:
     pieces = Pieces.of(run.location, INTERVENTIONS, key, run.stamp, REDO)
     wanted, patterns = intervention.items_in(run), _patterns(settings)
-    with open_session(run, source, load) as session, session.ready():
+    with open_session(run, source, load, intervention) as session, session.ready():
         session.on_fit_progress = on_fit_progress or notebook_progress("items learnt from")
         _check_roles(session, settings, getattr(type(intervention), "roles", Interchange.roles))
         items = intervention.eligible_items(session, wanted)
@@ -139,7 +140,7 @@ def too_few_groups(run: Run, intervention: Intervention) -> dict[str, int]:
 
     Empty for other kinds; see `groups_for_not_used`.
     """
-    if not isinstance(intervention, ImageSwap):
+    if not isinstance(intervention, ImageSwap) or not has_sides(run):
         return {}
     asked = run.episodes[run.episodes["item_id"].isin(intervention.items_in(run))]
     counts = asked.groupby("category", sort=False)["group_id"].nunique()
@@ -181,22 +182,37 @@ def _replay_item(
 def outcomes_of(run: Run, conditions: Sequence[str], found: ReplayBatch) -> ConditionOutcomes:
     """What K conditions gave, and for which episodes. conditions: names of the K, the clean one first."""
     rows = run.episodes.iloc[found.rows]
-    columns = {
-        own: rows[name].to_numpy(dtype=str)
-        for own, name in (
+    columns: dict[str, Any] = {
+        field: rows[name].to_numpy(dtype=str)
+        for field, name in (
             ("episodes", "episode_id"), ("items", "item_id"), ("groups", "group_id"), ("categories", "category"),
-            ("sides", "side_correct"),
         )
     }  # fmt: skip
+    columns["sides"] = rows["side_correct"].to_numpy(dtype=str) if has_sides(run) else np.full(len(rows), "")
+    if run.recorded:
+        names = zip(columns["episodes"], found.steps, strict=True)
+        columns["episodes"] = np.array([f"{episode}@{frame}" for episode, frame in names])
+    toward, size = _toward(conditions, found)
+    sided = has_sides(run) or toward is None
     return ConditionOutcomes(
         conditions=tuple(conditions),
         **columns,
-        displacement=found.displacement,
+        displacement=found.displacement if sided else toward,
+        toward=toward,
+        size=size,
         max_action_change=found.max_action_change,
         edit_log=found.edit_log,
         replay_error=found.replay_error,
         episode_outcomes=found.episode_outcomes,
     )
+
+
+def _toward(conditions: Sequence[str], batch: ReplayBatch) -> tuple[Any, Any]:
+    """Return (K, E) displacements toward the source's action, of all its inputs if they were played, and sizes."""
+    references = [name for name in (DONOR, IMAGE_SWAP) if name in conditions]
+    if batch.chunks is None or not references:
+        return None, None if batch.chunks is None else sizes(batch.chunks)
+    return displacements_toward(batch.chunks, list(conditions).index(references[0])), sizes(batch.chunks)
 
 
 def _replay_check(found: ReplayBatch) -> dict[str, Any]:

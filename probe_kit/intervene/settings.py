@@ -7,14 +7,36 @@ from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.runs.run import Run
-from probe_kit.runs.scene_only import check_scene_run
 
 FORMAT = 2  # raise when stored numbers would be others
 FIRST_CHUNK: Readout = "first-chunk"
 PER_STEP: Readout = "per-step"
 
 
-class Asked(Protocol):
+PairRow = tuple[str, int, str, int]
+"""Episode and frame of the clean inference, and of its donor."""
+
+
+class PairChoice(Protocol):
+    """The pairs that an intervention takes of a run without sides."""
+
+    @property
+    def varied(self) -> str:
+        """The input that the source has of its donor."""
+
+    @property
+    def frames(self) -> int | None:
+        """So many frames of each episode, evenly spaced."""
+
+    @property
+    def pairs(self) -> tuple[PairRow, ...]:
+        """Pairs of the user's own; empty for donors that are chosen here."""
+
+    def items_in(self, run: Run) -> list[str]:
+        """Return the items of a run that are replayed."""
+
+
+class Asked(PairChoice, Protocol):
     """The settings of an intervention, of whichever kind; see `kinds.base.Intervention`."""
 
     kind: ClassVar[str]
@@ -69,8 +91,18 @@ def settings_of(intervention: Asked, run: Run) -> dict[str, Any]:
         "categories": list(categories_in(run, intervention.categories)),
         "items": intervention.items,
         "readout": intervention.readout,
+        **({} if has_sides(run) else _pairs_of(intervention)),
         **intervention.parameters(),
     }
+
+
+def _pairs_of(choice: PairChoice) -> dict[str, Any]:
+    return {"vary": choice.varied, "frames": choice.frames, "pairs": [list(row) for row in choice.pairs]}
+
+
+def has_sides(run: Run) -> bool:
+    """Whether a run's questions have a correct picture on a side: it was played in the scene."""
+    return not (run.recorded or run.in_own_environment)
 
 
 def key_of(settings: Mapping[str, Any]) -> str:
@@ -80,14 +112,15 @@ def key_of(settings: Mapping[str, Any]) -> str:
 
 def check_run_fits(run: Run) -> None:
     """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
-    check_scene_run(run, "an intervention")
     settings = run.settings
     why = None
     if "ask" in settings:
         why = f"{run.model} was asked and did not act; intervene on a run of `probe-kit extract`"
     elif run.weights_sha256 is None or not run.streams:
         why = f"{run.model} is scripted: it has no network in which anything could be changed"
-    elif run.capture_only:
+    elif not has_sides(run) and run.inputs is None:
+        why = "it stores no inputs, with which a repeated observation could be compared"
+    elif run.capture_only and not run.recorded:
         why = (
             f"{run.model} only captured activations (--no-act): no action was stored with which the effect of a "
             "change could be compared. Extract a run without --no-act, of a checkpoint whose actions move this arm"

@@ -195,6 +195,10 @@ class LeRobotSource(SourceSettings):
         """The name in tables; where the folder lies is no part of a run."""
         return Path(self.folder).expanduser().resolve().name if self.is_local else self.folder.partition("@")[0]
 
+    def files(self) -> dict[str, Path]:
+        """Return the folder of recordings that lie here."""
+        return {"dataset": Path(self.folder).expanduser()} if self.is_local else {}
+
     def marks(self) -> list[str]:
         """The part of a run's label that names the source."""
         return [f"on {self.name}"]

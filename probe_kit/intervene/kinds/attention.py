@@ -21,6 +21,7 @@ from probe_kit.intervene.outcomes import ATTENTION, ATTENTION_FILE, RECORDED, Ef
 from probe_kit.intervene.places import ALL, TILE_ROLES, roles_of
 from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, ReplayBatch
 from probe_kit.intervene.selection import StoredResult, stored_results
+from probe_kit.intervene.settings import has_sides
 from probe_kit.intervene.tokens import TILES, role_token_mask
 from probe_kit.runs.run import Run
 from probe_kit.statistics.bootstrap import GAINS, units_seed
@@ -97,11 +98,11 @@ class AttentionReadout(Intervention):
             own: rows[name].to_numpy(dtype=str)
             for own, name in (
                 ("episodes", "episode_id"), ("groups", "group_id"), ("categories", "category"),
-                ("sides", "side_correct"),
             )
         }  # fmt: skip
+        sides = rows["side_correct"].to_numpy(dtype=str) if has_sides(run) else np.full(len(rows), "")
         attention_records = AttentionShares(
-            recording.roles, **columns, calls=batch.inferences[:, 1], mass=batch.mass
+            recording.roles, **columns, sides=sides, calls=batch.inferences[:, 1], mass=batch.mass
         )
         return {ATTENTION_FILE: attention_records.to_bytes()}
 

@@ -75,16 +75,16 @@ _LEGEND = (
 class Estimated:
     """No inference: the clean action, and by how much an estimate says that patching a cell moves it.
 
-    by_row: displacement by the row of the run's episodes. is_drawn: whether the cell was drawn for an exact patch.
+    by_row: displacement by row and step of the run. is_drawn: whether the cell was drawn for an exact patch.
     """
 
     name: str
-    by_row: Mapping[int, float] = field(repr=False)
+    by_row: Mapping[tuple[int, int], float] = field(repr=False)
     is_drawn: bool = False
 
     def play(self, context: ConditionContext) -> ConditionResult:
         """Return the clean action with the estimate; nothing is played."""
-        return ConditionResult(context.clean, estimated=self.by_row[context.pair.row])
+        return ConditionResult(context.clean, estimated=self.by_row[context.pair.row, context.pair.step])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,7 +157,7 @@ class AttributionPatching(Intervention):
         estimated = [
             Estimated(
                 f"{ESTIMATE}|{cell.place.name}|{cell.role}",
-                {row: float(by_cell[at]) for row, by_cell in rows.items()},
+                {at_row: float(by_cell[at]) for at_row, by_cell in rows.items()},
                 cell in drawn,
             )
             for at, cell in enumerate(every)
@@ -172,10 +172,10 @@ class AttributionPatching(Intervention):
 
     def _estimates(
         self, session: "ReplaySession", cells: Sequence[Cell]
-    ) -> tuple[dict[int, NDArray[np.float64]], list[NDArray[np.float64]]]:
-        """Return (C,) estimates by row of the run's episodes, and by category (C,) shares of the image swap."""
-        rows: dict[int, NDArray[np.float64]] = {}
-        wholes: dict[str, list[tuple[float, int]]] = {}
+    ) -> tuple[dict[tuple[int, int], NDArray[np.float64]], list[NDArray[np.float64]]]:
+        """Return (C,) estimates by row and step of the run, and by category (C,) shares of the image swap."""
+        rows: dict[tuple[int, int], NDArray[np.float64]] = {}
+        wholes: dict[str, list[tuple[float, tuple[int, int]]]] = {}
         items = self.items_in(session.run)
         for number, item in enumerate(items):
             for pair in session.pairs(item):
@@ -183,8 +183,8 @@ class AttributionPatching(Intervention):
                     session.policy, pair, cells, session.slope(pair), self.ends, session.act
                 )
                 clean, moved = (session.displacement(chunk, pair) for chunk in estimates[:2])
-                rows[pair.row] = estimates.by_cell
-                wholes.setdefault(pair.category, []).append((moved - clean, pair.row))
+                rows[pair.row, pair.step] = estimates.by_cell
+                wholes.setdefault(pair.category, []).append((moved - clean, (pair.row, pair.step)))
             if session.on_fit_progress is not None:
                 session.on_fit_progress(number + 1, len(items), item)
         shares = []
@@ -228,10 +228,10 @@ class AttributionPatching(Intervention):
         ]
         return effect_table(
             "; ".join([f"Which places to patch? {context.subject}, gradients", *void]),
-            _LEGEND,
+            context.in_words(_LEGEND),
             "category · cell",
             lines_of(rows, lambda row: row.name),
-            {"Share of the image swap": _COLUMNS},
+            {context.in_words("Share of the image swap"): _COLUMNS},
             lambda row: row.is_anchor,
         )
 

@@ -20,7 +20,7 @@ from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
 from probe_kit.intervene.places import SEPARATOR
 from probe_kit.intervene.replay import Condition, ReplayBatch, replay
-from probe_kit.intervene.settings import FIRST_CHUNK, categories_in, items_of
+from probe_kit.intervene.settings import FIRST_CHUNK, PairRow, categories_in, has_sides, items_of
 from probe_kit.intervene.tokens import TILES
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import max_t
@@ -88,6 +88,7 @@ class TableContext:
     """The words of a table besides its rows. subject: model and suite. verdicts: by category.
 
     legend: of the verdicts. explains: whether the caption says what each verdict rests on, as sentences do.
+    exchange: the change of inputs that effects are shares of.
     """
 
     measurement: Measurement
@@ -95,6 +96,16 @@ class TableContext:
     verdicts: Mapping[str, CategoryVerdict] = MappingProxyType({})
     legend: str = ""
     explains: bool = True
+    exchange: str = "image swap"
+
+    @property
+    def lacks_sides(self) -> bool:
+        """Whether the run has no correct picture on a side."""
+        return self.measurement is not None and not self.measurement.outcomes.has_sides
+
+    def in_words(self, text: str) -> str:
+        """Return a text about the image swap, about what was exchanged in this run."""
+        return text.replace("image swap", self.exchange)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,12 +113,15 @@ class Intervention(ABC):
     """One kind of intervention: its settings as fields, its conditions, and how their numbers are read.
 
     categories: of the run; None for all. items: so many of each category, the first ones; None for all. readout:
-    the part of the policy's answer that is read, see `Readout`.
+    the part of the policy's answer that is read, see `Readout`. Of runs without sides: vary: the input that the
+    source has of its donor, empty for `usual_vary`. frames: of an episode, evenly spaced; None for 4. pairs: of
+    the user's own, episode and frame of the clean inference and of its donor.
 
     Of the class. kind: its name on the command line. summary: a line of help. position: in help. options: those of
     sites, roles, direction, controls, coefficients, target_side and seed that it takes, and their meaning.
     has_verdict: whether `classify_use` classifies its rows. is_descriptive: whether it edits and tests nothing.
-    asks_where: whether it edits places of the network, so that a line says which layer matters.
+    asks_where: whether it edits places of the network, so that a line says which layer matters. needs_sides:
+    whether it applies to runs of the scene alone.
     """
 
     kind: ClassVar[str]
@@ -117,10 +131,15 @@ class Intervention(ABC):
     has_verdict: ClassVar[bool] = False
     is_descriptive: ClassVar[bool] = False
     asks_where: ClassVar[bool] = False
+    needs_sides: ClassVar[bool] = False
+    usual_vary: ClassVar[str] = "picture"
 
     categories: tuple[str, ...] | None = None
     items: int | None = None
     readout: Readout = FIRST_CHUNK
+    vary: str = ""
+    frames: int | None = None
+    pairs: tuple[PairRow, ...] = ()
 
     def __post_init__(self) -> None:
         if self.items is not None and self.items < 1:
@@ -153,6 +172,23 @@ class Intervention(ABC):
     def check_run(self, run: Run) -> None:
         """Raise UnknownCategoryError for a category that the run lacks, UsageError for a run that does not fit."""
         categories_in(run, self.categories)
+        if has_sides(run):
+            if self.vary or self.frames or self.pairs:
+                raise UsageError(
+                    "--vary, --frames and --pairs are for runs on recordings or in your own environment; in the "
+                    "scene the pictures are swapped. Leave them out"
+                )
+        elif self.needs_sides or self.readout != FIRST_CHUNK:
+            asked = f"--kind {self.kind}" if self.needs_sides else f"--readout {self.readout}"
+            raise UsageError(
+                f"{run.location} has no correct picture on a side, which {asked} needs. Take --kind interchange, "
+                "or a run of the scene"
+            )
+
+    @property
+    def varied(self) -> str:
+        """Return the input that the source has of its donor."""
+        return self.vary or self.usual_vary
 
     def items_in(self, run: Run) -> list[str]:
         """Return the items of a run that are replayed."""

@@ -90,6 +90,7 @@ class ConceptErasure(Intervention):
     kind: ClassVar[str] = ERASE
     summary: ClassVar[str] = "Remove the decodable answer (weaker than interchange)."
     position: ClassVar[int] = 8
+    needs_sides: ClassVar[bool] = True
     options: ClassVar[Mapping[str, str]] = {
         "sites": "where tokens are erased, one site each; required",
         "roles": "of the erased tokens; default image",

@@ -24,9 +24,10 @@ from probe_kit.intervene.kinds.base import (
 )
 from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, ConditionOutcomes, Effect
 from probe_kit.intervene.patching.sweep import SwapShare, share_of_whole
-from probe_kit.intervene.replay import CleanRun, Condition, SourceRun
+from probe_kit.intervene.replay import CleanRun, Condition, ControlInput, DonorRun, SourceRun
 from probe_kit.intervene.selection import preferred_by_category
-from probe_kit.intervene.settings import FIRST_CHUNK
+from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
+from probe_kit.intervene.toward import INPUT_LEGEND, InputEffect, describe_input, input_effects
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_tests import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -283,19 +284,24 @@ class ImageSwap(Intervention):
         return ("swap",)
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
-        """Return clean, and with swapped images."""
-        del session
-        return CleanRun(), SourceRun()
+        """Return clean, and with swapped images; without sides also all of the donor's inputs, and the control."""
+        if has_sides(session.run):
+            return CleanRun(), SourceRun()
+        return CleanRun(), SourceRun(), DonorRun(), ControlInput()
 
     @staticmethod
-    def effects(measurement: Measurement) -> list[ImageSwapEffect]:
+    def effects(measurement: Measurement) -> "list[ImageSwapEffect] | list[InputEffect]":
         """Return one row per category."""
+        if not measurement.outcomes.has_sides:
+            return exchanged_effects(measurement, IMAGE_SWAP)
         readout, apart = measurement.readout, measurement.tiles_apart
         return image_swap_effects(measurement.outcomes, measurement.seed_text, measurement.key, readout, apart)
 
     @staticmethod
     def table(rows: Sequence[ImageSwapEffect], context: TableContext) -> "Table":
         """Return one line per category, with its verdict."""
+        if not context.measurement.outcomes.has_sides:
+            return input_table(rows, context)
         verdicts = context.verdicts
         reasons = [f"{name}: {verdict.explanation}" for name, verdict in verdicts.items() if verdict.explanation]
         reaches = [_REACH[row.reach_source].format(100 * row.reach) for row in rows]
@@ -316,6 +322,8 @@ class ImageSwap(Intervention):
     @staticmethod
     def sentences(rows: Sequence[ImageSwapEffect], context: TableContext) -> list[str]:
         """Return one per category, with its verdict."""
+        if context.lacks_sides:
+            return input_sentences(rows)
         verdicts = context.verdicts
         return [
             f"{begin_sentence(row)}: "
@@ -353,6 +361,39 @@ SWAP_COLUMNS: Mapping[str, Any] = {
     "n (items)": lambda row: f"{row.n_episodes} ({row.n_items})",
 }
 """The columns that all swaps have."""
+
+
+INPUT_COLUMNS: Mapping[str, Any] = {
+    "changed %": lambda row: f"{100 * row.changed:.1f}",
+    "size": lambda row: text_of(row.size),
+    "control": lambda row: text_of(row.control_size),
+    "full": lambda row: text_of(row.full_size),
+    "share [95 %]": lambda row: interval_text(row.share, row.share_ci),
+    "p": lambda row: text_of(row.p, ".2g"),
+    "n (episodes)": lambda row: f"{row.n_episodes} ({row.n_items})",
+    "finding": lambda row: row.finding,
+}
+"""The columns of an exchanged input without sides."""
+
+
+def exchanged_effects(measurement: Measurement, swapped: str) -> list[InputEffect]:
+    """Return the effects of one input of a run without sides."""
+    vary = str(measurement.settings.get("vary", ""))
+    return input_effects(measurement.outcomes, swapped, vary, measurement.seed_text, measurement.key)
+
+
+def input_table(rows: Sequence[Any], context: TableContext) -> "ResponsiveTable":
+    """Return one line per category and input."""
+    title = f"Does the input decide? {context.subject}, {context.exchange}"
+    lines = [(f"{row.category} · {row.vary}", row) for row in rows]
+    return effect_table(
+        title, INPUT_LEGEND, "category · input", lines, {"Does the action follow it?": INPUT_COLUMNS}
+    )
+
+
+def input_sentences(rows: Sequence[Any]) -> list[str]:
+    """Return one per category and input."""
+    return [f"{row.n_episodes} frames of {row.n_items} episodes: {describe_input(row)}." for row in rows]
 
 
 class Swapped(Protocol):

@@ -19,11 +19,24 @@ from probe_kit.intervene.kinds.image_swap import (
     ImageSwapEffect,
     Reach,
     begin_sentence,
+    exchanged_effects,
+    input_sentences,
+    input_table,
     swap_columns,
     swap_rates,
 )
 from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, ConditionOutcomes
-from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, SourceRun
+from probe_kit.intervene.replay import (
+    CleanRun,
+    Condition,
+    ConditionContext,
+    ConditionResult,
+    ControlInput,
+    DonorRun,
+    SourceRun,
+)
+from probe_kit.intervene.settings import has_sides
+from probe_kit.intervene.toward import InputEffect
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
@@ -113,6 +126,7 @@ class InstructionSwap(Intervention):
     kind: ClassVar[str] = "instruction-swap"
     summary: ClassVar[str] = "Ask for the other picture: does the action change sides?"
     position: ClassVar[int] = 2
+    usual_vary: ClassVar[str] = "instruction"
 
     @property
     def required_capabilities(self) -> tuple[InterventionKind, ...]:
@@ -131,12 +145,15 @@ class InstructionSwap(Intervention):
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean; asked for the other picture; the images swapped; the noise drawn anew."""
-        del session
-        return CleanRun(), InstructionSwapped(), SourceRun(), NoiseResampled()
+        if has_sides(session.run):
+            return CleanRun(), InstructionSwapped(), SourceRun(), NoiseResampled()
+        return CleanRun(), InstructionSwapped(), DonorRun(), ControlInput(), NoiseResampled()
 
     @staticmethod
-    def effects(measurement: Measurement) -> list[InstructionSwapEffect]:
+    def effects(measurement: Measurement) -> "list[InstructionSwapEffect] | list[InputEffect]":
         """Return one per category, in the order of the episodes."""
+        if not measurement.outcomes.has_sides:
+            return exchanged_effects(measurement, INSTRUCTION_SWAP)
         reach = Reach.of(measurement.outcomes.of(CLEAN), measurement.tiles_apart)
         return [
             InstructionSwapEffect(
@@ -151,6 +168,8 @@ class InstructionSwap(Intervention):
     @staticmethod
     def table(rows: Sequence[InstructionSwapEffect], context: TableContext) -> "Table":
         """Return one line per category."""
+        if not context.measurement.outcomes.has_sides:
+            return input_table(rows, context)
         return effect_table(
             f"Is the instruction read? {context.subject}",
             _LEGEND,
@@ -162,7 +181,8 @@ class InstructionSwap(Intervention):
     @staticmethod
     def sentences(rows: Sequence[InstructionSwapEffect], context: TableContext) -> list[str]:
         """Return one per category; a swap of the instruction enters no verdict."""
-        del context
+        if context.lacks_sides:
+            return input_sentences(rows)
         return [f"{begin_sentence(row)}: {swap_rates(row, 'instruction')}" for row in rows]
 
 

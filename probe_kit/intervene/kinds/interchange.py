@@ -160,18 +160,17 @@ class Interchange(Intervention):
         edits = [row for row in rows if not row.is_control]
         return effect_table(
             f"Where is it used? {context.subject}, {context.measurement.settings['kind']}",
-            _LEGEND,
+            context.in_words(_LEGEND),
             "category · edit",
             lines_of(edits, lambda row: f"{row.name}{' (unread)' * (row.place in unread)}"),
-            {"What the action does": _COLUMNS},
+            {"What the action does": _WITHOUT_SIDES if context.lacks_sides else _COLUMNS},
             lambda row: row.is_localised and not row.is_by_construction,
         )
 
     @staticmethod
     def sentences(rows: Sequence[PatchEffect], context: TableContext) -> list[str]:
         """Return one per category: which edits carry half of the swap, or move the action at all."""
-        del context
-        return category_sentences(edits_by_category(rows), _finding)
+        return [context.in_words(text) for text in category_sentences(edits_by_category(rows), _finding)]
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:
@@ -189,6 +188,17 @@ _COLUMNS: Mapping[str, Any] = {
     "p": lambda row: text_of(row.p_fwe, ".2g"),
     "relative change": lambda row: f"{row.relative_change:.2f}",
 }
+
+
+_WITHOUT_SIDES: Mapping[str, Any] = {
+    "effect": _COLUMNS["effect"],
+    "nearer to the source [95 %]": _COLUMNS["net flip rate [95 %]"],
+    "displacement": lambda row: f"{row.mean_displacement:+.2f}",
+    "controls": lambda row: text_of(row.control_displacement, "+.2f"),
+    "p": _COLUMNS["p"],
+    "relative change": _COLUMNS["relative change"],
+}
+"""Displacements are in spreads of clean actions, toward the source's action."""
 
 
 def _cm(metres: float | None) -> float | None:

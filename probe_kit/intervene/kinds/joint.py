@@ -214,13 +214,13 @@ class JointPlaces(Intervention):
         """Return one line per category and set."""
         return effect_table(
             f"Where is it read, alone and jointly? {context.subject}, joint places",
-            _LEGEND,
+            context.in_words(_LEGEND),
             "category · cells",
             [
                 (" ".join(filter(None, (f"{row.category} ·", _PARTS.get(row.part, ""), row.cells))), row)
                 for row in rows
             ],
-            {"Share of the image swap": _COLUMNS},
+            {context.in_words("Share of the image swap"): _COLUMNS},
             lambda row: row.finding.startswith("read"),
         )
 

@@ -28,6 +28,7 @@ from probe_kit.intervene.kinds.base import (
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH, net_interval, share_of_swap, swap_sign
 from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
+from probe_kit.intervene.patching.sweep import SwapShare, share_fields, share_of_whole
 from probe_kit.intervene.places import ALL, RESIDUAL, PlaceName
 from probe_kit.intervene.selection import PooledConditions, Rank, pool_conditions, stored_results
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -63,6 +64,8 @@ class PatchEffect(EffectRow):
     t: float
     p: float | None
     p_fwe: float | None
+    action_share: float | None = None
+    action_share_ci: tuple[float, float] | None = None
 
     @property
     def is_localised(self) -> bool:
@@ -129,7 +132,8 @@ def _of_category(
     tests = test_against_controls(sign * displacements, names, outcomes, seed_text, (), ())
     effects = []
     for at, (row, name, test) in enumerate(zip(rows, names, tests, strict=True)):
-        flips = _flips(push, clean, outcomes.displacement[row])
+        flips = _flips(push, _crossed(outcomes, clean), _crossed(outcomes, outcomes.displacement[row]))
+        toward = _share_toward(outcomes, row, seed_text)
         # The swap moves actions to the wrong side; steering to another side is compared with its size.
         share = share_of_swap(outcomes, -outcomes.correct_sign * displacements[at], seed_text)
         columns: dict[str, Any] = common_columns(outcomes, row, name)
@@ -149,10 +153,26 @@ def _of_category(
                 t=test.t or 0.0,
                 p=test.p,
                 p_fwe=test.p_fwe,
+                **share_fields("action_share", toward),
                 key=key,
             )
         )
     return effects
+
+
+def _crossed(outcomes: ConditionOutcomes, displacement: Values) -> Values:
+    """Return (E,) above zero on the left; without sides, where the action is nearer to the source's."""
+    if outcomes.has_sides or IMAGE_SWAP not in outcomes.conditions:
+        return displacement
+    return np.asarray(displacement - outcomes.of(IMAGE_SWAP) / 2)
+
+
+def _share_toward(outcomes: ConditionOutcomes, row: int, seed_text: str) -> SwapShare | None:
+    """Return the displacement toward the source's action as a share of the full exchange; None without one."""
+    if outcomes.toward is None or IMAGE_SWAP not in outcomes.conditions:
+        return None
+    whole = outcomes.toward[outcomes.conditions.index(IMAGE_SWAP)]
+    return share_of_whole(outcomes.toward[row], whole, outcomes.groups, seed_text) if whole.any() else None
 
 
 def _flips(push: Values, clean: Values, edited: Values) -> Values:

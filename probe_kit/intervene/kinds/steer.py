@@ -23,6 +23,7 @@ from probe_kit.intervene.kinds.site_maps import PatchEffect
 from probe_kit.intervene.patching.patch import Cell
 from probe_kit.intervene.places import resolve_all
 from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, SourceRun
+from probe_kit.intervene.settings import has_sides
 from probe_kit.intervene.tokens import TILES, role_tokens
 from probe_kit.runs.run import Run
 
@@ -125,6 +126,14 @@ class Steering(Intervention):
                 "--kind steer needs --sites and one of --roles, such as --sites backbone.02 --roles image"
             )
         return super().from_options(run, role=roles[0], **options)
+
+    def check_run(self, run: Run) -> None:
+        """Raise UsageError for a run without sides, whose answers have no direction of their own."""
+        super().check_run(run)
+        if not has_sides(run):
+            raise UsageError(
+                f"{run.location} has no correct picture on a side, so that {self.direction} is no direction there"
+            )
 
     @property
     def fits_first(self) -> bool:

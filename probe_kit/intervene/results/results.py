@@ -84,7 +84,7 @@ class InterventionResult:
     def table(self) -> "pd.DataFrame":
         """One line per row of `effects`, with its columns; of a kind with verdicts also those of `UseVerdict`."""
         frame = frame_of(self.effects)
-        if self._kind.has_verdict:
+        if self._kind.has_verdict and self.outcomes.has_sides:
             found = [self.verdicts.get(str(category), None) for category in frame["category"]]
             for name in _VERDICT_COLUMNS:
                 frame[name] = [None if one is None else getattr(one, name) for one in found]
@@ -125,6 +125,8 @@ class InterventionResult:
         ]
 
     def _one_step(self) -> list[str]:
+        if not self.outcomes.has_sides:
+            return []
         is_per_step = self.certificate.get("supported", {}).get("readout") == PER_STEP
         if self.settings.get("readout") == PER_STEP:
             return [
@@ -187,7 +189,9 @@ class InterventionResult:
     def _context(self) -> TableContext:
         subject = f"{self.label}{' (random weights)' if self.random_weights else ''} on {self.suite}"
         uses = (self.verdicts.get(row.category) for row in self.effects)
-        return TableContext(self.measurement, subject, self.verdicts, describe_readouts(uses))
+        vary = str(self.settings.get("vary") or "")
+        exchange = "image swap" if self.outcomes.has_sides else f"exchange of the {vary}"
+        return TableContext(self.measurement, subject, self.verdicts, describe_readouts(uses), exchange=exchange)
 
 
 def load_effects(run: RunReader, key: str | None = None, kind: str | None = None) -> InterventionResult:
@@ -205,6 +209,8 @@ def effects_of(run: RunReader, stored: StoredIntervention) -> InterventionResult
         stored.key, tiles_apart(run),
     )  # fmt: skip
     found = InterventionResult(run.label, run.random_weights, run.suite, measurement)
+    if not found.outcomes.has_sides:
+        return found
     shown = found.effects if kind_of(found.kind).has_verdict else ()
     results, places = _newest_probes(run), stored_places(run)
     found.verdicts.update(_verdicts(run, results, places, shown))

@@ -1,6 +1,10 @@
 """Opening the session of a run, and the pairs of one category."""
 
+from typing import TYPE_CHECKING
+
 from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.sessions.frames import frames_of, with_cameras
+from probe_kit.intervene.sessions.observed import ObservedSession
 from probe_kit.intervene.sessions.scene import SceneSession
 from probe_kit.intervene.sessions.session import (
     LoadPolicy,
@@ -9,18 +13,33 @@ from probe_kit.intervene.sessions.session import (
     check_policy,
     load_policy_of,
 )
-from probe_kit.intervene.settings import items_of
-from probe_kit.runs.run import Run
+from probe_kit.intervene.settings import PairChoice, has_sides, items_of
+from probe_kit.runs import Run
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
 
 
-def open_session(run: Run, source: ReplaySource, load: LoadPolicy | None = None) -> ReplaySession:
+def open_session(
+    run: Run, source: ReplaySource, load: LoadPolicy | None = None, choice: PairChoice | None = None
+) -> ReplaySession:
     """Load the run's policy and set up its observations.
 
-    load: how the policy is found, if not by its name. Raises SettingsMismatchError if it is another one,
-    SuiteError for another suite, SuiteNotFoundError for one that is neither given nor can be drawn again,
-    SceneError for a scene that needs a file which is not given.
+    load: how the policy is found, if not by its name. choice: of pairs of a run without sides. Raises
+    SettingsMismatchError if it is another one, SuiteError for another suite, SuiteNotFoundError for one that is
+    neither given nor can be drawn again, SceneError for a scene that needs a file which is not given.
     """
-    session = SceneSession.of(run, source, lambda: (load or load_policy_of)(run, source))
+
+    def policy() -> "Policy":
+        return (load or load_policy_of)(run, source)
+
+    session: ReplaySession
+    if has_sides(run):
+        session = SceneSession.of(run, source, policy)
+    else:
+        frames = frames_of(run, source)
+        session = ObservedSession(run, with_cameras(policy(), frames), frames)
+        session.choose(choice)
     try:
         check_policy(run, session.policy)
     except BaseException:

@@ -47,7 +47,8 @@ class ReplaySource:
     suite: folder; None for that of the run, see `suite_of`. checkpoint, options, weights_seed: as for
     `probe-kit extract`; by default those of the run, of a checkpoint its folder if it is still there. Options of
     the run stay but for those that are named anew. device: of the model. files: of the scene, by field, such as
-    `background`; by default those of the run that are still there.
+    `background`; by default those of the run that are still there. dataset: folder of the recordings.
+    environment_options: of an environment, beside those of the run.
     """
 
     suite: Path | None = None
@@ -56,6 +57,8 @@ class ReplaySource:
     weights_seed: int | None = None
     device: str = "cpu"
     files: Mapping[str, Path] = field(default_factory=dict)
+    dataset: Path | None = None
+    environment_options: Mapping[str, Any] = field(default_factory=dict)
 
 
 LoadPolicy = Callable[[Run, ReplaySource], "Policy"]

@@ -1,0 +1,210 @@
+"""Frames of a run without sides, shown again: of its recordings, or first observations of its environment."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import OtherFramesError, UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.intervene.pairs import Chunk
+from probe_kit.intervene.sessions.session import ReplaySource, sources_of
+from probe_kit.runs import Run
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+DATASET = "dataset"
+"""The file among a run's sources that is the folder of its recordings."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One inference of a run. number: of the recorded frame; 0 of an environment. state: (D,) as it was stored."""
+
+    row: int
+    number: int
+    item: str
+    group: str
+    category: str
+    episode: str
+    instruction: str
+    seed: int
+    state: NDArray[np.float64]
+    stored: Chunk | None
+
+    @property
+    def name(self) -> str:
+        """Return the episode and the number of the frame."""
+        return f"{self.episode}@{self.number}"
+
+
+class Frames(ABC):
+    """All frames of a run that can be shown again. cameras: of the policy, those that get a picture."""
+
+    def __init__(self, run: Run) -> None:
+        self.run = run
+        self.index = list(self._listed())
+
+    @property
+    @abstractmethod
+    def cameras(self) -> tuple[str, ...]:
+        """Return the model's cameras that get a picture."""
+
+    @abstractmethod
+    def observe(self, frame: Frame) -> Observation:
+        """Return the observation of a frame. Raises OtherFramesError if it is not the run's."""
+
+    @abstractmethod
+    def _numbers(self, row: int) -> Sequence[int]:
+        """Return the numbers of the frames of one row, in the order of its inferences."""
+
+    def close(self) -> None:  # noqa: B027 - recordings hold nothing
+        """Free what it holds."""
+
+    def _listed(self) -> Any:
+        inputs = self.run.inputs
+        assert inputs is not None
+        states = inputs.read("state").astype(np.float64) if "state" in inputs.kinds else None
+        kind = next((name for name in ("prediction", "action") if name in inputs.kinds), None)
+        actions = None if kind is None else inputs.read(kind)
+        for row, record in enumerate(self.run.episodes.to_dict("records")):
+            for call, number in enumerate(self._numbers(row)):
+                yield Frame(
+                    row, number, str(record["item_id"]), str(record["group_id"]), str(record["category"]),
+                    str(record["episode_id"]), str(record["instruction"]),
+                    derive_seed(int(record["policy_seed"]), "inference", number),
+                    np.zeros(0) if states is None else states[row, call],
+                    None if actions is None else np.asarray(actions[row, call], np.float32),
+                )  # fmt: skip
+
+
+class RecordedFrames(Frames):
+    """Frames of the LeRobotDataset that a run showed."""
+
+    def __init__(self, run: Run, source: ReplaySource) -> None:
+        from probe_kit.extract.recordings.lerobot_folder import open_lerobot
+        from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
+        from probe_kit.extract.sources.recording import LeRobotSource
+
+        self._dataset = run.settings[DATASET]
+        self._folder = open_lerobot(LeRobotSource(_folder_of(run, source)))
+        self._reader = LeRobotFrames(self._folder)
+        self._features = {camera: feature for camera, feature, _ in self._dataset["cameras"]}
+        super().__init__(run)
+        self.observe = lru_cache(maxsize=64)(self.observe)  # type: ignore[method-assign]
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Return the mapped cameras."""
+        return tuple(self._features)
+
+    def _numbers(self, row: int) -> Sequence[int]:
+        record = self.run.episodes.iloc[row]
+        first, step, count = (int(record[name]) for name in ("first_frame", "frame_step", "frames"))
+        return range(first, first + step * count, step)
+
+    def observe(self, frame: Frame) -> Observation:
+        """Read a frame from the data set, as the run showed it."""
+        record = self.run.episodes.iloc[frame.row]
+        episode, features = int(record["source_episode"]), list(self._features.values())
+        if self._folder.content_blake2b(episode, features) != record["content_blake2b"]:
+            raise OtherFramesError(
+                f"{self._folder.path.name}: the files of {frame.item} are not those of {self.run.location}: their "
+                "hash differs. Give the data set of the run (--dataset)"
+            )
+        pictures = self._reader.pictures(episode, frame.number, features)
+        shown = {camera: pictures[feature] for camera, feature in self._features.items()}
+        for camera, degrees in self._dataset["rotations"]:
+            shown[camera] = np.ascontiguousarray(np.rot90(shown[camera], degrees // 90))
+        first, *others = shown
+        return Observation(
+            shown[first], frame.state.astype(np.float32) if frame.state.size else np.zeros(8, np.float32),
+            frame.instruction, None, {name: shown[name] for name in others},
+        )  # fmt: skip
+
+
+class EnvironmentFrames(Frames):
+    """The first observation of every episode of the environment that a run played."""
+
+    def __init__(self, run: Run, source: ReplaySource) -> None:
+        from probe_kit.extract.own_environments.opening import listed_episodes, open_environment
+        from probe_kit.extract.sources.environment import EnvSource
+
+        stored = run.settings["environment"]
+        options = {**stored["options"], **source.environment_options}
+        chosen = EnvSource(stored["environment"], options=options)
+        self._name, self._environment = chosen.name, open_environment(chosen)
+        if self._environment.revision != stored["revision"]:
+            raise OtherFramesError(
+                f"{self._name} has the revision {self._environment.revision!r}; {run.location} was played in "
+                f"{stored['revision']!r}. Use that version"
+            )
+        self._cameras = tuple(stored["cameras"])
+        self._episodes = {episode.id: episode for _, episode in listed_episodes(self._environment, chosen)}
+        super().__init__(run)
+        self.observe = lru_cache(maxsize=64)(self.observe)  # type: ignore[method-assign]
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Return the cameras of the environment."""
+        return self._cameras
+
+    def _numbers(self, row: int) -> Sequence[int]:
+        del row
+        return (0,)
+
+    def observe(self, frame: Frame) -> Observation:
+        """Set an episode up, and return what it shows first."""
+        from probe_kit.extract.own_environments.opening import started
+
+        if frame.episode not in self._episodes:
+            raise OtherFramesError(
+                f"{self._name} has no episode {frame.episode!r} any more; use the run's version"
+            )
+        observation = started(self._environment, self._episodes[frame.episode], self._name).observation
+        if frame.state.size and not np.array_equal(observation.state.astype(np.float64), frame.state):
+            raise OtherFramesError(
+                f"{self._name}, {frame.episode}: the state at the beginning is not that of "
+                f"{self.run.location}. Take all randomness from the episode's seed, and use the run's version"
+            )
+        pictures = {name: np.array(picture) for name, picture in observation.cameras.items()}
+        return replace(
+            observation, image=np.array(observation.image), state=np.array(observation.state), cameras=pictures
+        )
+
+    def close(self) -> None:
+        """Close the environment."""
+        self._environment.close()
+
+
+def frames_of(run: Run, source: ReplaySource) -> Frames:
+    """Return the frames of a run on recordings or in an environment."""
+    return (RecordedFrames if run.recorded else EnvironmentFrames)(run, source)
+
+
+def with_cameras(policy: "Policy", frames: Frames) -> "Policy":
+    """Return the policy as it is given these cameras."""
+    return policy.with_cameras(list(frames.cameras))
+
+
+def _folder_of(run: Run, source: ReplaySource) -> str:
+    """Return the folder or hub id of the run's recordings. Raises UsageError if it is not here."""
+    dataset = run.settings[DATASET]
+    if source.dataset is not None:
+        return str(source.dataset)
+    if "repo" in dataset:
+        return f"{dataset['repo']}@{dataset['revision']}"
+    stored = sources_of(run).scene_files.get(DATASET, "")
+    if not stored or not Path(stored).is_dir():
+        raise UsageError(
+            f"the recordings of {run.location} are not where they were{f' ({stored})' if stored else ''}; name "
+            "their folder with --dataset"
+        )
+    return stored

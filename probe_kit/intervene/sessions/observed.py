@@ -1,0 +1,229 @@
+"""The session of a run without sides: pairs of frames that differ in one input, read toward the donor's action.
+
+A donor is another frame of another group. The source of a pair is the clean frame with one of the donor's inputs.
+"""
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from probe_kit.errors import UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.checkpoints.containment import copied
+from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.intervene.pairs import Chunk, Given, Pair
+from probe_kit.intervene.sessions.frames import Frame, Frames
+from probe_kit.intervene.sessions.session import ReplaySession
+from probe_kit.intervene.settings import PairChoice, PairRow
+from probe_kit.intervene.toward import directions_of, spread_of
+from probe_kit.runs import Run
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from probe_kit.hooks import Policy
+
+INSTRUCTION, PICTURE, STATE = "instruction", "picture", "state"
+"""Inputs that vary; `picture` is of all cameras, `picture.NAME` of one."""
+FRAMES = 4
+"""Frames of an episode that are used if nothing is said."""
+JPEG_QUALITY = 95
+STATE_SHARE = 0.01
+"""The share of its spread over frames by which a control moves a state."""
+
+
+class ObservedSession(ReplaySession):
+    """A policy and frames of recordings, or first observations of an environment.
+
+    vary: the input that the source has of its donor. frames_each: of an episode. table: pairs of the user's own,
+    by which donors are chosen. items: those whose clean actions are the unit of displacements.
+    """
+
+    def __init__(self, run: Run, policy: "Policy", frames: Frames) -> None:
+        super().__init__(run, policy)
+        self.frames = frames
+        self.vary, self.frames_each = PICTURE, FRAMES
+        self.table: tuple[PairRow, ...] = ()
+        self.items: Sequence[str] = tuple(dict.fromkeys(frame.item for frame in frames.index))
+        self._weights: NDArray[np.float64] | None = None
+        self._ends: dict[tuple[int, int], tuple[Chunk, NDArray[np.float64]]] = {}
+        self._spread = _state_spread(frames.index)
+
+    def choose(self, choice: PairChoice | None) -> None:
+        """Take the varied input, the number of frames, the table and the items of an intervention."""
+        if choice is not None:
+            self.vary, self.frames_each = choice.varied, choice.frames or FRAMES
+            self.table, self.items = choice.pairs, choice.items_in(self.run)
+        self.check_vary()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.frames.close()
+
+    def pairs(self, item: str) -> list[Pair]:
+        """Return the pairs of an item's frames; frames without a donor are left out."""
+        pairs = []
+        for frame, donor in self._donors(item):
+            clean, other = self.frames.observe(frame), self.frames.observe(donor)
+            pairs.append(
+                Pair(
+                    clean=clean,
+                    source=with_input(clean, self.vary, other),
+                    donor=other,
+                    control=self._control(clean),
+                    seed=frame.seed,
+                    group=frame.group,
+                    item=item,
+                    row=frame.row,
+                    step=frame.number,
+                    episode=frame.name if self.run.recorded else frame.episode,
+                    category=frame.category,
+                    stored=frame.stored,
+                )
+            )
+        return pairs
+
+    def _donors(self, item: str) -> list[tuple[Frame, Frame]]:
+        if self.table:
+            by_name = {(frame.item, frame.number): frame for frame in self.frames.index}
+            by_name |= {(frame.episode, frame.number): frame for frame in self.frames.index}
+            rows = [(by_name.get(row[:2]), by_name.get(row[2:])) for row in self.table]
+            for row, (frame, donor) in zip(self.table, rows, strict=True):
+                if frame is None or donor is None:
+                    episode, number = row[:2] if frame is None else row[2:]
+                    raise UsageError(
+                        f"the run has no frame {number} of {episode!r}, which the table of pairs names"
+                    )
+            return [(frame, donor) for frame, donor in rows if frame and donor and frame.item == item]
+        frames = [frame for frame in self.frames.index if frame.item == item]
+        chosen = np.unique(np.linspace(0, len(frames) - 1, min(self.frames_each, len(frames))).round().astype(int))
+        found = [(frames[at], self._donor(frames[at])) for at in chosen]
+        return [(frame, donor) for frame, donor in found if donor is not None]
+
+    def _donor(self, frame: Frame) -> Frame | None:
+        """Return another group's frame: of the nearest state, and of another instruction if that varies."""
+        others: list[Frame] = [other for other in self.frames.index if other.group != frame.group]
+        if self.vary == INSTRUCTION:
+            others = [other for other in others if other.instruction != frame.instruction]
+        draw = np.random.default_rng(derive_seed("donor", self.vary, frame.name))
+        if self.vary == INSTRUCTION and others:
+            texts = sorted({other.instruction for other in others})
+            text = texts[int(draw.integers(len(texts)))]
+            others = [other for other in others if other.instruction == text]
+        if not others:
+            return None
+        if self.vary == STATE:
+            return others[int(draw.integers(len(others)))]
+        apart = [float(np.linalg.norm((other.state - frame.state) / self._spread)) for other in others]
+        return others[int(np.argmin(apart))]
+
+    def _control(self, clean: Observation) -> Observation:
+        """Return the clean observation after a change of the same input that means nothing."""
+        if self.vary == INSTRUCTION:
+            text = clean.instruction
+            return replace(clean, instruction=text[:-1] if text.endswith(".") else f"{text}.")
+        if self.vary == STATE:
+            moved = clean.state + STATE_SHARE * self._spread[: clean.state.size]
+            return replace(clean, state=moved.astype(np.float32))
+        return with_input(clean, self.vary, _compressed(clean))
+
+    def check_vary(self) -> None:
+        """Raise UsageError for an input that the frames do not have, or that no frame of another group varies."""
+        inputs = (INSTRUCTION, PICTURE, *(f"{PICTURE}.{name}" for name in self.frames.cameras), STATE)
+        if self.vary not in inputs:
+            raise UsageError(f"vary is {self.vary!r}; expected one of {', '.join(inputs)}")
+        if not any(self._donors(item) for item in self.items):
+            raise UsageError(
+                f"no frame of another group has another {self.vary}; extract more episodes, or choose another "
+                "--vary"
+            )
+
+    # -- actions and readout -----------------------------------------------------------------------------
+
+    def act(self, given: Given, seed: int) -> Chunk:
+        """Return (chunk, D): one prediction in the checkpoint's own units, alone in its batch."""
+        assert isinstance(given, Observation)
+        with while_acting(self.run.model, self.policy.card.checkpoint):
+            return np.asarray(self.policy.predict(copied([given]), [seed])[0], np.float32)
+
+    def displacement(self, chunk: Chunk, pair: Pair) -> float:
+        """Return how far a chunk lies toward the source's, in spreads of clean actions; 0 is the clean action."""
+        clean, direction = self._end(pair)
+        return float((chunk.astype(np.float64).ravel() - clean.astype(np.float64).ravel()) @ direction)
+
+    def slope(self, pair: Pair) -> "Callable[[Tensor], Tensor]":
+        """Return the same up to a constant. Raises UsageError for a family whose gradients are in other units."""
+        clean, direction = self._end(pair)
+        assert isinstance(pair.clean, Observation)
+        if not np.array_equal(clean, self.policy.act(copied([pair.clean]), [pair.seed])[0]):
+            raise UsageError(
+                f"gradients of {self.policy.card.family} are of an arm's actions, and these frames have "
+                "predictions in other units. Patch exactly: --kind interchange"
+            )
+        return lambda actions: (actions.flatten() * actions.new_tensor(direction)).sum()
+
+    def _end(self, pair: Pair) -> tuple[Chunk, NDArray[np.float64]]:
+        """Return the clean chunk, and the direction (N,) that displacements of this pair are read along."""
+        at = pair.row, pair.step
+        if at not in self._ends:
+            clean, source = self.act(pair.clean, pair.seed), self.act(pair.source, pair.seed)
+            start, end = (chunk.astype(np.float64).ravel()[None] for chunk in (clean, source))
+            (direction,), _ = directions_of(start, end, self.weights)
+            self._ends[at] = clean, direction
+        return self._ends[at]
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Return (N,) 1 / spread² of every number of the clean actions, over all pairs of the items."""
+        if self._weights is None:
+            clean = [self.act(pair.clean, pair.seed).ravel() for item in self.items for pair in self.pairs(item)]
+            self._weights = spread_of(np.array(clean))
+        return self._weights
+
+    # -- words -------------------------------------------------------------------------------------------
+
+    def has_other_instruction(self, item: str) -> bool:
+        """Whether a frame of the item has a donor."""
+        return bool(self._donors(item))
+
+    def with_other_instruction(self, pair: Pair) -> Observation | None:
+        """Return the source: a swap of the instruction varies just that."""
+        return pair.source if isinstance(pair.source, Observation) else None
+
+
+def with_input(clean: Observation, vary: str, donor: Observation) -> Observation:
+    """Return the clean observation with one input of another."""
+    if vary == INSTRUCTION:
+        return replace(clean, instruction=donor.instruction)
+    if vary == STATE:
+        return replace(clean, state=donor.state)
+    camera = vary.partition(".")[2]
+    if not camera:
+        return replace(clean, image=donor.image, cameras=donor.cameras)
+    if camera in donor.cameras:
+        return replace(clean, cameras={**clean.cameras, camera: donor.cameras[camera]})
+    return replace(clean, image=donor.image)
+
+
+def _compressed(clean: Observation) -> Observation:
+    """Return the observation after a JPEG round trip of every picture."""
+    cameras: Mapping[str, Any] = {name: _jpeg(picture) for name, picture in clean.cameras.items()}
+    return replace(clean, image=_jpeg(clean.image), cameras=cameras)
+
+
+def _jpeg(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    stored = io.BytesIO()
+    Image.fromarray(picture).save(stored, "JPEG", quality=JPEG_QUALITY)
+    return np.asarray(Image.open(stored)).copy()
+
+
+def _state_spread(frames: Sequence[Frame]) -> NDArray[np.float64]:
+    """Return (D,) the standard deviation of every number of the state, 1 where it has none."""
+    spread = np.std([frame.state for frame in frames], axis=0)
+    return np.where(spread > 0, spread, 1.0)

@@ -1,0 +1,201 @@
+"""Interventions on recordings: pairs of frames that differ in one input, read toward the donor's action."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.errors import OtherFramesError, UsageError
+from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
+from probe_kit.hooks import Observation
+from probe_kit.intervene import ImageSwap, Interchange, ReplaySource, run_intervention
+from probe_kit.intervene.kinds.site_maps import patch_effects
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.replay import replay
+from probe_kit.intervene.runner import outcomes_of
+from probe_kit.intervene.sessions.observed import ObservedSession
+from probe_kit.intervene.sessions.opening import open_session
+from probe_kit.intervene.sessions.pair_table import read_pairs
+from probe_kit.intervene.sessions.scene import SceneSession
+from probe_kit.intervene.toward import displacements_toward, sizes, spread_of
+from probe_kit.runs import Run, open_run
+from tests.support.lerobot_recordings import CAMERA, write_recording
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+ITEMS = 3
+
+
+@pytest.fixture(scope="module")
+def scene_pairs(session: SceneSession) -> list[Pair]:
+    """Both layouts of some items: the other layout is the donor of each."""
+    items = list(dict.fromkeys(session.run.episodes["item_id"].astype(str)))[:ITEMS]
+    return [pair for item in items for pair in session.pairs(item)]
+
+
+@pytest.fixture(scope="module")
+def shown(scene_pairs: list[Pair], tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run on recordings whose episodes are the first frames of the scene, one frame each."""
+    pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="the extra `datasets` is not installed")
+    folder = tmp_path_factory.mktemp("recorded")
+    frames = [pair.clean for pair in scene_pairs]
+    assert all(isinstance(frame, Observation) for frame in frames)
+    write_recording(folder / "frames", [[frame] for frame in frames])  # type: ignore[list-item]
+    source = LeRobotSource(str(folder / "frames"), cameras={"base": CAMERA})
+    return extract_run(ExtractSettings("pi0-tiny", source=source, random_weights=True), folder / "run")
+
+
+@pytest.fixture(scope="module")
+def table(shown: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Every frame with the other layout of its item."""
+    file = tmp_path_factory.mktemp("pairs") / "pairs.csv"
+    rows = [f"{at},0,{at ^ 1},0" for at in range(len(shown.episodes))]
+    file.write_text("\n".join(["episode,frame,donor_episode,donor_frame", *rows]), encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def observed(shown: Run, table: Path, twin: "Policy") -> Iterator[ObservedSession]:
+    choice = ImageSwap(pairs=read_pairs(table))
+    with open_session(shown, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():
+        assert isinstance(opened, ObservedSession)
+        yield opened
+
+
+def test_recordings_of_scene_frames_give_the_numbers_of_the_scene_bit_for_bit(
+    session: SceneSession, scene_pairs: list[Pair], observed: ObservedSession
+) -> None:
+    """Same frames and seeds: the chunks, the displacements toward the source and the shares of patches."""
+    recorded = [pair for item in observed.items for pair in observed.pairs(item)]
+    seeded = [replace(pair, seed=own.seed, stored=None) for pair, own in zip(recorded, scene_pairs, strict=True)]
+    for pair, own in zip(seeded, scene_pairs, strict=True):
+        assert isinstance(pair.clean, Observation)
+        assert isinstance(own.source, Observation)
+        assert isinstance(pair.source, Observation)
+        np.testing.assert_array_equal(pair.source.image, own.source.image)
+        np.testing.assert_array_equal(pair.clean.state, own.source.state)
+    asked = Interchange(sites=("backbone.01", "kv.01"), roles=("all", "image"))
+    batches = [
+        replay(opened, pairs, asked.conditions(opened))
+        for opened, pairs in ((session, scene_pairs), (observed, seeded))
+    ]
+    names = [condition.name for condition in asked.conditions(session)]
+    scene, frames = (
+        outcomes_of(opened.run, names, batch) for opened, batch in zip((session, observed), batches, strict=True)
+    )
+    assert batches[0].chunks is not None
+    assert batches[1].chunks is not None
+    np.testing.assert_array_equal(batches[0].chunks, batches[1].chunks)
+    np.testing.assert_array_equal(scene.toward, frames.toward)
+    np.testing.assert_array_equal(frames.displacement, frames.toward)
+    assert scene.toward is not None
+    assert not np.array_equal(scene.displacement, scene.toward), "in the scene also metres"
+    groups = np.arange(len(seeded)).astype(str)
+    rows = [
+        patch_effects(replace(one, groups=groups, categories=np.full(len(seeded), "all")), "seed")
+        for one in (scene, frames)
+    ]
+    assert [row.action_share for row in rows[0]] == [row.action_share for row in rows[1]]
+    assert all(row.action_share is not None for row in rows[0])
+
+
+def test_a_swap_of_pictures_is_stored_and_read_again(shown: Run, table: Path, twin: "Policy") -> None:
+    asked = ImageSwap(pairs=read_pairs(table))
+    result = run_intervention(shown, asked, load=lambda *_: twin)
+    (row,) = result.effects
+    assert (row.vary, row.n_episodes, row.n_items) == ("picture", 2 * ITEMS, 2 * ITEMS)
+    assert row.share == pytest.approx(1.0), "only the pictures differ in these pairs"
+    assert row.size == row.full_size > 0
+    assert row.finding in ("decides", "open")
+    again = run_intervention(shown, asked, load=not_loaded)
+    assert again.to_csv() == result.to_csv()
+    assert result.verdicts == {}
+    assert "the picture" in result.sentences[0]
+    assert result.to_rich() is not None
+    assert run_intervention(shown, ImageSwap(), load=lambda *_: twin).key != result.key, "other pairs"
+
+
+def not_loaded(*_: object) -> "Policy":
+    raise AssertionError("it is stored")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--kind", "closed-loop", "--sites", "backbone.02"), "closed-loop"),
+        (("--kind", "erase", "--sites", "backbone.02"), "erase"),
+        (("--readout", "per-step"), "per-step"),
+        (("--vary", "smell"), "expected one of instruction, picture, picture.base, state"),
+        (("--kind", "steer", "--sites", "backbone.02", "--roles", "image"), "no direction there"),
+    ],
+)
+def test_what_needs_sides_or_another_input_is_refused_by_name(
+    shown: Run, words: tuple[str, ...], named: str
+) -> None:
+    answer = CliRunner().invoke(app, ["intervene", str(shown.path), *words], env={"COLUMNS": "200"})
+    assert answer.exit_code == 2
+    assert named in " ".join(answer.stderr.split())
+
+
+def test_pairs_are_refused_in_the_scene(copy: Run, table: Path) -> None:
+    with pytest.raises(UsageError, match="--vary, --frames and --pairs"):
+        ImageSwap(pairs=read_pairs(table)).check_run(copy)
+
+
+def test_recordings_that_were_changed_or_moved_are_refused(
+    shown: Run, tmp_path: Path, observed: ObservedSession
+) -> None:
+    run = open_run(shown.path)
+    run.__dict__["sources"] = (replace(shown.sources[0], scene_files={}),)
+    with pytest.raises(UsageError, match="--dataset"):
+        open_session(run, ReplaySource())
+    frame = observed.frames.index[0]
+    run.episodes.loc[0, "content_blake2b"] = "0" * 32
+    observed.frames.run = run
+    with pytest.raises(OtherFramesError, match="not those of"):
+        type(observed.frames).observe(observed.frames, frame)  # not the cached one
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("episode,frame\n0,0", "donor_episode"),
+        ("episode,frame,donor_episode,donor_frame\n0,zero,1,0", "number of a frame"),
+        ("episode,frame,donor_episode,donor_frame\n", "names no pair"),
+    ],
+)
+def test_a_table_that_names_no_pairs_is_refused_with_its_line(tmp_path: Path, text: str, named: str) -> None:
+    file = tmp_path / "pairs.csv"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(UsageError, match=named):
+        read_pairs(file)
+
+
+def test_displacements_are_shares_of_the_source_and_flat_numbers_do_not_count() -> None:
+    """Against the definition, written out number by number."""
+    draw = np.random.default_rng(0)
+    chunks = draw.normal(size=(3, 5, 4)).astype(np.float32)
+    chunks[..., 3] = 0.25  # a number without spread
+    chunks[2] = chunks[0] + np.float32(0.5) * (chunks[1] - chunks[0])
+    assert spread_of(chunks[0])[3] == 0
+    spread = chunks[0].astype(np.float64)[:, :3].std(axis=0)
+    apart = (chunks[1].astype(np.float64) - chunks[0])[:, :3] / spread
+    toward = displacements_toward(chunks, 1)
+    np.testing.assert_allclose(toward[1], np.sqrt((apart**2).mean(axis=1)))
+    np.testing.assert_allclose(toward[2], toward[1] / 2, rtol=1e-6)
+    np.testing.assert_allclose(sizes(chunks)[1], toward[1])
+    assert not toward[0].any()
+
+
+def test_a_table_and_a_command_give_the_same_rows(shown: Run, table: Path, twin: "Policy") -> None:
+    result = run_intervention(shown, ImageSwap(pairs=read_pairs(table)), load=lambda *_: twin)
+    answer = CliRunner().invoke(app, ["intervene", str(shown.path), "--pairs", str(table), "--format", "json"])
+    assert answer.exit_code == 0, answer.stderr
+    assert json.loads(answer.stdout)["key"] == result.key
