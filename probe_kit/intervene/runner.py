@@ -21,7 +21,7 @@ from probe_kit.intervene.rollout import evaluate_per_step
 from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.intervene.sessions.session import LoadPolicy, Progress, ReplaySession, ReplaySource
 from probe_kit.intervene.settings import PER_STEP, check_run_fits, has_sides, key_of, settings_of
-from probe_kit.intervene.toward import displacements_toward, sizes
+from probe_kit.intervene.spread import displacements_toward, sizes
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.results import tidy_bundle
 from probe_kit.runs.resume_pieces import Pieces

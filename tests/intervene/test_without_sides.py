@@ -23,7 +23,7 @@ from probe_kit.intervene.sessions.observed import ObservedSession
 from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.intervene.sessions.pair_table import read_pairs
 from probe_kit.intervene.sessions.scene import SceneSession
-from probe_kit.intervene.toward import displacements_toward, sizes, spread_of
+from probe_kit.intervene.spread import displacements_toward, sizes, spread_of
 from probe_kit.runs import Run, open_run
 from tests.support.lerobot_recordings import CAMERA, write_recording
 
@@ -149,9 +149,7 @@ def test_pairs_are_refused_in_the_scene(copy: Run, table: Path) -> None:
         ImageSwap(pairs=read_pairs(table)).check_run(copy)
 
 
-def test_recordings_that_were_changed_or_moved_are_refused(
-    shown: Run, tmp_path: Path, observed: ObservedSession
-) -> None:
+def test_recordings_that_were_changed_or_moved_are_refused(shown: Run, observed: ObservedSession) -> None:
     run = open_run(shown.path)
     run.__dict__["sources"] = (replace(shown.sources[0], scene_files={}),)
     with pytest.raises(UsageError, match="--dataset"):

@@ -7,7 +7,6 @@ import pytest
 
 from probe_kit.errors import ActivationsLeftOutError, RunDamagedError, UsageError
 from probe_kit.extract.recordings.recorded_plan import SIDE
-from probe_kit.intervene.settings import check_run_fits
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, copy_run, export_run, verify_run
 from probe_kit.runs.store import locate
@@ -71,7 +70,6 @@ def test_it_grows_by_further_episodes_and_keeps_those_it_has(tmp_path: Path) -> 
     ("wanted", "refused"),
     [
         ("retention table", lambda run: retention_table([run])),
-        ("intervention", check_run_fits),
         ("probe of the side .correct.", train_probes),
         ("viewer", lambda run: view_runs([run])),
     ],

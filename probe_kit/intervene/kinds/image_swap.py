@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.counting import counted
 from probe_kit.hooks.contract.interventions import InterventionKind, Readout
+from probe_kit.intervene.inputs import INPUT_LEGEND, InputEffect, describe_input, input_effects
 from probe_kit.intervene.kinds.base import (
     TILES_APART,
     Intervention,
@@ -27,7 +28,6 @@ from probe_kit.intervene.patching.sweep import SwapShare, share_of_whole
 from probe_kit.intervene.replay import CleanRun, Condition, ControlInput, DonorRun, SourceRun
 from probe_kit.intervene.selection import preferred_by_category
 from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
-from probe_kit.intervene.toward import INPUT_LEGEND, InputEffect, describe_input, input_effects
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_tests import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE

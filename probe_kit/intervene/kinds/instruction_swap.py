@@ -13,6 +13,7 @@ import numpy as np
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.intervene.inputs import InputEffect
 from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, effect_table
 from probe_kit.intervene.kinds.image_swap import (
     SWAP_COLUMNS,
@@ -36,7 +37,6 @@ from probe_kit.intervene.replay import (
     SourceRun,
 )
 from probe_kit.intervene.settings import has_sides
-from probe_kit.intervene.toward import InputEffect
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table

@@ -21,7 +21,7 @@ from probe_kit.intervene.pairs import Chunk, Given, Pair
 from probe_kit.intervene.sessions.frames import Frame, Frames
 from probe_kit.intervene.sessions.session import ReplaySession
 from probe_kit.intervene.settings import PairChoice, PairRow
-from probe_kit.intervene.toward import directions_of, spread_of
+from probe_kit.intervene.spread import directions_of, spread_of
 from probe_kit.runs import Run
 
 if TYPE_CHECKING:
@@ -121,7 +121,12 @@ class ObservedSession(ReplaySession):
         if self.vary == STATE:
             return others[int(draw.integers(len(others)))]
         apart = [float(np.linalg.norm((other.state - frame.state) / self._spread)) for other in others]
-        return others[int(np.argmin(apart))]
+        clean = self.frames.observe(frame)
+        for at in np.argsort(apart, kind="stable"):
+            donor = self.frames.observe(others[int(at)])
+            if not _is_equal(with_input(clean, self.vary, donor), clean):
+                return others[int(at)]
+        return None
 
     def _control(self, clean: Observation) -> Observation:
         """Return the clean observation after a change of the same input that means nothing."""
@@ -209,6 +214,12 @@ def with_input(clean: Observation, vary: str, donor: Observation) -> Observation
     if camera in donor.cameras:
         return replace(clean, cameras={**clean.cameras, camera: donor.cameras[camera]})
     return replace(clean, image=donor.image)
+
+
+def _is_equal(one: Observation, other: Observation) -> bool:
+    pictures = [(one.image, other.image), *((one.cameras[name], other.cameras[name]) for name in one.cameras)]
+    same = all(np.array_equal(first, second) for first, second in pictures)
+    return same and one.instruction == other.instruction and np.array_equal(one.state, other.state)
 
 
 def _compressed(clean: Observation) -> Observation:

@@ -79,7 +79,8 @@ def test_noting_changes_no_action_bit_for_bit(attention_records: InterventionRes
     assert said["max_action_change"] == 0.0
     assert attention_records.certificate["replay"]["equal"] == 4
     found = ReplayBatch(
-        np.zeros(1, int), np.zeros((2, 1)), np.array([[0.0], [1e-6]]), np.zeros((2, 1, 5)), np.zeros(1),
+        np.zeros(1, int), np.zeros(1, int), np.zeros((2, 1)), np.array([[0.0], [1e-6]]), np.zeros((2, 1, 5)),
+        np.zeros(1),
         mass=np.zeros((1, 1, 1, 1, 1), np.float32), inferences=np.zeros((1, 2), int),
     )  # fmt: skip
     with pytest.raises(CaptureChangedActionError, match="1e-06"):

@@ -1,0 +1,163 @@
+"""Directions from outside: vectors in safetensors or npz files, and the decoders of sparse autoencoders.
+
+A file holds arrays (D,) or (K, D) by name. The entry `directions` has, as JSON by name, the site, the role, the
+space and the hash of the weights: in safetensors it is metadata, in npz an array of one text. A direction in the
+space `standardised` has an array NAME.scale (D,), by which it is multiplied. SAELens writes folders with
+`sae_weights.safetensors` and `cfg.json`; there NAME is the number of a feature, whose row of the decoder is
+read.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit.errors import UsageError
+
+ENTRY = "directions"
+SUFFIXES = (".safetensors", ".npz")
+SAE_WEIGHTS, SAE_SETTINGS, DECODER = "sae_weights.safetensors", "cfg.json", "W_dec"
+Space = Literal["raw", "standardised"]
+_SITE_KEYS = ("site", "hook_name")
+
+
+@dataclass(frozen=True)
+class FileDirection:
+    """Vectors of a file in the raw space of a site.
+
+    name: as conditions are called, with a hash of the vectors. vectors: (K, D) float64. site, role, weights: empty
+    where the file does not say. weights: hash of those that it was found in.
+    """
+
+    name: str
+    vectors: NDArray[np.float64] = field(repr=False)
+    site: str = ""
+    role: str = ""
+    weights: str = ""
+
+    @property
+    def basis(self) -> NDArray[np.float32]:
+        """Return (K, D) orthonormal rows that span the vectors."""
+        return np.asarray(np.linalg.qr(self.vectors.T)[0].T, np.float32)
+
+    def check(self, site: str, width: int, weights: str | None) -> None:
+        """Raise UsageError for a site of another name or width, or for other weights."""
+        if self.site and self.site != site:
+            raise UsageError(
+                f"{self.name} is a direction of {self.site}; it cannot be used at {site}. Name that site"
+            )
+        if self.vectors.shape[1] != width:
+            raise UsageError(f"{self.name} has {self.vectors.shape[1]} numbers; {site} has {width}")
+        if self.weights and self.weights != weights:
+            raise UsageError(
+                f"{self.name} was found in the weights {self.weights[:12]}; the run has {str(weights)[:12]}. Take "
+                "a direction of this model"
+            )
+
+
+def names_file(direction: str) -> bool:
+    """Whether a direction is spelled as FILE or FILE#NAME."""
+    path = Path(direction.partition("#")[0])
+    return path.suffix in SUFFIXES or (path / SAE_WEIGHTS).is_file()
+
+
+def read_direction(text: str) -> FileDirection:
+    """Read FILE#NAME; a file of one direction needs no name. Raises UsageError for what holds no direction."""
+    file, _, name = text.partition("#")
+    path = Path(file).expanduser()
+    if (path / SAE_WEIGHTS).is_file():
+        return _of_autoencoder(path, name)
+    if not path.is_file():
+        raise UsageError(f"--direction {text}: there is no file {path}; expected safetensors or npz")
+    arrays, said = _contents(path)
+    names = [own for own in arrays if not own.endswith(".scale")]
+    if name not in names:
+        if name or len(names) != 1:
+            raise UsageError(
+                f"--direction {text}: {path.name} has the directions {', '.join(names[:10]) or 'none'}; expected "
+                f"one of them behind #"
+            )
+        (name,) = names
+    about = said.get(name, {})
+    space = about.get("space", "raw")
+    if space not in ("raw", "standardised"):
+        raise UsageError(f"--direction {text}: the space is {space!r}; expected raw or standardised")
+    vectors = _rows(arrays[name], text)
+    if space == "standardised":
+        if f"{name}.scale" not in arrays:
+            raise UsageError(f"--direction {text}: a standardised direction needs the array {name}.scale")
+        vectors = vectors * _rows(arrays[f"{name}.scale"], text)
+    return _direction(name, vectors, about)
+
+
+def write_directions(
+    path: Path, vectors: Mapping[str, NDArray[Any]], about: Mapping[str, Mapping[str, str]]
+) -> None:
+    """Write directions as `read_direction` reads them. about: site, role, space and weights by name."""
+    arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in vectors.items()}
+    if path.suffix == ".safetensors":
+        from safetensors.numpy import save_file
+
+        save_file(arrays, path, {ENTRY: json.dumps(about)})
+    elif path.suffix == ".npz":
+        np.savez(path, allow_pickle=False, **{ENTRY: np.array(json.dumps(about))}, **arrays)
+    else:
+        raise UsageError(f"{path} is no file of directions; expected the ending {' or '.join(SUFFIXES)}")
+
+
+def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping[str, str]]]:
+    """Return arrays by name, and what is said of each."""
+    try:
+        if path.suffix == ".npz":
+            with open_arrays(path.read_bytes()) as opened:
+                arrays = {name: np.asarray(opened[name]) for name in opened}
+            said = str(arrays.pop(ENTRY, "{}"))
+        else:
+            from safetensors import safe_open
+
+            with safe_open(path, "np") as opened:
+                arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - no mapping
+                said = (opened.metadata() or {}).get(ENTRY, "{}")
+        return arrays, json.loads(said)
+    except (OSError, ValueError, KeyError) as error:
+        raise UsageError(f"{path} holds no directions: {str(error)[:200]}") from error
+    except Exception as error:
+        if type(error).__name__ != "SafetensorError":
+            raise
+        raise UsageError(f"{path} is no safetensors file: {str(error)[:200]}") from error
+
+
+def _of_autoencoder(folder: Path, name: str) -> FileDirection:
+    """Return one feature of a sparse autoencoder that SAELens wrote."""
+    arrays, _ = _contents(folder / SAE_WEIGHTS)
+    if DECODER not in arrays or not name.isdecimal() or int(name) >= len(arrays[DECODER]):
+        count = len(arrays.get(DECODER, ()))
+        raise UsageError(f"{folder} has {count} features; expected {folder.name}#NUMBER, counted from 0")
+    settings = folder / SAE_SETTINGS
+    stored = json.loads(settings.read_text(encoding="utf-8")) if settings.is_file() else {}
+    metadata = stored.get("metadata") or {}
+    about = {"site": next((str(own[key]) for own in (stored, metadata) for key in _SITE_KEYS if own.get(key)), "")}
+    about["weights"] = str(metadata.get("weights") or "")
+    return _direction(f"feature-{name}", _rows(arrays[DECODER][int(name)], folder.name), about)
+
+
+def _rows(values: NDArray[Any], text: str) -> NDArray[np.float64]:
+    rows = np.atleast_2d(np.asarray(values, np.float64))
+    if rows.ndim != 2 or not np.isfinite(rows).all() or (np.linalg.norm(rows, axis=1) == 0).any():
+        raise UsageError(
+            f"--direction {text}: an array of shape {np.shape(values)}; expected (D,) or (K, D), not zero"
+        )
+    return rows
+
+
+def _direction(name: str, vectors: NDArray[np.float64], about: Mapping[str, Any]) -> FileDirection:
+    digest = hashlib.sha256(np.ascontiguousarray(vectors).tobytes()).hexdigest()[:8]
+    plain = "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in name)
+    said = {part: str(about.get(part) or "") for part in ("site", "role", "weights")}
+    return FileDirection(f"{plain}-{digest}", vectors, **said)
