@@ -334,6 +334,8 @@ class ImageSwap(Intervention):
     @classmethod
     def findings(cls, rows: Sequence[ImageSwapEffect], context: TableContext) -> list[str]:
         """Return one short sentence per category: the verdict, and how often a swap turns the action."""
+        if context.lacks_sides:
+            return input_sentences(rows)
         names = [category_of(row.category).title for row in rows]
         width = max(map(len, names), default=0)
         found = []
@@ -382,7 +384,7 @@ def exchanged_effects(measurement: Measurement, swapped: str) -> list[InputEffec
     return input_effects(measurement.outcomes, swapped, vary, measurement.seed_text, measurement.key)
 
 
-def input_table(rows: Sequence[Any], context: TableContext) -> "ResponsiveTable":
+def input_table(rows: Sequence[Any], context: TableContext) -> "Table":
     """Return one line per category and input."""
     title = f"Does the input decide? {context.subject}, {context.exchange}"
     lines = [(f"{row.category} · {row.vary}", row) for row in rows]

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import pytest
 import torch
+from probe_kit.hooks.conformance.examples import examples_for
 from torch import Tensor
 
 from probe_kit.errors import ProbeKitError
@@ -19,7 +20,6 @@ from probe_kit.hooks.conformance.acting import (
     another_seed_gives_another_chunk_where_noise_is_drawn,
 )
 from probe_kit.hooks.conformance.check import CheckFailedError
-from probe_kit.hooks.conformance.examples import examples_for
 from probe_kit.hooks.conformance.subject import ContractSettings, PolicySubject
 from probe_kit.hooks.registry import own_families
 from tests.support.every_checkpoint import WRITERS
