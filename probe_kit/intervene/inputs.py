@@ -8,7 +8,7 @@ import numpy as np
 
 from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, ConditionOutcomes, Effect
 from probe_kit.intervene.patching.sweep import SwapShare, share_fields, share_of_whole
-from probe_kit.statistics.paired_signs import paired_greater_p
+from probe_kit.statistics.paired_tests import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 Finding = Literal["decides", "moves", "no effect", "open"]
