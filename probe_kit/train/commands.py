@@ -104,7 +104,7 @@ def _train(
 ) -> None:
     """Probe the target at the captured inferences that `call` names, and print the best sites."""
     from probe_kit.train import train_probes
-    from probe_kit.train.results.summary import best_sites_sentences, best_sites_table
+    from probe_kit.train.results.summary import best_sites_findings, best_sites_sentences, best_sites_table
 
     read = asked.read(run, seed=options["seed"])
     if not asked.is_side:
@@ -137,7 +137,7 @@ def _train(
             "signal is judged against chance only: add the control random-features, or a --untrained by random "
             "weights"
         )
-    for sentence in best_sites_sentences(fitted[0]):
+    for sentence in (best_sites_sentences if details else best_sites_findings)(fitted[0]):
         out.print(sentence, markup=False, highlight=False)
 
 

@@ -7,8 +7,8 @@ import pytest
 from rich.table import Table
 from rich.text import Text
 
+from probe_kit._tables import table as tables
 from probe_kit._terminal.console import SafeConsole, counter, marked, print_json, print_text
-from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
 
 HOSTILE = "[bold red]x[/] [/unopened] \x1b[2J\u202e:warning:"
 SHOWN = "[bold red]x[/] [/unopened] ␛[2J\ufffd:warning:"
@@ -36,9 +36,7 @@ def a_table() -> Table:
         Text(HOSTILE),
         a_table(),
         marked("[bold]{}[/]", HOSTILE),
-        ResponsiveTable(
-            HOSTILE, HOSTILE, "name", (HOSTILE,), ("",), (Part(HOSTILE, ("a",), ((Cell(HOSTILE),),)),)
-        ),
+        tables.Table.of(HOSTILE, (HOSTILE, HOSTILE), [(HOSTILE, HOSTILE)], notes=[HOSTILE]),
     ],
     ids=["text", "Text", "table", "marked", "fitting table"],
 )

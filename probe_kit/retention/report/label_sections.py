@@ -111,7 +111,4 @@ _TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "contin
 
 
 def _probes_table(results: ProbeResults, title: str) -> Table:
-    shown = best_sites_table([results])
-    (part,) = shown.parts
-    cells = tuple((name, *(cell.text for cell in row)) for name, row in zip(shown.names, part.rows, strict=True))
-    return Table.of(title, ("stream", *part.headings), cells, notes=[shown.caption])
+    return replace(best_sites_table([results]), title=title)

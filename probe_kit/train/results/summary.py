@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from probe_kit._system.counting import counted
-from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
+from probe_kit._tables.table import Table
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.suite.categories import category_of
 from probe_kit.train.crossval.task_scores import METRICS
@@ -28,35 +28,38 @@ _SIDES = {
 # -- the table of a terminal -----------------------------------------------------------------------------------
 
 
-def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> ResponsiveTable:
+def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Table:
     """Return a row per category, stream, view and captured inference, and per control of a target that is no side.
 
     fitted: probes of one target in a run, one per inference. Controls of a side are in the table with `splits`.
     """
     first, several_calls = fitted[0].settings, len(fitted) > 1
     several_views, metric = len(first.views) > 1, "accuracy %" if first.is_side else METRICS[first.task]
-    names, cells = [], []
+    rows: list[tuple[str, ...]] = []
     for results in fitted:
         call = [f"call {results.settings.call}"] * several_calls
         for row in _best(results):
             view = [str(row["view"])] * several_views
-            names.append(" · ".join([_name(results, row["category"], row["stream"]), *view, *call]))
-            cells.append(_cells(results, row))
+            name = " · ".join([_name(results, row["category"], row["stream"]), *view, *call])
+            rows.append((name, *_cells(results, row)))
         for control in results.controls.scores if splits or not first.is_side else ():
             view = [control.view] * (several_views and bool(control.view))
             where = _name(results, control.category, control.stream)
-            names.append(" · ".join(filter(None, [f"control {control.name}", where, *view, *call])))
-            cells.append(_control_cells(control, first.is_side))
-    headings = ("best site", f"{metric} [95 %]", "chance", "family-wise p", "exceeds", "n", "first iteration")
-    return ResponsiveTable(
-        title=", ".join(_title(fitted, several_views)),
-        caption=_LEGEND + (_OF_SIDE if first.is_side else _OF_LABEL),
-        name="category" if first.is_side else "stream",
-        names=tuple(names),
-        styles=("",) * len(names),
-        parts=(Part("Best sites", headings, tuple(tuple(map(Cell, row)) for row in cells)),),
-        splits=splits,
+            name = " · ".join(filter(None, [f"control {control.name}", where, *view, *call]))
+            rows.append((name, *_control_cells(control, first.is_side)))
+    headings = (
+        "category" if first.is_side else "stream",
+        "best site",
+        f"{metric} [95 %]",
+        "chance",
+        "family-wise p",
+        "exceeds",
+        "n",
+        "first iteration",
     )
+    notes = [_LEGEND + (_OF_SIDE if first.is_side else _OF_LABEL)]
+    overflow = "split" if splits else "leave out"
+    return Table.of(", ".join(_title(fitted, several_views)), headings, rows, notes=notes, overflow=overflow)
 
 
 def _title(fitted: Sequence[ProbeResults], several_views: bool) -> Iterator[str]:
@@ -118,17 +121,61 @@ def best_sites_sentences(results: ProbeResults) -> list[str]:
 
     Of a side the first view alone, and whether the pictures alone decode it.
     """
+    sentences = _left_out(results)
+    for view, category, rows in _places(results):
+        parts = "; ".join(_in_stream(results, row) for row in rows)
+        sentences.append(
+            f"{_subject(results, category, view, rows[0])} is {parts}.{_from_pictures(results, category)}"
+        )
+    return sentences
+
+
+def best_sites_findings(results: ProbeResults) -> list[str]:
+    """Return the last lines of the command: the same in short, without intervals."""
     own = results.settings
-    sentences = [f"left out: {count} {reason}" for reason, count in results.left_out.items()]
-    sentences += [f"control {name} was not run: {reason}" for name, reason in results.controls.left_out.items()]
-    rows = _best(results)
+    lines = []
+    for view, category, rows in _places(results):
+        by_pictures = ["the pictures alone decode it too"] * bool(_from_pictures(results, category))
+        name = category_of(category).title if own.is_side else own.target
+        if not own.is_side:
+            name = ", ".join([name, *[category] * (own.categories != ("all",)), *[view] * (len(own.views) > 1)])
+        lines.append((name, "; ".join([*_findings(results, rows), *by_pictures])))
+    width = max((len(name) for name, _ in lines), default=0)
+    return [*_left_out(results), *(f"{name.ljust(width)}  {said}." for name, said in lines)]
+
+
+def _places(results: ProbeResults) -> "Iterator[tuple[str, str, list[pd.Series]]]":
+    """Yield view, category and the best sites of each stream; of a side in the first view alone."""
+    rows, own = _best(results), results.settings
     for view in own.views[:1] if own.is_side else own.views:
         for category in dict.fromkeys(str(row["category"]) for row in rows):
-            of_place = [row for row in rows if (row["category"], row["view"]) == (category, view)]
-            parts = "; ".join(_in_stream(results, row) for row in of_place)
-            pictures = _from_pictures(results, category) if own.is_side else ""
-            sentences.append(f"{_subject(results, category, view, of_place[0])} is {parts}.{pictures}")
-    return sentences
+            yield view, category, [row for row in rows if (row["category"], row["view"]) == (category, view)]
+
+
+def _left_out(results: ProbeResults) -> list[str]:
+    return [
+        *(f"left out: {count} {reason}" for reason, count in results.left_out.items()),
+        *(f"control {name} was not run: {reason}" for name, reason in results.controls.left_out.items()),
+    ]
+
+
+def _findings(results: ProbeResults, rows: "Sequence[pd.Series]") -> Iterator[str]:
+    """Yield where the target is decodable, the first two streams with their scores, and where it is not shown."""
+    decodable: list[str] = []
+    open_: dict[str, list[str]] = {}
+    for row in rows:
+        stream, (met, missed) = f"the {label_of(row['stream'])}", _exceeded(results, row)
+        score = f"{100 * row['score']:.0f} %" if results.settings.is_side else f"{row['score']:.2f}"
+        if "chance" not in (*met, *missed):
+            open_.setdefault("not tested in {}: fit with permutations", []).append(stream)
+        elif missed:
+            open_.setdefault(f"not shown in {{}} beyond {' and '.join(missed)}", []).append(stream)
+        else:
+            decodable.append(f"{stream}, {score}" if len(decodable) < 2 else stream)
+    if decodable:
+        yield f"decodable in {' and '.join(decodable)}"
+    for words, streams in open_.items():
+        yield words.format(" and ".join(streams))
 
 
 def _subject(results: ProbeResults, category: str, view: str, row: "pd.Series") -> str:
@@ -163,7 +210,7 @@ def _numbers(results: ProbeResults, row: "pd.Series") -> str:
 
 def _from_pictures(results: ProbeResults, category: str) -> str:
     """Return a sentence where the control `pixels` decodes the target, for no model has to know it then."""
-    pixels = results.controls.of_category(category).get("pixels")
+    pixels = results.controls.of_category(category).get("pixels") if results.settings.is_side else None
     if pixels is None or not pixels.above_chance:
         return ""
     accuracy, low, high = (f"{100 * share:.0f}" for share in (pixels.score, *pixels.ci))

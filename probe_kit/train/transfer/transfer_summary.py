@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from probe_kit._system.counting import counted
-from probe_kit._terminal.responsive_table import Cell, Part, ResponsiveTable
+from probe_kit._tables.table import Table
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.task_scores import METRICS
@@ -19,28 +19,16 @@ _LEGEND = (
 )
 
 
-def transfer_table(results: TransferResults, splits: bool = True) -> ResponsiveTable:
+def transfer_table(results: TransferResults, splits: bool = True) -> Table:
     """A row per stream and view for its best site."""
     several, metric = len(results.curves) > 1, METRICS[results.task]
     best = _best(results)
-    names = tuple(" · ".join([label_of(row["stream"]), *[row["view"]] * several]) for row in best)
+    rows = [(" · ".join([label_of(row["stream"]), *[row["view"]] * several]), *_cells(row)) for row in best]
     said = [f"{results.target}: {metric}", f"{results.model} to {results.other_model}"]
     said += ["OTHER WEIGHTS"] * (not results.same_weights)
-    return ResponsiveTable(
-        title=", ".join(said),
-        caption=_LEGEND,
-        name="stream",
-        names=names,
-        styles=("",) * len(names),
-        parts=(
-            Part(
-                "Best sites",
-                ("best site", f"{metric} [95 %]", "chance", "family-wise p", "recentred", "own [95 %]"),
-                tuple(tuple(map(Cell, _cells(row))) for row in best),
-            ),
-        ),
-        splits=splits,
-    )
+    headings = ("stream", "best site", f"{metric} [95 %]", "chance", "family-wise p", "recentred", "own [95 %]")
+    overflow = "split" if splits else "leave out"
+    return Table.of(", ".join(said), headings, rows, notes=[_LEGEND], overflow=overflow)
 
 
 def transfer_sentences(results: TransferResults) -> list[str]:
