@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.rollout.examples import example_observations
 from probe_kit.hooks import AnswerModel, Model, Policy, load_model
 from probe_kit.hooks.contract.model import Prompt
+from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
 
 # The tests' folder is no installed package, and an installed one may have its name.
@@ -205,7 +205,10 @@ def subject(
     if checkpoint is None:
         checkpoint, options = str(written(family, folder / "tiny")), WRITERS[family][1]
     model = load_model(family, checkpoint, device, dtype, random_weights=True, **options)
-    seen = example_observations(SceneSpec(), [INSTRUCTION] * min(batch, model.card.batch or batch))
+    scene = SceneSpec()
+    picture, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
+    one = Observation(picture, state, INSTRUCTION, scene.intrinsics)
+    seen = [one] * min(batch, model.card.batch or batch)
     if isinstance(model, Policy):
         policy = model  # named, for the closure
         return Subject(

@@ -20,7 +20,7 @@ import zarr
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract import Extraction, ExtractSettings, prepare
-from probe_kit.extract.plan import Plan, make_plan
+from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
 from probe_kit.hooks import Observation
@@ -33,6 +33,7 @@ from probe_kit.runs.layout import CODECS, StoredStream
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite, build_suite
+from tests.support.plans import make_plan
 
 LAYERS, VIEWS, TOKENS = 19, ("mean", "last", "mean:language", "mean:image"), 816
 SITE = Site("backbone", 11)

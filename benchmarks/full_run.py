@@ -21,8 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.plan import Plan, PlannedEpisode, make_plan
-from probe_kit.extract.rollout.stage import Ending, Stage
+from probe_kit.extract.plan import Plan, Row
+from probe_kit.extract.sources.player import Ending
+from probe_kit.extract.sources.scene_player import ScenePlayer
+from probe_kit.extract.sources.source import Played as PlayerOptions
 from probe_kit.runs import Run, open_run, seal
 from probe_kit.runs.layout import COMMITS, StoredStream
 from probe_kit.runs.store import locate
@@ -31,6 +33,7 @@ from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite, build_suite
 from probe_kit.suite.generators import GENERATORS
 from probe_kit.train import train_probes
+from tests.support.plans import make_plan
 
 WIDTH = 16
 STREAMS = (
@@ -55,7 +58,7 @@ def play(plan: Plan, scene: SceneSpec, per_script: int) -> dict[str, list[Played
     found: dict[str, list[Played]] = defaultdict(list)
     stride = max(1, len(plan.episodes) // per_script)
     for script in SCRIPTS:
-        stage = Stage(scene, script, frames="ends")
+        stage = ScenePlayer(scene, PlayerOptions("ends", script=script))
         try:
             for planned in plan.episodes[::stride][:per_script]:
                 ending = stage.begin(planned, False)
@@ -70,10 +73,10 @@ def play(plan: Plan, scene: SceneSpec, per_script: int) -> dict[str, list[Played
     return found
 
 
-def episode(planned: PlannedEpisode, played: dict[str, list[Played]], knows: bool) -> tuple[EpisodeRecord, Played]:
+def episode(planned: Row, played: dict[str, list[Played]], knows: bool) -> tuple[EpisodeRecord, Played]:
     """One episode: right in 7 of 10 where the category is known, else anywhere. The same numbers every time."""
     draw = np.random.default_rng([SEED, planned.index])
-    correct = planned.episode.side_correct
+    correct = planned.content.side_correct
     other = "right" if correct == "left" else "left"
     weights = (0.7, 0.2, 0.1) if knows else (0.3, 0.3, 0.4)
     placed = str(draw.choice([correct, other, "none"], p=weights))
@@ -110,7 +113,7 @@ def write_full_run(folder: Path, episodes: int, say: Callable[[str], None] = pri
     began = time.process_time()
     suite, scene = small_suite(folder / "suite", episodes), SceneSpec()
     plan = planned_run(suite, episodes)
-    known = set(list(dict.fromkeys(one.episode.item.category for one in plan.episodes))[::2])
+    known = set(list(dict.fromkeys(one.content.item.category for one in plan.episodes))[::2])
     settings = {
         "model": "synthetic", "weights_sha256": None, "random_weights": False, "captured_calls": 1,
         "tokens": "pooled", "codec": "zstd", "seed": SEED,
@@ -124,7 +127,7 @@ def write_full_run(folder: Path, episodes: int, say: Callable[[str], None] = pri
         played = play(plan, scene, 12)
         for number in remaining:
             planned = plan.episodes[number]
-            record, one = episode(planned, played, planned.episode.item.category in known)
+            record, one = episode(planned, played, planned.content.item.category in known)
             writer.write(replace(record, pictures={thumbnail_key(number): as_thumbnail(one.ends)}))
         say(f"written: {len(remaining)} episodes, {time.process_time() - began:.0f} CPU-s")
         began = time.process_time()

@@ -24,9 +24,10 @@ from unittest.mock import patch
 import google_crc32c
 import numpy as np
 
-from probe_kit.extract.plan import Plan, PlannedEpisode, make_plan
+from probe_kit.extract.plan import Plan, Row
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
+from probe_kit.extract.sources.scene_source import scene_row
 from probe_kit.runs import open_run, seal, verify_run
 from probe_kit.runs.commits import Commit, commit_key, write_commit
 from probe_kit.runs.layout import DATA, StoredStream
@@ -35,6 +36,7 @@ from probe_kit.runs.seconds import NOT_MEASURED, write_seconds
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite, build_suite
+from tests.support.plans import make_plan
 
 BACKBONE = StoredStream("backbone", 19, 512, None, 816, ("mean", "last", "mean:language", "mean:image"))
 EXPERT = StoredStream("expert", 19, 64, 10, 51, ("mean", "mean:action"))
@@ -185,20 +187,20 @@ def large_run(suite: Suite, run: Path, episodes: int) -> None:
             objects[new] = known
             (run / DATA / new).parent.mkdir(parents=True)
             os.link(run / DATA / key, run / DATA / new)
-        one = {**commit, "episode": number, "episode_id": many[number].episode.episode_id, "objects": objects}
+        one = {**commit, "episode": number, "episode_id": many[number].episode_id, "objects": objects}
         write_seconds(writer.root, number, replace(NOT_MEASURED, inference=0.0, simulation=0.0))
         write_commit(writer.location, Commit.model_validate(one))
 
 
-def _of_many(plan: Plan, episodes: tuple[PlannedEpisode, ...]) -> Plan:
+def _of_many(plan: Plan, episodes: tuple[Row, ...]) -> Plan:
     """The plan with these episodes, whose items its suite then holds."""
-    items = tuple(planned.episode.item for planned in episodes)
+    items = tuple(planned.content.item for planned in episodes)
     return replace(plan, suite=replace(plan.suite, items=items), episodes=episodes)
 
 
-def _numbered(planned: PlannedEpisode, number: int) -> PlannedEpisode:
-    item = replace(planned.episode.item, item_id=f"color-{number:05d}")
-    return replace(planned, index=number, episode=replace(planned.episode, item=item))
+def _numbered(planned: Row, number: int) -> Row:
+    item = replace(planned.content.item, item_id=f"color-{number:05d}")
+    return scene_row(number, replace(planned.content, item=item), 0, 0)
 
 
 def parse_commits(run: Path) -> None:

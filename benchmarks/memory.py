@@ -13,9 +13,10 @@ from itertools import cycle, islice
 from pathlib import Path
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.plan import make_plan
-from probe_kit.extract.rollout.stage import Stage
+from probe_kit.extract.sources.scene_player import ScenePlayer
+from probe_kit.extract.sources.source import Played
 from probe_kit.suite import build_suite
+from tests.support.plans import make_plan
 
 
 def resident_megabytes() -> float:
@@ -34,7 +35,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         suite = build_suite(Path(folder) / "suite", None, options.items)
         planned = make_plan(suite, [], 0, 1, True).episodes
-        stage = Stage(SceneSpec(max_steps=options.actions), "idle", frames="ends")
+        stage = ScenePlayer(SceneSpec(max_steps=options.actions), Played("ends", script="idle"))
         began, every = time.process_time(), max(1, options.episodes // options.lines)
         print(f"{len(planned)} episodes in the suite, {resident_megabytes():.0f} MB before the first", flush=True)
         for number, episode in enumerate(islice(cycle(planned), options.episodes), start=1):

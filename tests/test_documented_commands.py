@@ -159,18 +159,19 @@ LOOKED_FOR = {
 
 def _stop_with(*asked: Any, **_: Any) -> Any:
     """In place of loading a model: what can be wrong with the settings before."""
-    from probe_kit.extract.prepared import as_protocol
+    from probe_kit.extract.preparation import check_meaningless
     from probe_kit.extract.rollout.controllers import SCRIPTED
-    from probe_kit.extract.rollout.settings_checks import check_meaningless
+    from probe_kit.extract.settings import AskSettings, ExtractSettings
     from probe_kit.hooks.contract.options import check_options
     from probe_kit.hooks.registry import find_family
 
-    for settings in (as_protocol(one) for one in asked if not isinstance(one, str | None)):
-        if settings.model not in SCRIPTED:
-            family = find_family(settings.model, tuple(SCRIPTED))
-            check_options(family.name, family.options, settings.options)
-            assert family.acts != hasattr(settings, "prompt")
+    for settings in (one for one in asked if not isinstance(one, str | None)):
         check_meaningless(settings)
+        followed = settings.followed() if isinstance(settings, ExtractSettings) else settings
+        if followed.model.family not in SCRIPTED:
+            family = find_family(followed.model.family, tuple(SCRIPTED))
+            check_options(family.name, family.options, followed.model.options)
+            assert family.acts != isinstance(settings, AskSettings)
     raise UsageError("accepted so far")
 
 

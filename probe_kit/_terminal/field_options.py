@@ -115,6 +115,7 @@ def command_with(
         run.__signature__ = inspect.Signature([context, *keyword])  # type: ignore[attr-defined]
         run.__annotations__ = {one.name: one.annotation for one in (context, *keyword)}
         run.__name__, run.__doc__, run.__module__ = command.__name__, command.__doc__, command.__module__
+        run.__wrapped__ = command  # type: ignore[attr-defined]
         del first
         return run
 

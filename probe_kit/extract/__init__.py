@@ -6,10 +6,10 @@ from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction, ask_run, extract_run, prepare, prepare_asks
-    from probe_kit.extract.own_environments.contract import EnvEpisode, OwnEnvironment, Step
-    from probe_kit.extract.own_environments.source_contract import check_environment
     from probe_kit.extract.settings import AskSettings, ExtractSettings
     from probe_kit.extract.sources.environment import EnvSource
+    from probe_kit.extract.sources.environment_check import check_environment
+    from probe_kit.extract.sources.environment_contract import EnvEpisode, OwnEnvironment, Step
     from probe_kit.extract.sources.recording import LeRobotSource
     from probe_kit.extract.vqa.templates import TEMPLATES
 
@@ -37,11 +37,11 @@ __getattr__, __dir__ = lazy_names(
         "AskSettings": "settings",
         "ExtractSettings": "settings",
         "Extraction": "extraction",
-        "EnvEpisode": "own_environments.contract",
+        "EnvEpisode": "sources.environment_contract",
         "EnvSource": "sources.environment",
-        "OwnEnvironment": "own_environments.contract",
-        "Step": "own_environments.contract",
-        "check_environment": "own_environments.source_contract",
+        "OwnEnvironment": "sources.environment_contract",
+        "Step": "sources.environment_contract",
+        "check_environment": "sources.environment_check",
         "LeRobotSource": "sources.recording",
         "ask_run": "extraction",
         "extract_run": "extraction",

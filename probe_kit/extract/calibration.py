@@ -9,16 +9,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.controllers import PolicyController
-from probe_kit.extract.rollout.examples import example_observations
-from probe_kit.extract.rollout.stage import Ending, Stage
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.sources.player import Ending
+from probe_kit.extract.sources.source import Played, Source
 from probe_kit.hooks.contract.observation import Observation
 
 LARGEST = 64
@@ -62,7 +63,7 @@ class Calibration:
 
 
 def calibrated(
-    settings: ExtractSettings, controller: PolicyController, plan: Plan
+    settings: ExtractSettings, controller: PolicyController, source: Source[Any], plan: Plan
 ) -> tuple[ExtractSettings, Calibration]:
     """`settings` with a batch and simulating processes chosen for this machine, and what led to them.
 
@@ -70,11 +71,11 @@ def calibrated(
     """
     if settings.machine.env_workers is not None:
         raise UsageError("--batch auto chooses batch and simulating processes: leave out --env-workers")
-    example = example_observations(settings.scene, [plan.episodes[0].instruction])[0]
+    example = source.example(plan.episodes[0].instruction)
     most = largest_batch(controller.policy.card.batch, len(plan.episodes))
     with torch_threads(controller.threads):
         times = inference_times(lambda batch: _infer(controller, example, batch), most)
-    found = choose(times, _turn(settings, controller, plan), cores_here())
+    found = choose(times, _turn(settings, controller, source, plan), cores_here())
     return settings.changed(batch=found.batch, env_workers=found.env_workers), found
 
 
@@ -143,11 +144,11 @@ def _infer(controller: PolicyController, example: Observation, batch: int) -> No
         raise MemoryError(str(error)) from error
 
 
-def _turn(settings: ExtractSettings, controller: PolicyController, plan: Plan) -> float:
+def _turn(settings: ExtractSettings, controller: PolicyController, source: Source[Any], plan: Plan) -> float:
     """Seconds per inference that a simulator takes, with zero actions; setting up counts once per episode."""
-    stage = Stage(settings.scene, None)
+    player = source.play(Played())()
     try:
-        setting_up = _seconds(lambda: stage.begin(plan.episodes[0], False))
+        setting_up = _seconds(lambda: player.begin(plan.episodes[0], False))
         if controller.capture_only:
             return setting_up
         steps = min(controller.execute, max(1, settings.scene.max_steps // (TURNS + 1)))
@@ -155,11 +156,11 @@ def _turn(settings: ExtractSettings, controller: PolicyController, plan: Plan) -
         began, turns = perf_counter(), 0
         while turns < TURNS:
             turns += 1
-            if isinstance(stage.advance(actions), Ending):
+            if isinstance(player.advance(actions), Ending):
                 break
         per_step = (perf_counter() - began) / (turns * steps)
     finally:
-        stage.close()
+        player.close()
     inferences = -(-settings.scene.max_steps // controller.execute)
     return per_step * controller.execute + setting_up / inferences
 

@@ -8,20 +8,15 @@ from probe_kit._system.counting import counted
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, out, print_json, progress, say
 from probe_kit._terminal.field_options import command_with
-from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.extract import command_options as start
 from probe_kit.extract.config_files import read_config
 from probe_kit.extract.settings import ExtractSettings
 
 if TYPE_CHECKING:
-    from probe_kit.env import SceneSpec
     from probe_kit.extract import Extraction
-    from probe_kit.extract.own_environments.environment_plan import EnvironmentPlan
-    from probe_kit.extract.recordings.recorded_plan import RecordedPlan
     from probe_kit.extract.settings import Settings
     from probe_kit.runs import Run
     from probe_kit.runs.location import Location
-    from probe_kit.suite.wording import Wording
 
 
 LARGE = 64 * 10**9
@@ -87,7 +82,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         **_weights_row(extraction),
         **_units_row(extraction.settings),
         **_protocol_row(identity),
-        **_rows_of_plan(extraction),
+        **extraction.source.describe(plan.episodes),
         **({"grows": growth.words} if growth and growth.words else {}),
         "streams": ("; ".join(_describe(s) for s in plan.streams) or "none") + source,
         **_acts_row(identity),
@@ -145,64 +140,10 @@ def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> 
         )
 
 
-def _rows_of_plan(extraction: "Extraction") -> dict[str, str]:
-    """What is shown to the model."""
-    from probe_kit.extract.own_environments.environment_plan import EnvironmentPlan
-    from probe_kit.extract.plan import Plan
-    from probe_kit.extract.recordings.recorded_plan import RecordedPlan
-
-    plan = extraction.plan
-    if isinstance(plan, RecordedPlan):
-        return recorded_facts(plan)
-    if isinstance(plan, EnvironmentPlan):
-        return played_facts(plan)
-    assert isinstance(plan, Plan)
-    return {
-        "suite": plan.suite.identity,
-        "categories": ", ".join(plan.suite.categories),
-        "scene": _describe_scene(extraction.settings.scene),
-        "episodes": f"{len(plan.episodes)} ({counted(len(plan.suite.items), 'item')} in both layouts)",
-        **({} if plan.skipped is None else {"wordings": _describe_wordings(plan.skipped)}),
-    }
-
-
-def recorded_facts(plan: "RecordedPlan") -> dict[str, str]:
-    """Data set, cameras and frames of a plan, in words."""
-    own, source = plan.dataset, {one.source_episode for one in plan.episodes}
-    turned = dict(own["rotations"])
-    cameras = [
-        f"{camera} from {feature} ({kind})" + (f", rotated by {turned[camera]}°" if camera in turned else "")
-        for camera, feature, kind in own["cameras"]
-    ]
-    where = f"{own['repo']}@{own['revision']}" if "repo" in own else plan.name
-    return {
-        "data set": f"{terminal_safe(where)}, {own['fps']:g} frames per second",
-        "cameras": terminal_safe("; ".join(cameras)) or "mapped when the model is loaded",
-        "frames": f"{plan.frames} of {len(source)} episodes ({own['frames']}), in {len(plan.episodes)} rows",
-    }
-
-
-def played_facts(plan: "EnvironmentPlan") -> dict[str, str]:
-    """Environment, cameras, facts and episodes of a plan, in words."""
-    own, groups = plan.environment, {one.to_json()["group_id"] for one in plan.episodes}
-    if not own:
-        return {
-            "environment": terminal_safe(plan.name),
-            "episodes": f"{len(plan.episodes)} in {len(groups)} groups",
-        }
-    return {
-        "environment": terminal_safe(f"{plan.name} ({own['revision']})"),
-        "cameras": terminal_safe(", ".join(own["cameras"])),
-        "actions": terminal_safe(", ".join(own["names"]["action"])),
-        "facts": terminal_safe(", ".join(own["columns"])) or "none",
-        "episodes": f"{len(plan.episodes)} in {len(groups)} groups, at most {own['max_steps']} actions each",
-    }
-
-
 def _acts_row(identity: Mapping[str, Any]) -> dict[str, str]:
     if not identity.get("capture_only"):
         return {}
-    shown = "recorded frames are shown" if "dataset" in identity else "only captured, once per episode"
+    shown = "only captured, once per episode" if "scene" in identity else "recorded frames are shown"
     return {"acts": f"no: {shown}; no success rate"}
 
 
@@ -210,36 +151,21 @@ def print_sufficiency(extraction: "Extraction") -> None:
     """What the plan is enough for, said before any work; too few items in yellow."""
     from rich.table import Table
 
-    from probe_kit.extract.plan import Plan
-    from probe_kit.extract.recordings.recorded_plan import RecordedPlan
     from probe_kit.suite.validation.sufficiency import GROUPS_FOR_PROBES, Smallest, sufficiencies
 
-    plan, scored = extraction.plan, not extraction.identity().get("capture_only")
-    if not isinstance(plan, Plan):
-        groups = len({row.to_json()["group_id"] for row in plan.episodes})
+    plan, source, suite = extraction.plan, extraction.source, extraction.source.suite
+    if suite is None:
+        groups = len({row.columns["group_id"] for row in plan.episodes})
         if groups < GROUPS_FOR_PROBES:
-            kind = "recorded episodes" if isinstance(plan, RecordedPlan) else "groups of episodes"
-            say(marked("[yellow]{} {}; probes need {} or more[/]", groups, kind, GROUPS_FOR_PROBES))
+            say(marked("[yellow]{} {}; probes need {} or more[/]", groups, source.groups, GROUPS_FOR_PROBES))
         return
-    table = Table(show_header=False, title=f"enough for ({Smallest.of(plan.suite).words})", box=None)
+    scored = not extraction.identity().get("capture_only")
+    table = Table(show_header=False, title=f"enough for ({Smallest.of(suite).words})", box=None)
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
-    for one in sufficiencies(plan.suite, scored, bool(plan.streams)):
+    for one in sufficiencies(suite, scored, bool(plan.streams)):
         table.add_row(one.name, marked("[yellow]{}[/]" if one.enough is False else "{}", one.words))
     err.print(table)
-
-
-def _describe_scene(scene: "SceneSpec") -> str:
-    """The preset, and how long an episode may last."""
-    early = ", less once the cube was released and rests" if scene.early_stop else ""
-    return f"{scene.name}, at most {scene.max_steps} actions{early}"
-
-
-def _describe_wordings(skipped: "Mapping[Wording, int]") -> str:
-    """Their names, and how many items are left out of each."""
-    return ", ".join(
-        f"{name} ({count} items have none: skipped)" if count else name for name, count in skipped.items()
-    )
 
 
 def _pace_row(extraction: "Extraction") -> dict[str, str]:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 from probe_kit._system.counting import counted
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import EpisodesFailedError, UsageError
+from probe_kit.extract.events import Done, Failed
 from probe_kit.extract.needs import space_needed
-from probe_kit.extract.plan import RowPlan
-from probe_kit.extract.prepared import Prepared, as_protocol, check_run, load, load_answer_model
-from probe_kit.extract.rollout.events import Done, Failed
+from probe_kit.extract.plan import Plan
+from probe_kit.extract.preparation import Prepared, load, load_answer_model, open_checked
 from probe_kit.extract.settings import (
     AskSettings,
     ExtractSettings,
@@ -82,7 +82,7 @@ class Extraction(Prepared):
             root.check_continuable()
             check_other_settings(root.own_settings, json.loads(canonical_json(self.identity())), str(location))
 
-    def further_plan(self, location: Location) -> RowPlan:
+    def further_plan(self, location: Location) -> Plan:
         """The plan of the episodes that the run at `location` does not plan yet: all of them where there is none.
 
         Raises SettingsMismatchError if the run there cannot grow by this plan, and RunDamagedError.
@@ -95,7 +95,7 @@ class Extraction(Prepared):
         added = {row["episode_id"] for row in rows}
         return self.plan.only(one for one in self.plan.episodes if one.episode_id in added)
 
-    def _play(self, writer: RunWriter[RowPlan], remaining: list[int], progress: Progress | None) -> None:
+    def _play(self, writer: RunWriter[Plan], remaining: list[int], progress: Progress | None) -> None:
         total, done, given_up = len(self.plan.episodes), 0, list[Failed]()
         with closing(play(self, writer, remaining)) as events:
             for event in events:
@@ -113,7 +113,7 @@ class Extraction(Prepared):
             raise _failure(writer, given_up, done)
 
 
-def _failure(writer: RunWriter[RowPlan], given_up: list[Failed], done: int) -> EpisodesFailedError:
+def _failure(writer: RunWriter[Plan], given_up: list[Failed], done: int) -> EpisodesFailedError:
     error = EpisodesFailedError(
         f"{counted(len(given_up), 'episode')} failed twice and were given up; {done} others were finished and are "
         "kept. The same command tries them again; --partial reads the run without them"
@@ -139,16 +139,15 @@ def prepare(
     the family declares, without weights, network or GPU; such an extraction cannot be run.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
-    settings = as_protocol(settings)
     location = None if out is None else locate(out)
-    if settings.machine.workers or settings.machine.ray:
+    if settings.machine.elsewhere:
         # This process only plans; the GPUs belong to the workers.
         # Each worker calibrates on its own device.
         measures = {"batch": 1} if settings.machine.batch == "auto" else {}
         here = settings.changed(device="cpu", **measures)
         planned = load(here, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
         chosen = planned.settings.changed(device=settings.machine.device, batch=settings.machine.batch)
-        return Extraction(chosen, planned.plan, planned.card, None, declared=planned.declared)
+        return Extraction(chosen, planned.source, planned.plan, planned.card, None, declared=planned.declared)
     prepared = load(settings, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
     return Extraction(**{field.name: getattr(prepared, field.name) for field in fields(prepared)})
 
@@ -173,7 +172,7 @@ def prepare_asks(
     Raises what `prepare` raises.
     """
     for own, out in zip(settings, outs, strict=True):
-        check_run(own, None if out is None else locate(out), fetch=fetch)
+        open_checked(own, None if out is None else locate(out), fetch=fetch)
     if not fetch:
         yield from (prepare(own, out, fetch=False) for own, out in zip(settings, outs, strict=True))
         return

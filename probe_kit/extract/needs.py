@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract.plan import RowPlan
+from probe_kit.extract.plan import Plan
 from probe_kit.extract.settings import Settings
 from probe_kit.hooks.contract.views import view_names
 from probe_kit.hooks.family import DTYPES
@@ -33,7 +33,7 @@ REPORT = 5_000_000
 """Bytes of a report with its figures."""
 
 
-def space_needed(plan: RowPlan, settings: Settings) -> dict[str, int]:
+def space_needed(plan: Plan, settings: Settings) -> dict[str, int]:
     """Bytes by part, uncompressed. Probes are those of one view; more views take as much again each."""
     return space_of(plan.streams, len(plan.episodes), settings)
 

@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
+from inspect import Parameter, Signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, Self
 
@@ -56,6 +57,11 @@ def _checked_label(label: str | None) -> str | None:
     return label
 
 
+def _model_of(settings: "type[Settings]", part: str) -> Any:
+    """The model of a part; the base class, which is never made, has several."""
+    return settings.model_fields[part].annotation
+
+
 class Settings(Part):
     """Settings of a run of any kind; the defaults are the command line's.
 
@@ -84,6 +90,16 @@ class Settings(Part):
         Raises UsageError and SceneError for values that cannot be used, TypeError for a name that is no field.
         """
         super().__init__(**self._by_part(model, values))
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Give `help` and editors every keyword with its default: fields of all parts by their names."""
+        models = [*(_model_of(cls, part) for part in _PARTS), SceneSettings, SceneOptions, cls]
+        fields = {name: info for model in models for name, info in model.model_fields.items() if name != "kind"}
+        defaults = {name: None if info.is_required() else info.default for name, info in fields.items()}
+        names = ["model", *(name for name in defaults if name not in ("family", "model"))]
+        kind = Parameter.POSITIONAL_OR_KEYWORD
+        cls.__signature__ = Signature([Parameter(name, kind, default=defaults.get(name)) for name in names])
 
     @classmethod
     def _by_part(cls, model: Any, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -134,8 +150,8 @@ class Settings(Part):
         if kind is SceneSettings:
             values |= fields
         else:
-            if refused := [name for name in values if name in kind.decides]:
-                _refuse(refused, kind)
+            if "captured_calls" in values and kind is LeRobotSource:
+                _refuse(["captured_calls"], kind)
             known = dict(before.source) if before is not None and isinstance(before.source, kind) else {}
             values["source"] = kind(**{**known, **fields})
         return cls(values.pop("family", None), **values) if before is None else before.changed(**values)
@@ -190,6 +206,16 @@ class Settings(Part):
         }
         calls = {"captured_calls": self.capture.captured_calls}
         return {**model, "seed": self.seed, **self.capture.model_dump(mode="json"), **calls}
+
+    def chosen(self) -> dict[str, Any]:
+        """The fields of all parts but the source that differ from their defaults, by name."""
+        parts = [getattr(self, part) for part in _PARTS]
+        values = {
+            name: value for part in parts for name, value in part if value != type(part).model_fields[name].default
+        }
+        return {
+            name: value for name, value in values.items() if name != "family" and (name, value) != ("batch", 1)
+        }
 
     def marks(self) -> list[str]:
         """The parts of a label behind the model and its checkpoint."""
@@ -334,9 +360,20 @@ class AskSettings(Settings):
         ]
 
 
-def _model_of(settings: type[Settings], part: str) -> Any:
-    """The model of a part; the base class, which is never made, has several."""
-    return settings.model_fields[part].annotation
+def refuse(settings: Settings, names: Iterable[str], why: str) -> None:
+    """Raise UsageError for fields that were chosen and have no effect.
+
+    names: of fields, or NAME=VALUE where only that value has none. why: the rest of the sentence.
+    """
+    chosen, wrong = settings.chosen(), []
+    flags = {one.field: one.flag for part in _PARTS for one in options_of(type(getattr(settings, part)))}
+    for name, _, value in (text.partition("=") for text in names):
+        if name == "options":
+            wrong += [f"-M {option}" for option in chosen.get(name, {})]
+        elif name in chosen and (not value or chosen[name] == value):
+            wrong.append(" ".join(filter(None, (flags.get(name, name), value))))
+    if wrong:
+        raise UsageError(f"{', '.join(wrong)} {why}")
 
 
 def _refuse(names: Iterable[str], source: type[SourceSettings]) -> NoReturn:

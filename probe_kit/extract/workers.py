@@ -9,16 +9,16 @@ from typing import Any
 from probe_kit._execution.executor import GivenUp, Pool, TaskQueue, work_off
 from probe_kit._execution.process_pool import ProcessPool, share_of_machine
 from probe_kit._execution.ray_pool import RayPool
-from probe_kit.extract.plan import RowPlan
-from probe_kit.extract.prepared import Prepared, load
-from probe_kit.extract.rollout.events import Done, Event, Failed
+from probe_kit.extract.events import Done, Event, Failed
+from probe_kit.extract.plan import Plan
+from probe_kit.extract.preparation import Prepared, load
 from probe_kit.extract.rollout.worker import Worker
 from probe_kit.extract.settings import Settings
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 
 
-def play(prepared: Prepared, writer: RunWriter[RowPlan], numbers: list[int]) -> Generator[Event]:
+def play(prepared: Prepared, writer: RunWriter[Plan], numbers: list[int]) -> Generator[Event]:
     """Play episodes where the settings say; yields `Done` of each, or `Failed` once it is given up.
 
     In this process with the model that is loaded, else in workers with one of their own, to which only episode
@@ -64,15 +64,15 @@ def load_worker(settings: Settings, run: str) -> Iterator[Worker]:
     with writer.joined():
         writer.begin(settings.machine.allow_mixed)
         episodes = len(writer.remaining())
-        with Worker(writer, prepared.settings, prepared.controller, episodes) as worker:
+        with Worker(writer, prepared.settings, prepared.controller, prepared.source, episodes) as worker:
             yield worker
 
 
 def _played_here(
-    prepared: Prepared, writer: RunWriter[RowPlan], queue: TaskQueue[int], episodes: int
+    prepared: Prepared, writer: RunWriter[Plan], queue: TaskQueue[int], episodes: int
 ) -> Iterator[tuple[int, Event]]:
     assert prepared.controller is not None
-    with Worker(writer, prepared.settings, prepared.controller, episodes) as worker:
+    with Worker(writer, prepared.settings, prepared.controller, prepared.source, episodes) as worker:
         while not queue.finished:
             yield from ((0, event) for event in worker.run(lambda: queue.take(0)))
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import CaptureChangedActionError, NoTrajectoryError
 from probe_kit.extract.rollout.executed_actions import executed_actions
-from probe_kit.extract.rollout.stage import Answer, Ending
+from probe_kit.extract.sources.player import Answer, Ending
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edit_engine import EditLog
 from probe_kit.hooks.contract.observation import Observation

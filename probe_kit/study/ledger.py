@@ -18,7 +18,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.extract.rollout.events import traceback_of
+from probe_kit.extract.events import traceback_of
 from probe_kit.hashing import sha256_text
 from probe_kit.runs.growth import flat_settings
 from probe_kit.runs.records import HASH, as_record, read_record

@@ -3,6 +3,7 @@
 import hashlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,16 +13,15 @@ import torch
 from probe_kit.env import SceneSpec
 from probe_kit.errors import InstructionError, SettingsMismatchError, UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run, prepare, prepare_asks
-from probe_kit.extract.plan import plan_episodes
-from probe_kit.extract.prepared import load_answer_model
-from probe_kit.extract.rollout.answer_controller import AnswerController, AskTurn
+from probe_kit.extract.preparation import load_answer_model
+from probe_kit.extract.rollout.answer_controller import AnswerController
+from probe_kit.extract.rollout.controllers import Turn
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-from probe_kit.extract.rollout.examples import example_observations
 from probe_kit.extract.vqa.templates import P1, P2, SEEN, Template
 from probe_kit.hooks import AnswerModel, Prompt, Reading, Site
 from probe_kit.retention import success_rate
 from probe_kit.runs import Run, open_run, verify_run
-from probe_kit.suite import Suite, load_suite
+from probe_kit.suite import Suite
 from tests.support.position_models import PositionModel, always, likes
 from tests.support.prismatic_checkpoints import write_checkpoint
 
@@ -172,18 +172,17 @@ def test_an_episode_that_cannot_be_asked_is_given_up_and_the_others_stay(
 
 def answers(settings: AskSettings, answer_model: AnswerModel | None = None) -> pd.DataFrame:
     """What the run's episodes would hold. Their frames are noise: which model answers needs no scene."""
-    assert settings.source.suite is not None
-    suite = load_suite(settings.source.suite).select(settings.source.categories, settings.source.items)
-    blank = example_observations(settings.scene, [suite.items[0].instruction])[0]
+    source: Any = settings.source.open()
+    blank = source.example(source.instructions[0])
     model = load_answer_model(settings) if answer_model is None else answer_model
-    controller = AnswerController(model, settings, suite, blank)
+    controller = AnswerController(model, source, settings, settings.seed)
     noise = np.random.default_rng(0)
     turns = [
-        AskTurn(one, replace(blank, image=noise.integers(0, 256, blank.image.shape, np.uint8)), NOWHERE)
-        for one in plan_episodes(suite, settings.seed)
+        Turn(replace(blank, image=noise.integers(0, 256, blank.image.shape, np.uint8)), row, 0, NOWHERE)
+        for row in source.rows(settings.seed)
     ]
-    outcomes = [outcome for turn in turns for outcome in controller.ask([turn])]
-    return pd.DataFrame([turn.planned.to_json() | own for turn, own in zip(turns, outcomes, strict=True)])
+    outcomes = [dict(inference.columns) for turn in turns for inference in controller.infer([turn])]
+    return pd.DataFrame([turn.row.to_json() | own for turn, own in zip(turns, outcomes, strict=True)])
 
 
 @pytest.mark.parametrize(("option", "side", "bias"), [("A", "left", 1.0), ("B", "right", -1.0)])

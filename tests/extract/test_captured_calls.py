@@ -20,7 +20,6 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import ExtractSettings, extract_run, prepare
-from probe_kit.extract.plan import make_plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
 from probe_kit.hooks import Site
@@ -35,6 +34,7 @@ from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.results.by_call import load_results_by_call
 from tests.support.little_run import suite_record
+from tests.support.plans import make_plan
 
 STREAM = StoredStream("backbone", 2, 8, None, 6, ("mean", "last", "mean:language"))
 CALLS = 3
@@ -64,7 +64,7 @@ def write_run(where: Path, suite: Suite, later_views: LaterViews = "all") -> Run
         buffers = EpisodeBuffers([STREAM], CALLS, with_tokens, False, later_views)
         for call in range(inferences_of(planned.index)):
             values = draw.normal(size=(2, 3, 8)) + 10 * call
-            values[..., 0] += 3 * (call > 0) * (planned.episode.side_correct == "left")
+            values[..., 0] += 3 * (call > 0) * (planned.content.side_correct == "left")
             buffers.roles.append({"backbone": [("language", 0, 4), ("padding", 4, 6)]})
             buffers.keep_pooled("backbone", torch.from_numpy(values.astype(np.float32)))
             if with_tokens:
@@ -275,10 +275,10 @@ def early(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     }  # fmt: skip
     plan = make_plan(small_suite, [STREAM], 0, 6, False)
     writer = RunWriter(locate(tmp_path_factory.mktemp("early") / "run"), plan, settings)
-    left: list[int] = [e.index for e in plan.episodes if e.episode.item.category == "color"
-                       and e.episode.side_correct == "left"][:4]  # fmt: skip
+    left: list[int] = [e.index for e in plan.episodes if e.content.item.category == "color"
+                       and e.content.side_correct == "left"][:4]  # fmt: skip
     for planned in plan.episodes:
-        fourth = planned.index in left or planned.episode.item.category == "shape"
+        fourth = planned.index in left or planned.content.item.category == "shape"
         draw = np.random.default_rng(planned.index)
         buffers = EpisodeBuffers([STREAM], 6, False, pinned=False)
         for call in range(3 + fourth + (planned.index == left[0])):

@@ -37,7 +37,7 @@ def nowhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def refuse(*_: Any, **__: Any) -> Any:
         raise AssertionError("a dry run asked the network")
 
-    monkeypatch.setattr("probe_kit.extract.prepared.run_preflight", lambda *_: None)
+    monkeypatch.setattr("probe_kit.extract.sources.scene_source.SceneSource.rehearse", lambda *_: None)
     monkeypatch.setattr(socket, "create_connection", refuse)
     monkeypatch.setattr("probe_kit.hooks.checkpoints.hub.urlopen", refuse)
     monkeypatch.setattr("huggingface_hub.snapshot_download", refuse)
@@ -304,10 +304,10 @@ def test_a_plan_of_a_few_items_draws_these_and_one_category(
     whole = default_suite(("color", "shape"))
     again = prepare(settings, fetch=False)
     assert isinstance(again.plan, Plan)
-    assert again.plan.suite.whole.content_sha256 == whole.content_sha256
-    assert first.plan.suite.items == again.plan.suite.items
-    assert first.plan.suite.identity == again.plan.suite.identity
-    enough = [list(sufficiencies(own.plan.suite, True, True)) for own in (first, again)]
+    assert again.source.suite.whole.content_sha256 == whole.content_sha256
+    assert first.source.suite.items == again.source.suite.items
+    assert first.source.suite.identity == again.source.suite.identity
+    enough = [list(sufficiencies(own.source.suite, True, True)) for own in (first, again)]
     assert enough[0] == enough[1]
 
 

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -22,8 +23,8 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import Extraction, ExtractSettings, extract_run, prepare
-from probe_kit.extract.rollout.stage import LocalStage
-from probe_kit.extract.rollout.stage_process import ProcessStage
+from probe_kit.extract.sources.player import LocalPlayer, ProcessPlayer
+from probe_kit.extract.sources.scene_player import ScenePlayer
 from probe_kit.extract.workers import play_episodes
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
@@ -41,23 +42,23 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
     return build_suite(tmp_path_factory.mktemp("suite") / "two", ["color"], 2)
 
 
-@pytest.mark.parametrize("stage_kind", [LocalStage, ProcessStage])
+@pytest.mark.parametrize("stage_kind", [LocalPlayer, ProcessPlayer])
 def test_a_stage_raises_the_same_error_wherever_it_stands(
-    stage_kind: type[LocalStage | ProcessStage], suite: Suite, tmp_path: Path
+    stage_kind: type[LocalPlayer | ProcessPlayer], suite: Suite, tmp_path: Path
 ) -> None:
     """A picture that changed on disk is no dead process."""
     copy = Path(shutil.copytree(suite.folder, tmp_path / "suite"))
     planned = prepare(ExtractSettings("expert", suite=copy)).plan.episodes[0]
     for picture in copy.rglob("*.png"):
         picture.write_bytes(b"not a picture")
-    stage = stage_kind(SHORT, None)
+    stage = stage_kind(partial(ScenePlayer, SHORT))
     try:
         stage.ask("begin", planned, False)
         with pytest.raises(SuiteError) as caught:
             stage.answer()
     finally:
         stage.close()
-    assert any(planned.episode.episode_id in note for note in caught.value.__notes__)
+    assert any(planned.episode_id in note for note in caught.value.__notes__)
 
 
 def test_an_arm_without_its_extra_is_said_before_anything_is_played(

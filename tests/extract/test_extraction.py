@@ -21,7 +21,7 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import ExtractSettings, extract_run, prepare
-from probe_kit.extract.prepared import load_acting_policy
+from probe_kit.extract.preparation import load_acting_policy
 from probe_kit.hooks import Site, Tap
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import open_run
@@ -154,16 +154,16 @@ def test_sixty_expert_episodes_prove_environment_and_scoring(tmp_path: Path) -> 
 def test_both_layouts_of_an_item_start_from_the_same_scene_with_their_own_noise(two_items: Suite) -> None:
     plan = prepare(ExtractSettings("expert", suite=two_items.folder)).plan
     first, second = plan.episodes[:2]
-    assert first.episode.item == second.episode.item
-    assert first.scene_seed == second.scene_seed
+    assert first.content.item == second.content.item
+    assert first.columns["scene_seed"] == second.columns["scene_seed"]
     assert first.policy_seed != second.policy_seed
 
 
 def test_seeds_do_not_depend_on_which_other_episodes_are_run(small_suite: Suite) -> None:
     whole = prepare(ExtractSettings("expert", suite=small_suite.folder)).plan.episodes
     part = prepare(ExtractSettings("expert", suite=small_suite.folder, categories=("shape",))).plan.episodes
-    seeds = {planned.episode.episode_id: planned.policy_seed for planned in whole}
-    assert all(seeds[planned.episode.episode_id] == planned.policy_seed for planned in part)
+    seeds = {planned.episode_id: planned.policy_seed for planned in whole}
+    assert all(seeds[planned.episode_id] == planned.policy_seed for planned in part)
 
 
 @pytest.mark.slow

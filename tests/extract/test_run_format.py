@@ -14,11 +14,11 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
-from probe_kit.extract.plan import make_plan
 from probe_kit.runs import Run, label_run, open_run, verify_run
 from probe_kit.suite import Suite, load_suite
 from probe_kit.train import load_results, train_probes
 from tests.support.little_run import probe_little_run, write_little_run
+from tests.support.plans import make_plan
 
 IN_EVERY_RUN_OTHERWISE = ("times", "certificates", "label.json")
 

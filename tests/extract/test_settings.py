@@ -15,7 +15,7 @@ from probe_kit.env.spec import PRESETS
 from probe_kit.errors import UsageError
 from probe_kit.extract import AskSettings, EnvSource, ExtractSettings, LeRobotSource
 from probe_kit.extract.config_files import read_config
-from probe_kit.extract.prepared import check_run
+from probe_kit.extract.preparation import open_checked
 from probe_kit.extract.settings import SOURCES, run_label
 from probe_kit.hooks import Edit, Site
 from probe_kit.suite import load_suite
@@ -217,8 +217,8 @@ def test_only_what_is_asked_is_drawn_of_the_embedded_suite(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PROBE_KIT_CACHE", str(tmp_path))
-    suite = check_run(ExtractSettings("expert", categories=("color",), items=2))
-    assert len(suite.items) == 2
+    _, source = open_checked(ExtractSettings("expert", categories=("color",), items=2))
+    assert len(source.rows(0)) == 4
     (drawn,) = (tmp_path / "suites").iterdir()
     assert {item.category for item in load_suite(drawn).items} == {"color"}
 

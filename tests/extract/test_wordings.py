@@ -8,12 +8,12 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run, prepare
-from probe_kit.extract.plan import plan_episodes
 from probe_kit.hooks import Site
 from probe_kit.retention import retention_table
 from probe_kit.runs import open_run
 from probe_kit.suite import build_suite
 from probe_kit.train.results.inventory import inventory
+from tests.support.plans import scene_rows
 
 SHORT = SceneSpec(max_steps=2)
 LADDER = ("knowledge", "named", "side", "neutral")
@@ -36,19 +36,19 @@ def ladder(suite, tmp_path_factory):
 
 def test_every_item_is_planned_in_every_wording_that_it_has_on_the_same_seeds(suite):
     plan = prepare(ExtractSettings("expert", suite=suite.folder, wordings=LADDER, scene=SHORT)).plan
-    assert plan.skipped == {"knowledge": 0, "named": 2, "side": 0, "neutral": 0}
+    assert plan.selection["wordings"]["skipped"] == {"knowledge": 0, "named": 2, "side": 0, "neutral": 0}
     assert len(plan.episodes) == 4 * 2 * 4 - 4
     rows = [planned.to_json() for planned in plan.episodes]
     assert len({row["episode_id"] for row in rows}) == len(rows)
-    plain = {planned.episode.episode_id: planned for planned in plan_episodes(suite, 0)}
+    plain = {planned.content.episode_id: planned for planned in scene_rows(suite, 0)}
     for row in rows:
         own = plain[":".join(row["episode_id"].split(":")[:2])]
-        assert (row["scene_seed"], row["policy_seed"]) == (own.scene_seed, own.policy_seed)
+        assert (row["scene_seed"], row["policy_seed"]) == (own.columns["scene_seed"], own.policy_seed)
 
 
 def test_a_run_without_the_option_is_what_it_was(suite):
     plain = prepare(ExtractSettings("expert", suite=suite.folder, scene=SHORT))
-    assert plain.plan.wordings is None
+    assert "wordings" not in plain.plan.selection
     assert not [row for row in (e.to_json() for e in plain.plan.episodes) if "wording" in row]
     asked = prepare(ExtractSettings("expert", suite=suite.folder, scene=SHORT, wordings=("knowledge",)))
     assert asked.plan.selection["wordings"]["names"] == ["knowledge"]

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import EpisodesFailedError, RunIncompleteError, StageDiedError
 from probe_kit.extract import ExtractSettings, extract_run, prepare
-from probe_kit.extract.rollout.stage_process import ProcessStage
+from probe_kit.extract.sources.player import ProcessPlayer
+from probe_kit.extract.sources.scene_player import ScenePlayer
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs import open_run
 from probe_kit.suite import Suite, build_suite
@@ -60,7 +62,7 @@ def test_a_batch_gives_the_same_numbers_up_to_float_rounding(suite: Suite, plain
 def test_a_simulating_process_starts_without_the_array_store_and_torch() -> None:
     """Two are started for every run of some length; the array store alone would double their start."""
     code = (
-        "import sys, probe_kit.extract.rollout.stage_process; "
+        "import sys, probe_kit.extract.sources.player; "
         "print([m for m in ('zarr', 'torch', 'pandas', 'xarray') if m in sys.modules])"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8").stdout == "[]\n"
@@ -69,7 +71,7 @@ def test_a_simulating_process_starts_without_the_array_store_and_torch() -> None
 @pytest.mark.slow
 def test_a_simulator_that_dies_costs_its_episode_and_is_replaced(suite: Suite) -> None:
     planned = prepare(ExtractSettings("expert", suite=suite.folder)).plan.episodes[0]
-    stage = ProcessStage(SHORT, None)
+    stage = ProcessPlayer(partial(ScenePlayer, SHORT))
     try:
         os.kill(stage._child.pid, signal.SIGKILL)
         stage.ask("begin", planned, False)
@@ -98,10 +100,10 @@ def test_an_episode_that_fails_twice_is_named_and_all_others_are_kept(
     monkeypatch.setattr(PolicyController, "act", act_badly)
     with pytest.raises(EpisodesFailedError, match="1 episode failed twice") as caught:
         extract_run(settings(suite, env_workers=0), tmp_path / "run")
-    assert poison.episode.episode_id in caught.value.__notes__[0]
+    assert poison.episode_id in caught.value.__notes__[0]
     assert caught.value.exit_code == 1
     run = open_run(tmp_path / "run", allow_partial=True)
-    assert (len(run.episodes), list(run.failed), run.sealed) == (7, [poison.episode.episode_id], True)
+    assert (len(run.episodes), list(run.failed), run.sealed) == (7, [poison.episode_id], True)
     with pytest.raises(RunIncompleteError, match="1 failed"):
         open_run(tmp_path / "run")
     monkeypatch.undo()

@@ -13,9 +13,9 @@ import pytest
 from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.rollout.examples import example_observations
 from probe_kit.hooks import AnswerModel, Policy, capture, load_model
 from probe_kit.hooks.contract.model import Prompt
+from probe_kit.hooks.contract.observation import Observation
 from tests.support.every_checkpoint import WRITERS
 
 OF_LARGEST = 2e-3
@@ -39,7 +39,9 @@ def captured(family: str, place: str, device: str, options: dict[str, Any]) -> d
     """Every residual site by name, and what the model put out."""
     model = load_model(family, place, device, "float32", **options)
     assert model.card.device.startswith(device)
-    (seen,) = example_observations(SceneSpec(), ["Put the cube on the red shape"])
+    scene = SceneSpec()
+    picture, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
+    seen = Observation(picture, state, "Put the cube on the red shape", scene.intrinsics)
     with capture(model, model.sites()) as tape:
         if isinstance(model, Policy):
             out = model.infer_without_acting([seen], [0])

@@ -22,7 +22,7 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import ExtractSettings
-from probe_kit.extract.rollout.stage import Seen, Stage
+from probe_kit.extract.sources.scene_player import ScenePlayer
 from probe_kit.intervene import (
     ImageSwap,
     InstructionSwap,
@@ -80,11 +80,11 @@ def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Ru
     """State and noise stay; and what one layout sees exchanged is what the other one sees, set up by itself."""
     item = str(copy.episodes["item_id"][0])
     original, swapped = session.pairs(item)
-    planned = replace(session.planned(swapped), scene_seed=session.planned(original).scene_seed)
-    alone = Stage(session.scene, None)
+    row, seed = session.planned(swapped), session.planned(original).columns["scene_seed"]
+    planned = replace(row, columns={**row.columns, "scene_seed": seed})
+    alone = ScenePlayer(session.scene)
     looked = alone.look(planned)
     alone.close()
-    assert isinstance(looked, Seen)
     np.testing.assert_array_equal(original.source.image, looked.observation.image)
     assert looked.facts["first_frame_sha256"] == copy.episodes["first_frame_sha256"][swapped.row]
     np.testing.assert_array_equal(original.source.image, swapped.clean.image)

@@ -15,7 +15,7 @@ import numpy as np
 from zarr.core.buffer import Buffer
 from zarr.storage import LocalStore
 
-from probe_kit.extract.plan import Plan, make_plan
+from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
 from probe_kit.runs import sealing, writer
@@ -23,6 +23,7 @@ from probe_kit.runs.commits import Commit
 from probe_kit.runs.layout import StoredStream
 from probe_kit.runs.store import Location, locate
 from probe_kit.suite import load_suite
+from tests.support.plans import make_plan
 
 STREAMS = [
     StoredStream("backbone", 4, 64, None, 150, ("mean", "last")),

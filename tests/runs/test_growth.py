@@ -15,7 +15,7 @@ import zarr
 
 from probe_kit.errors import NoProbesError, RunDamagedError, RunIncompleteError, SettingsMismatchError
 from probe_kit.extract import Extraction, ExtractSettings
-from probe_kit.extract.plan import Plan, make_plan
+from probe_kit.extract.plan import Plan
 from probe_kit.extract.vqa.phrases import QUERIES, phrases
 from probe_kit.runs import Run, open_run, seal, verify_run
 from probe_kit.runs.folder import Folder
@@ -30,6 +30,7 @@ from probe_kit.train import load_results, train_probes
 from probe_kit.train.results.inventory import inventory
 from tests.support.changed_suites import without_twins
 from tests.support.little_run import STREAMS, certify, episode, little_settings, still
+from tests.support.plans import make_plan
 from tests.support.rehashing import write_record
 
 pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
@@ -58,10 +59,10 @@ def writer_of(where: Path, plan: Plan) -> RunWriter:
 
 def play(writer: RunWriter, last: Plan, numbers: Sequence[int] | None = None) -> None:
     """What an episode gives follows from its place in `last`, whatever its number is."""
-    places = {one.episode.episode_id: place for place, one in enumerate(last.episodes)}
+    places = {one.content.episode_id: place for place, one in enumerate(last.episodes)}
     for number in writer.remaining() if numbers is None else numbers:
         planned = writer.plan.episode(number)
-        place = places[planned.episode.episode_id]
+        place = places[planned.content.episode_id]
         record = episode(last, place)
         pictures = {thumbnail_key(number): as_thumbnail(still(0, place))}
         arrays = {"pooled": record.arrays["pooled"]}
@@ -174,7 +175,7 @@ def test_a_plan_that_was_made_without_its_model_is_compared_with_the_stored_one(
     plan = replace(plan_of(small_suite, COLOR[1]), bytes=800)
     declared = Extraction(ExtractSettings("pi0-tiny"), plan, {"weights_sha256": None}, None, declared=True)
     further = declared.further_plan(run.location)
-    assert {one.episode.episode_id for one in further.episodes}.isdisjoint(run.episodes["episode_id"])
+    assert {one.content.episode_id for one in further.episodes}.isdisjoint(run.episodes["episode_id"])
     assert (len(further.episodes), further.bytes) == (4, 400)
 
 

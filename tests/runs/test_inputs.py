@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import ActivationsLeftOutError, RunDamagedError, UsageError
-from probe_kit.extract.recordings.recorded_plan import SIDE
+from probe_kit.extract.sources.player import SIDE
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, copy_run, export_run, verify_run
 from probe_kit.runs.store import locate

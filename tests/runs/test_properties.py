@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
-from probe_kit.extract.plan import Plan, make_plan
+from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
 from probe_kit.runs import Run, open_run, seal, verify_run
@@ -23,6 +23,7 @@ from probe_kit.runs.run import NotSealedWarning
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite
+from tests.support.plans import make_plan
 
 STREAMS = st.builds(
     StoredStream,

@@ -9,12 +9,12 @@ import pytest
 import zarr
 
 from probe_kit.errors import NoTrajectoryError, RunDamagedError, UsageError
-from probe_kit.extract.plan import make_plan
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import Run, open_run, rows, verify_run
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite
+from tests.support.plans import make_plan
 from tests.support.rehashing import rehash
 
 

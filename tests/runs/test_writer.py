@@ -3,7 +3,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probe_kit.extract.plan import make_plan
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
 from probe_kit.hooks.contract.sites import Site
@@ -12,6 +11,7 @@ from probe_kit.runs.layout import StoredStream
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite
+from tests.support.plans import make_plan
 
 STREAM = StoredStream("backbone", 2, 8, None, 300, ("mean", "last"))
 SETTINGS = {"captured_calls": 1, "tokens": "all", "codec": "zstd", "model": "synthetic"}

@@ -6,7 +6,6 @@ import numpy as np
 
 from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
 from probe_kit.env.spec import SceneSpec
-from probe_kit.extract.plan import make_plan
 from probe_kit.hashing import derive_seed
 from probe_kit.runs import Run, open_run, seal
 from probe_kit.runs.layout import StoredStream
@@ -14,6 +13,7 @@ from probe_kit.runs.store import locate
 from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite
 from tests.support.little_run import certify
+from tests.support.plans import make_plan
 
 STREAMS = (
     StoredStream("backbone", 2, 8, None, 6, ("mean",), quantities=("residual",)),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.env.scoring.trajectory import CHANNELS
 from probe_kit.env.spec import SceneSpec
-from probe_kit.extract.plan import Plan, make_plan
+from probe_kit.extract.plan import Plan
 from probe_kit.hashing import derive_seed
 from probe_kit.intervene import ConditionOutcomes, ImageSwap
 from probe_kit.intervene.settings import settings_of
@@ -22,6 +22,7 @@ from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite
 from probe_kit.train import train_probes
 from tests.intervene.answers import store_outcomes
+from tests.support.plans import make_plan
 
 STREAMS = (
     StoredStream("backbone", 2, 6, None, 130, ("mean", "last"), quantities=("residual",)),
@@ -84,7 +85,7 @@ def episode(plan: Plan, number: int, seed: int = 0) -> EpisodeRecord:
         arrays["tokens"][stream.name] = tokens
     placed = PLACED[int(draw.integers(3))]
     outcome = {
-        "outcome": "oob" if placed == "none" else "correct" if placed == planned.episode.side_correct else "wrong",
+        "outcome": "oob" if placed == "none" else "correct" if placed == planned.content.side_correct else "wrong",
         "side_placed": placed,
         "cube_x": float(draw.uniform()),
         "cube_y": float(draw.uniform(-0.3, 0.3)),

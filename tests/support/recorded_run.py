@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from probe_kit.extract.recordings.recorded_plan import SIDE, PlannedStretch, RecordedPlan
+from probe_kit.extract.plan import Plan, Row
+from probe_kit.extract.sources.player import SIDE
 from probe_kit.hashing import derive_seed
 from probe_kit.runs import Run, open_run, seal
-from probe_kit.runs.layout import CAPTURE_ONLY, StoredStream
+from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, StoredStream
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from tests.support.little_run import certify
@@ -21,15 +22,9 @@ PLANTED = 2
 """The feature of `backbone.layer1` that holds the first number of the state."""
 
 
-def recorded_plan(episodes: int, pixels: bool = True, streams: tuple[StoredStream, ...] = STREAMS) -> RecordedPlan:
+def recorded_plan(episodes: int, pixels: bool = True, streams: tuple[StoredStream, ...] = STREAMS) -> Plan:
     """Frames 0, 5, 10 and 15 of every episode but SHORT, which has three; of two tasks in turn."""
-    rows = tuple(
-        PlannedStretch(
-            number, number, 0, 0, EVERY, CALLS - (number == SHORT), 20,
-            f"Open the {('door', 'drawer')[number % 2]}", number, f"{number:032x}",
-        )
-        for number in range(episodes)
-    )  # fmt: skip
+    rows = tuple(recorded_row(number, CALLS - (number == SHORT)) for number in range(episodes))
     inputs = {"columns": [2], "state": [STATE], "action": [CHUNK, ACTION], "prediction": [CHUNK, ACTION]}
     dataset = {
         "kind": "lerobot",
@@ -43,7 +38,28 @@ def recorded_plan(episodes: int, pixels: bool = True, streams: tuple[StoredStrea
         "columns": ["timestamp", "next.reward"],
         "names": {"state": ["x", "y", "z"], "action": ["dx", "grip"]},
     }
-    return RecordedPlan(rows, streams, 1000, dataset, "kitchen", episodes + 2)
+    chosen = {"name": "kitchen", "episodes": list(range(episodes)), RECORDED_EPISODES: episodes + 2}
+    return Plan(rows, streams, 1000, {DATASET: dataset}, {"recording": {**chosen, OTHER_ACTIONS: None}})
+
+
+def recorded_row(number: int, count: int) -> Row:
+    """The first frames of a recorded episode."""
+    item = f"episode-{number:06d}"
+    columns = {
+        "episode_id": item,
+        "item_id": item,
+        "category": "all",
+        "group_id": item,
+        "instruction": f"Open the {('door', 'drawer')[number % 2]}",
+        "source_episode": number,
+        "first_frame": 0,
+        "frame_step": EVERY,
+        "frames": count,
+        "recorded_frames": 20,
+        "policy_seed": number,
+        "content_blake2b": f"{number:032x}",
+    }
+    return Row(number, columns, frames=range(0, EVERY * count, EVERY))
 
 
 def write_recorded_run(
@@ -75,7 +91,7 @@ def write_recorded_run(
     certify(writer)
     for planned in plan.episodes:
         draw = np.random.default_rng(derive_seed("recorded", planned.index))
-        count = planned.count
+        count = len(planned.frames or ())
         state = draw.normal(size=(count, STATE)).astype(np.float32)
         pooled = np.full((CALLS, 2, 1, 6), np.nan, np.float32)
         noise = draw.normal(size=(count, 2, 1, 6))
@@ -98,7 +114,7 @@ def write_recorded_run(
                 {"outcome": CAPTURE_ONLY, "frames_blake2b": "0" * 32},
                 {"pooled": {"backbone": pooled, **({"expert": noisy(draw, count)} if expert else {})}},
                 [{"backbone": [("language", 0, 4)], **({"expert": [("action", 0, 2)]} if expert else {})}] * count,
-                control_steps=tuple(planned.frames),
+                control_steps=tuple(planned.frames or ()),
                 inputs=inputs,
             )
         )

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
 from probe_kit.env.scoring.trajectory import CHANNELS
-from probe_kit.extract.plan import make_plan
 from probe_kit.runs import Run, label_run, open_run, seal
 from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
@@ -25,6 +24,7 @@ from tests.support.little_run import (
     intervene_on_little_run,
     little_settings,
 )
+from tests.support.plans import make_plan
 
 CALLS = 2
 FILMED, FILM_STEPS = 2, 9
@@ -100,7 +100,7 @@ def write_run(where: Path, suite: Suite, seed: int) -> Run:
         for stream in STREAMS:
             shape = (CALLS, *stream.lead, len(stream.views), stream.width)
             pooled[stream.name] = draw.normal(size=shape).astype(np.float32)
-        sign = 1 if plan.episodes[number].episode.side_correct == "left" else -1
+        sign = 1 if plan.episodes[number].content.side_correct == "left" else -1
         if (seed, number) == MISREAD:
             sign = -sign
         pooled["backbone"][0, -1, :, 0] = 3 * sign + draw.normal(size=2) / 2

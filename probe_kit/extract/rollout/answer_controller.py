@@ -1,4 +1,4 @@
-"""The controller of `probe-kit ask`: a model answers one question about the first frame of an episode.
+"""The task ask: a model answers one question about the first frame of an episode.
 
 Every question is asked with the left side named first and, where the prompt can be turned round, once more with
 the right side named first. Each time the answer is both spoken and forced: greedy text, and the logits of the
@@ -12,18 +12,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probe_kit.errors import PolicyFailedError, UsageError
-from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.plan import Row
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
+from probe_kit.extract.rollout.controllers import Inference, Turn
 from probe_kit.extract.settings import AskSettings
+from probe_kit.extract.sources.scene_source import SceneSource
 from probe_kit.extract.vqa.letter_lens import letter_margins
 from probe_kit.extract.vqa.parsing import Said, read_answer
 from probe_kit.extract.vqa.phrases import Phrase, phrases
 from probe_kit.extract.vqa.pictures import side_by_side
 from probe_kit.extract.vqa.scores import Choice, outcome_of, side_expected, side_said
 from probe_kit.extract.vqa.templates import Order, sides
+from probe_kit.hooks.checkpoints.containment import copied
+from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import StoredStream
-from probe_kit.suite import Suite
 from probe_kit.suite.wording import side_words
 
 if TYPE_CHECKING:
@@ -45,15 +48,6 @@ class Form:
 
 
 @dataclass(frozen=True)
-class AskTurn:
-    """A question that is due: about the first frame `seen` of an episode, activations to `buffers`."""
-
-    planned: PlannedEpisode
-    seen: Observation
-    buffers: "EpisodeBuffers"
-
-
-@dataclass(frozen=True)
 class Forced:
     """Logits of the admissible answers, one row: by what each says, their share, and whether rounding decides."""
 
@@ -69,11 +63,13 @@ class AnswerController:
     Raises UsageError if an item has no phrase for what is asked, or an option is none behind this prompt.
     """
 
-    def __init__(self, model: "AnswerModel", settings: AskSettings, suite: Suite, blank: Observation) -> None:
-        """blank: an observation as the scene will show them."""
+    def __init__(self, model: "AnswerModel", source: SceneSource, settings: AskSettings, seed: int) -> None:
+        """source: whose suite names the objects. seed: of the run, which draws objects that are absent."""
+        suite = source.suite
+        blank = source.example(min(source.instructions))
         self.model, self._settings, self.template = model, settings, settings.task.prompt
         self._choose_positions()
-        self._phrases = phrases(suite, settings.task.query, settings.seed)
+        self._phrases = phrases(suite, settings.task.query, seed)
         self._item_has_side_word = {item.item_id: item.side_word for item in suite.items}
         self._instructions = sorted({item.instruction for item in suite.items})
         card = model.card
@@ -105,11 +101,15 @@ class AnswerController:
             "capture_check": self._capturer.check,
         }
 
-    def ask(self, turns: Sequence[AskTurn]) -> list[dict[str, Any]]:
-        """Per turn the columns of its outcome."""
+    def infer(self, turns: Sequence[Turn]) -> list[Inference]:
+        """Per turn the columns of its outcome; nothing is executed."""
+        with while_acting(self.identity["model"], self.model.card.checkpoint, self.limit):
+            return [Inference(None, columns=columns) for columns in self._asked(turns)]
+
+    def _asked(self, turns: Sequence[Turn]) -> list[dict[str, Any]]:
         self._choose_positions()
         shown = [self._shown(turn) for turn in turns]
-        phrases_asked = [self._phrases[turn.planned.episode.item.item_id] for turn in turns]
+        phrases_asked = [self._phrases[turn.row.content.item.item_id] for turn in turns]
         buffers = {row: turn.buffers for row, turn in enumerate(turns)} if self.streams else {}
         spoken: list[list[str]] = []
         forced: list[list[Forced]] = []
@@ -139,11 +139,12 @@ class AnswerController:
 
     # -- what is asked -----------------------------------------------------------------------------------
 
-    def _shown(self, turn: AskTurn) -> Observation:
+    def _shown(self, turn: Turn) -> Observation:
+        (seen,) = copied([turn.seen])
         if self._settings.task.picture != "side-by-side":
-            return turn.seen
-        picture = side_by_side(turn.planned.episode, self._settings.scene.picture_shape)
-        return replace(turn.seen, image=picture)
+            return seen
+        picture = side_by_side(turn.row.content, self._settings.scene.picture_shape)
+        return replace(seen, image=picture)
 
     def _questions(self, shown: Sequence[Observation], named: Sequence[Phrase], order: Order) -> list["Prompt"]:
         """As the answer is spoken; the logits of its options are those of how it begins."""
@@ -202,7 +203,7 @@ class AnswerController:
         stored = {stream.name: stream for stream in self.streams if "last" in stream.views}
         return stored.get(self.model.unembedding.streams[-1])
 
-    def _record_lens(self, turns: Sequence[AskTurn], reading: "Reading") -> None:
+    def _record_lens(self, turns: Sequence[Turn], reading: "Reading") -> None:
         """Keep the margins of questions with left named first, where option 0 is the letter for left."""
         stream = self._lens_stream
         if stream is None or reading.option_ids is None:
@@ -218,9 +219,9 @@ class AnswerController:
     # -- what came of it ---------------------------------------------------------------------------------
 
     def _outcome(
-        self, turn: AskTurn, question: str, spoken: Sequence[str], forced: Sequence[Forced]
+        self, turn: Turn, question: str, spoken: Sequence[str], forced: Sequence[Forced]
     ) -> dict[str, Any]:
-        episode = turn.planned.episode
+        episode = turn.row.content
         expected = side_expected(self._settings.task.query, episode.side_correct)
         choice = Choice([own.logits for own in forced])
         columns: dict[str, Any] = {}
@@ -305,3 +306,17 @@ class AnswerController:
             else:
                 return form
         return None
+
+
+def asked_rows(rows: Sequence[Row], source: SceneSource, settings: AskSettings) -> tuple[Row, ...]:
+    """The rows with what a question asks for, where that is not the object of the instruction.
+
+    Raises UsageError for items without such a phrase.
+    """
+    named = phrases(source.suite, settings.task.query, settings.seed)
+    if settings.task.query == "target":
+        return tuple(rows)
+    objects = {item: phrase.with_article for item, phrase in named.items()}
+    return tuple(
+        replace(row, columns={**row.columns, "asked_object": objects[row.columns["item_id"]]}) for row in rows
+    )

@@ -1,7 +1,7 @@
-"""Controllers of an episode: a captured policy, or a scripted one that needs no model."""
+"""Tasks of a model, act and capture: a policy whose inferences are captured, or a script that needs none."""
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
@@ -11,10 +11,13 @@ from numpy.typing import NDArray
 
 from probe_kit.env.robot.controller import ACTION_SIZE
 from probe_kit.errors import PolicyFailedError, ProbeKitError
+from probe_kit.extract.plan import Row
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
 from probe_kit.extract.rollout.executed_actions import executed_actions
+from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.sources.source import Source
+from probe_kit.extract.sources.units import check_predictions
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.capturing.edits import Edit, Vectors
 from probe_kit.hooks.checkpoints.containment import begin_randomness, copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
@@ -58,29 +61,40 @@ def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: s
 class Turn:
     """One inference that is due.
 
-    seed: of the episode; every inference derives its own. call: how many inferences came before.
-    buffers: where the activations of the first calls go. past: chunks of the inferences before, oldest first,
-    which the controller keeps where a policy averages them. noise: the number that its seed is derived from, None
-    for `call`.
+    call: how many inferences of the row came before. buffers: where the activations of the first calls go. past:
+    chunks of the inferences before, oldest first, which the controller keeps where a policy averages them.
     """
 
     seen: Observation
-    seed: int
+    row: Row
     call: int
     buffers: "EpisodeBuffers"
     past: list[NDArray[np.float32]] = field(default_factory=list)
-    noise: int | None = None
 
     def derived_seed(self, of: str) -> int:
         """The seed of this inference for `of`."""
-        return derive_seed(self.seed, of, self.call if self.noise is None else self.noise)
+        return derive_seed(self.row.policy_seed, of, self.row.noise_of(self.call))
+
+
+@dataclass(frozen=True)
+class Inference:
+    """What one inference leads to.
+
+    actions: (n, D) float32 to execute, n >= 1; None ends the episode. flagged: whether it put out no valid action;
+    None if that is unknown. columns: of the episode's outcome.
+    """
+
+    actions: NDArray[np.float32] | None
+    flagged: bool | None = None
+    columns: Mapping[str, Any] = field(default_factory=dict)
 
 
 class Controller(Protocol):
-    """Decides what happens on every stage: by acting, or by answering a question.
+    """A task: act, capture or ask.
 
-    script: for `Stage`, None if this controller acts itself.
-    threads: what its network wants, None for torch's choice. on_gpu: whether activations come from a GPU.
+    script: for the player, None if the controller infers. threads: of its network, None for torch's choice.
+    on_gpu: whether activations come from a GPU. identity: the part of a run's identity that the loaded model
+    decides.
     """
 
     identity: dict[str, Any]
@@ -89,41 +103,29 @@ class Controller(Protocol):
     threads: int | None
     on_gpu: bool
 
+    def infer(self, turns: Sequence[Turn]) -> list[Inference]:
+        """One call of the model about all of these turns."""
+
+    def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
+        """The ids that the network is delivered as this instruction; None if it reads none or cannot say."""
+
     def certificate(self) -> dict[str, Any]:
         """What was checked so far, for the run's certificate."""
 
 
-class ActingController(Controller, Protocol):
-    """Acts.
-
-    flagged: of the last `act`, the turns whose inference put out no action; None if that is unknown.
-    capture_only: whether `act` only captures, and the episode ends after it.
-    """
-
-    capture_only: bool
-    flagged: NDArray[np.bool_] | None
-
-    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
-        """Per turn the next (n, 7) float32 actions to execute, n >= 1."""
-
-    def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
-        """What the network is delivered as this instruction; None if it reads none or cannot say."""
-
-
 class ScriptedController:
-    """A script plays on the stage itself, looks at nothing and leaves no activations."""
+    """A script plays by itself, looks at nothing and leaves no activations."""
 
     def __init__(self, name: str) -> None:
         self.identity: dict[str, Any] = {"model": name, "random_weights": False, "weights_sha256": None}
         self.streams: list[StoredStream] = []
         self.script: str | None = name
         self.threads: int | None = None
-        self.on_gpu = self.capture_only = False
-        self.flagged: NDArray[np.bool_] | None = None
+        self.on_gpu = False
 
-    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
-        """Never asked: a scripted stage plays to the end by itself."""
-        raise AssertionError(f"a scripted stage asked for {len(turns)} actions")
+    def infer(self, turns: Sequence[Turn]) -> list[Inference]:
+        """Never asked: a scripted player plays to the end by itself."""
+        raise AssertionError(f"a scripted player asked for {len(turns)} actions")
 
     def instruction_ids(self, instruction: str) -> None:
         """None: it reads no instruction."""
@@ -136,97 +138,91 @@ class ScriptedController:
 class PolicyController:
     """Infers, executes the head of the chunk, and captures the first inferences of every episode.
 
-    With `capture_only`, it infers and captures once per episode and executes nothing.
+    In the checkpoint's own units where the source asks for them; where nothing is executed, the whole chunk goes
+    back to the player. With `capture_only` in a scene, it infers and captures once per episode.
     """
 
-    def __init__(
-        self,
-        policy: "Policy",
-        name: str,
-        examples: Sequence[Observation],
-        execute: int | None,
-        captured_calls: int,
-        with_tokens: bool,
-        edits: Sequence[Edit] = (),
-        vectors: Vectors | None = None,
-        capture_only: bool = False,
-        limit: float | None = None,
-        rotation: Rotation | None = None,
-    ) -> None:
-        """examples: an observation per instruction of the suite, as the scene will show them.
-
-        limit: seconds that a call of the policy may take, after which this process ends. rotation: see
-        `ProtocolRow.rotation`; None for the angles as they are.
-        """
-        self.policy, self.capture_only, self._limit = policy, capture_only, limit
-        self._infer = policy.infer_without_acting if capture_only else policy.act
-        self.execute = execute or policy.card.execute
-        self.rotation: Rotation = rotation or PLAIN
-        self.captured_calls = captured_calls
-        self._edits, self._vectors = edits, vectors
-        with while_acting(name, policy.card.checkpoint):
+    def __init__(self, policy: "Policy", source: Source[Any], settings: ExtractSettings) -> None:
+        """source: as the policy is shown it. Raises UsageError for more actions than a chunk has."""
+        task, card = settings.task, policy.card
+        self.policy, self._source, self._limit = policy, source, settings.machine.inference_limit
+        self.capture_only = task.capture_only and source.executes
+        self.execute = task.execute or card.execute
+        self.rotation: Rotation = task.rotation or PLAIN
+        self.captured_calls = settings.with_every_call(self.execute).capture.calls
+        self._edits, self._vectors = task.edits, task.vectors
+        name = settings.model.family
+        with while_acting(name, card.checkpoint):
+            examples = [source.example(text) for text in source.instructions]
             self.streams = stored_streams(policy, policy.roles(examples))
-        self._capturer = Capturer(policy, self.streams, with_tokens, "actions")
-        card = policy.card
+        self._capturer = Capturer(policy, self.streams, settings.capture.tokens == "all", "actions")
         self.script: str | None = None
         self.threads = 1 if card.parameters < SMALL else None
         self.on_gpu = card.device.startswith("cuda")
-        self.flagged: NDArray[np.bool_] | None = None
         self.identity: dict[str, Any] = {
             "model": name,
             "random_weights": card.random_weights,
             "weights_sha256": card.weights_sha256,
             "dtype": card.dtype,
-            "execute": self.execute,
+            **({"execute": self.execute} if source.executes else {}),
+            **({"policy": dict(card.settings)} if card.settings else {}),
         }
-        if card.settings:
-            self.identity["policy"] = dict(card.settings)
-        if capture_only and (deaf := policy.zero_filled_inputs()):
+        if self.capture_only and (deaf := policy.zero_filled_inputs()):
             self.identity["zeros_for"] = list(deaf)
         self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
         self._edit_log: list[dict[str, Any]] = []
 
-    def act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+    def infer(self, turns: Sequence[Turn]) -> list[Inference]:
         """Per turn the first `execute` actions of a fresh chunk, from one call of the policy.
 
         Where the policy's card asks for it, one action averaged over the plans of this and earlier chunks.
         """
         with self._acting():
             begin_randomness(derive_seed("global", *(turn.derived_seed("call") for turn in turns)))
-            return self._act(turns)
+            chunks = self._captured(turns)
+        flags = _own_flags(self.policy.flagged, len(turns))
+        return [
+            Inference(self._executed(turn, chunk), None if flags is None else bool(flags[row]))
+            for row, (turn, chunk) in enumerate(zip(turns, chunks, strict=True))
+        ]
 
     def _acting(self) -> AbstractContextManager[None]:
         return while_acting(self.identity["model"], self.policy.card.checkpoint, self._limit)
 
-    def _act(self, turns: Sequence[Turn]) -> list[NDArray[np.float32]]:
+    def _captured(self, turns: Sequence[Turn]) -> NDArray[np.float32]:
+        """(B, chunk, D) of one call, whose activations are kept for the turns that are captured."""
         observations = copied([turn.seen for turn in turns])
         seeds = [turn.derived_seed("inference") for turn in turns]
         captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
-        if captured:
-            chunks = self._capturer.run(
-                lambda: self._chunks(turns, seeds),
-                lambda actions: actions,
-                self.policy.roles(observations),
-                captured,
-                lambda: self._edited(observations),
-            )
-        else:
+        if not captured:
             with self._edited(observations):
-                chunks = self._chunks(turns, seeds)
-        self.flagged = _own_flags(self.policy.flagged, len(turns))
-        return [self._executed(turn, chunk) for turn, chunk in zip(turns, chunks, strict=True)]
+                return self._chunks(turns, seeds)
+        return self._capturer.run(
+            lambda: self._chunks(turns, seeds),
+            lambda actions: actions,
+            self.policy.roles(observations),
+            captured,
+            lambda: self._edited(observations),
+        )
 
     def _chunks(self, turns: Sequence[Turn], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """What the policy gives for observations that it may write to, and cannot change later."""
-        chunks = self._infer(copied([turn.seen for turn in turns]), list(seeds))
-        if not self.capture_only:
+        """The policy's answer about observations that it may write to, and cannot change later."""
+        chunks = self._called([turn.seen for turn in turns], seeds)
+        if self._source.own_units:
+            check_predictions(chunks, len(turns))
+        elif not self.capture_only:
             _check_chunks(chunks, len(turns))
         return np.array(chunks)
+
+    def _called(self, observations: Sequence[Observation], seeds: Sequence[int]) -> Any:
+        policy = self.policy
+        acts = policy.infer_without_acting if self.capture_only else policy.act
+        return (policy.predict if self._source.own_units else acts)(copied(observations), list(seeds))
 
     def run_preflight(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
         """One inference of which nothing is kept: what another one will take."""
         with self._acting():
-            self._infer(copied(observations), list(seeds))
+            self._called(observations, seeds)
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
         """The ids that the policy's own packing makes of it, frames around it included."""
@@ -236,9 +232,11 @@ class PolicyController:
                 self._instruction_ids[instruction] = None if ids is None else tuple(map(int, ids[0]))
         return self._instruction_ids[instruction]
 
-    def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32] | None:
         if self.capture_only:
-            return chunk[: self.execute]
+            return None
+        if self._source.own_units:
+            return chunk[: self.execute] if self._source.executes else chunk
         exponent = self.policy.card.ensemble
         chunks = [chunk]
         if exponent is not None:
@@ -250,7 +248,7 @@ class PolicyController:
         """The policy's card, fire counts of the last capture, and what the capture proved."""
         return {
             "policy": self.policy.card.to_json(),
-            **({} if self.capture_only else {"rotation": self.rotation}),
+            **({} if self.capture_only or self._source.own_units else {"rotation": self.rotation}),
             "fires_per_inference": self._capturer.fires,
             "capture_check": self._capturer.check,
             **({"edits": self._edit_log} if self._edits else {}),

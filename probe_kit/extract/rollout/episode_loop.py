@@ -1,4 +1,4 @@
-"""The episode loop: two groups of stages alternate; one simulates while the policy infers for the other."""
+"""The loop of a run: two groups of players alternate; one simulates while the model infers for the other."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract.plan import PlannedRow
-from probe_kit.extract.rollout.controllers import ActingController, Turn, count_lost_words
+from probe_kit.extract.events import EPISODE_ERRORS, traceback_of
+from probe_kit.extract.plan import Row
+from probe_kit.extract.rollout.controllers import Controller, Inference, Turn, count_lost_words
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
-from probe_kit.extract.rollout.events import traceback_of
-from probe_kit.extract.rollout.stage import EPISODE_ERRORS, AskableStage, Ending, StageRequest
+from probe_kit.extract.sources.player import AskablePlayer, Ending, Request
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import LATER
 from probe_kit.runs.seconds import Seconds
@@ -30,7 +30,7 @@ class Rollout:
     the episode came before it. inputs: what was shown of recordings, see `Ending`.
     """
 
-    planned: PlannedRow
+    planned: Row
     outcome: dict[str, Any]
     buffers: EpisodeBuffers
     frames: list[NDArray[np.uint8]]
@@ -59,27 +59,27 @@ class Rollout:
 class Failure:
     """An episode that could not be played to its end. traceback: of the error that ended it."""
 
-    planned: PlannedRow
+    planned: Row
     reason: str
     traceback: str
 
     @classmethod
-    def from_error(cls, planned: PlannedRow, error: ProbeKitError) -> "Failure":
+    def from_error(cls, planned: Row, error: ProbeKitError) -> "Failure":
         """The failure of `planned` by `error`."""
         return cls(planned, f"{type(error).__name__}: {error}", traceback_of(error))
 
 
 class EpisodeSlot:
-    """One place in a batch: a stage and the episode on it, if any.
+    """One place in a batch: a player and the episode on it, if any.
 
-    following: what its stage starts when the episode ends, while the policy infers for others.
-    ahead: whether it has so begun the episode that is on.
+    following: what its player starts when the episode ends, while the model infers for others. columns: of the
+    outcome. ahead: whether it has so begun the episode that is on.
     """
 
-    def __init__(self, stage: AskableStage) -> None:
-        self.stage = stage
-        self.planned: PlannedRow | None = None
-        self.following: PlannedRow | None = None
+    def __init__(self, player: AskablePlayer) -> None:
+        self.player = player
+        self.planned: Row | None = None
+        self.following: Row | None = None
         self.ahead = False
         self.seen: Observation | None = None
         self.control_steps: list[int] = []
@@ -89,15 +89,17 @@ class EpisodeSlot:
         self.instruction_ids: Sequence[int] | None = None
         self.lost_words = 0
         self.past: list[NDArray[np.float32]] = []
+        self.columns: Mapping[str, Any] = {}
 
-    def start(self, planned: PlannedRow, buffers: EpisodeBuffers, begin: StageRequest | None) -> None:
-        """Take an episode up; begin: the question that begins it, None if the stage does so already."""
+    def start(self, planned: Row, buffers: EpisodeBuffers, begin: Request | None) -> None:
+        """Take an episode up; begin: the question that begins it, None if the player does so already."""
         self.planned, self.buffers, self.seen = planned, buffers, None
         self.control_steps, self.steps, self.seconds = [], 0, 0.0
         self.flagged, self.instruction_ids, self.lost_words, self.past = None, None, 0, []
+        self.columns = {}
         self.ahead = begin is None
         if begin is not None:
-            self.stage.ask(begin[0], *begin[1])
+            self.player.ask(begin[0], *begin[1])
 
     @property
     def calls(self) -> int:
@@ -114,21 +116,18 @@ class EpisodeSlot:
         """The inference that is due."""
         assert self.planned is not None
         assert self.seen is not None
-        noise = self.planned.noise_of(self.calls)
-        return Turn(self.seen, self.planned.policy_seed, self.calls, self.buffers, self.past, noise)
+        return Turn(self.seen, self.planned, self.calls, self.buffers, self.past)
 
-    def advance(self, actions: NDArray[np.float32], flagged: bool | None, then: StageRequest | None) -> None:
-        """Execute actions. flagged: whether their inference put out no valid action; None if unknown."""
-        self.seen = None
-        self.steps += len(actions)
-        if flagged is not None:
-            self.flagged = (self.flagged or 0) + flagged
-        self.stage.ask("advance", actions, then=then)
-
-    def end_without_acting(self, then: StageRequest | None) -> None:
-        """End the episode after its capture, before anything moves."""
-        self.seen = None
-        self.stage.ask("dismiss", then=then)
+    def go_on(self, inference: Inference, then: Request | None) -> None:
+        """Execute the actions of an inference, or end the episode where it has none."""
+        self.seen, self.columns = None, inference.columns
+        if inference.actions is None:
+            self.player.ask("dismiss", then=then)
+            return
+        self.steps += len(inference.actions)
+        if inference.flagged is not None:
+            self.flagged = (self.flagged or 0) + inference.flagged
+        self.player.ask("advance", inference.actions, then=then)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -142,17 +141,17 @@ class EpisodeSlot:
 
 
 class EpisodeLoop:
-    """Plays episode after episode on two groups of stages.
+    """Plays episode after episode on two groups of players.
 
     next_episode: what to play next, None for nothing. All slots of a group take their turn in one call of the
     policy; a slot whose episode ends begins the next one at once.
     """
 
     def __init__(
-        self, stages: Sequence[AskableStage], controller: ActingController, ring: BufferPool,
-        next_episode: Callable[[], PlannedRow | None], film: Callable[[PlannedRow], bool],
+        self, players: Sequence[AskablePlayer], controller: Controller, ring: BufferPool,
+        next_episode: Callable[[], Row | None], film: Callable[[Row], bool],
     ) -> None:  # fmt: skip
-        slots = [EpisodeSlot(stage) for stage in stages]
+        slots = [EpisodeSlot(player) for player in players]
         self._groups = [slots[: len(slots) // 2], slots[len(slots) // 2 :]]
         self._controller, self._pool = controller, ring
         self._next_episode, self._film = next_episode, film
@@ -168,7 +167,7 @@ class EpisodeLoop:
                 yield from self._infer(group)
 
     def _begin_next(self, slot: EpisodeSlot, *, ended: bool = False) -> None:
-        """ended: whether the stage came to an end by itself, and so began what follows if it knew of any."""
+        """ended: whether the player came to an end by itself, and so began what follows if it knew of any."""
         planned, begun = slot.following, ended
         if planned is None:
             planned, begun = self._next_episode(), False
@@ -178,11 +177,11 @@ class EpisodeLoop:
         else:
             slot.start(planned, self._pool.take(), None if begun else self._beginning(planned))
 
-    def _beginning(self, planned: PlannedRow) -> StageRequest:
+    def _beginning(self, planned: Row) -> Request:
         return "begin", (planned, self._film(planned))
 
-    def _then(self, slot: EpisodeSlot) -> StageRequest | None:
-        """What the slot's stage is to begin if its episode ends now."""
+    def _then(self, slot: EpisodeSlot) -> Request | None:
+        """What the slot's player is to begin if its episode ends now."""
         if slot.following is None:
             slot.following = self._next_episode()
         return None if slot.following is None else self._beginning(slot.following)
@@ -190,14 +189,14 @@ class EpisodeLoop:
     def _settle(self, group: list[EpisodeSlot]) -> Iterator[Rollout | Failure]:
         """Collect answers until the group can take its turn together.
 
-        If all its episodes ended at once, and no stage has begun the next one, that is done during the other
+        If all its episodes ended at once, and no player has begun the next one, that is done during the other
         group's turn.
         """
         while waiting := [slot for slot in group if slot.planned and not slot.seen]:
             for slot in waiting:
                 assert slot.planned is not None
                 try:
-                    answer = slot.stage.answer()
+                    answer = slot.player.answer()
                 except EPISODE_ERRORS as error:
                     yield self._give_up(slot, error)
                     continue
@@ -205,7 +204,7 @@ class EpisodeLoop:
                     slot.seen = answer
                 else:
                     assert isinstance(answer, Ending)
-                    outcome = {**answer.outcome, **slot.counts}
+                    outcome = {**answer.outcome, **slot.columns, **slot.counts}
                     yield Rollout(
                         slot.planned, outcome, slot.buffers, answer.frames, answer.small_frames, answer.trajectory,
                         slot.instruction_ids, slot.control_steps, Seconds(slot.seconds, answer.seconds),
@@ -222,7 +221,7 @@ class EpisodeLoop:
         try:
             turns = [slot.turn() for slot in due]
             started = perf_counter()
-            chunks = self._controller.act(turns)
+            inferences = self._controller.infer(turns)
             seconds = (perf_counter() - started) / len(turns)
             for slot, turn in zip(due, turns, strict=True):
                 if turn.call == 0:
@@ -232,13 +231,9 @@ class EpisodeLoop:
             for slot in due:
                 yield self._give_up(slot, error)
             return
-        flags = self._controller.flagged
-        for row, (slot, actions) in enumerate(zip(due, chunks, strict=True)):
+        for slot, inference in zip(due, inferences, strict=True):
             slot.count_inference(seconds)
-            if self._controller.capture_only:
-                slot.end_without_acting(self._then(slot))
-            else:
-                slot.advance(actions, None if flags is None else bool(flags[row]), self._then(slot))
+            slot.go_on(inference, self._then(slot))
 
     def _give_up(self, slot: EpisodeSlot, error: ProbeKitError) -> Failure:
         assert slot.planned is not None

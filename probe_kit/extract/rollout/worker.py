@@ -2,32 +2,26 @@
 
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 from PIL import Image
 
 from probe_kit.env import save_gif
-from probe_kit.extract.plan import PlannedEpisode, PlannedRow, RowPlan
-from probe_kit.extract.rollout.answer_controller import AnswerController
-from probe_kit.extract.rollout.controllers import ActingController
+from probe_kit.extract.events import Done, Event, Failed
+from probe_kit.extract.plan import Plan, Row
+from probe_kit.extract.rollout.controllers import Controller
 from probe_kit.extract.rollout.episode_buffers import BufferPool, EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import EpisodeLoop, Failure, Rollout
-from probe_kit.extract.rollout.events import Done, Event, Failed
-from probe_kit.extract.rollout.own_environments.environment_stage import EnvironmentStage, PlayedEnvironment
-from probe_kit.extract.rollout.question_loop import Asking
-from probe_kit.extract.rollout.recorded.recorded_stage import RecordedStage
-from probe_kit.extract.rollout.stage import AskableStage, LocalStage
-from probe_kit.extract.rollout.stage_process import ProcessStage
 from probe_kit.extract.settings import Settings
-from probe_kit.extract.sources.environment import EnvSource
-from probe_kit.extract.sources.scene import SceneSettings
-from probe_kit.runs.layout import VIDEOS, stored_inputs_of
+from probe_kit.extract.sources.player import AskablePlayer, LocalPlayer, ProcessPlayer
+from probe_kit.extract.sources.source import Played, Source
+from probe_kit.runs.layout import VIDEOS
 from probe_kit.runs.sources import SOURCES, RunSources
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.runs.writer import RunWriter
@@ -37,7 +31,6 @@ SPARE_BUFFERS = 2
 # With fewer episodes than this, starting processes takes longer than they save.
 WORTH_PROCESSES = 8
 _FILM_SIZE = (320, 240)
-NextEpisode = Callable[[], PlannedEpisode | None]
 
 
 class Worker:
@@ -49,20 +42,23 @@ class Worker:
 
     def __init__(
         self,
-        writer: RunWriter[RowPlan],
+        writer: RunWriter[Plan],
         settings: Settings,
-        controller: ActingController | AnswerController,
+        controller: Controller,
+        source: Source[Any],
         episodes: int,
     ) -> None:
         self._writer, self._settings, self._controller = writer, settings, controller
         self._episodes = episodes
+        played = Played(settings.machine.frames, settings.capture.calls, controller.script)
+        self._opens = source.play(played)
         self._pending: deque[Future[Done]] = deque()
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             stack.enter_context(torch_threads(self._controller.threads))
             count = 2 * self._settings.machine.observations
-            self._stages = [self._open_stage(position, stack) for position in range(count)]
+            self._players = [self._open_player(position, stack) for position in range(count)]
             self._ring = BufferPool([self._make_buffers() for _ in range(count + SPARE_BUFFERS)])
             self._thread = stack.enter_context(ThreadPoolExecutor(1, "probe-kit-writer"))
             self._opened = stack.pop_all()
@@ -71,23 +67,14 @@ class Worker:
     def __exit__(self, *_: object) -> None:
         self._opened.close()
 
-    def _open_stage(self, position: int, stack: ExitStack) -> AskableStage:
+    def _open_player(self, position: int, stack: ExitStack) -> AskablePlayer:
         wanted = self._settings.machine.env_workers
         if wanted is None:
             wanted = 2 * self._settings.machine.observations if self._episodes >= WORTH_PROCESSES else 0
-        kind = ProcessStage if position < wanted else LocalStage
-        settings, source = self._settings, self._settings.source
-        stage: AskableStage
-        if isinstance(source, SceneSettings):
-            stage = kind(settings.scene, self._controller.script, settings.machine.frames)
-        elif isinstance(source, EnvSource):
-            facts = tuple(stored_inputs_of(self._writer.settings)["columns"])
-            played = PlayedEnvironment(source, facts, settings.capture.calls)
-            stage = kind(played, None, settings.machine.frames, kind=EnvironmentStage)
-        else:
-            stage = kind(source, None, kind=RecordedStage)
-        stack.callback(stage.close)
-        return stage
+        kind = ProcessPlayer if position < wanted else LocalPlayer
+        player = kind(self._opens)
+        stack.callback(player.close)
+        return player
 
     def _make_buffers(self) -> EpisodeBuffers:
         settings, controller = self._settings, self._controller
@@ -103,16 +90,11 @@ class Worker:
     def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
         """EpisodeLoop what `next_number` gives until it gives None; an event per episode, when it is committed."""
 
-        def next_episode() -> PlannedRow | None:
+        def next_episode() -> Row | None:
             number = next_number()
             return None if number is None else self._writer.plan.episode(number)
 
-        controller, stages, ring = self._controller, self._stages, self._ring
-        playing: Iterable[Rollout | Failure]
-        if isinstance(controller, AnswerController):
-            playing = Asking(stages, controller, ring, cast("NextEpisode", next_episode))
-        else:
-            playing = EpisodeLoop(stages, controller, ring, next_episode, self._is_filmed)
+        playing = EpisodeLoop(self._players, self._controller, self._ring, next_episode, self._is_filmed)
         for played in playing:
             if isinstance(played, Failure):
                 yield Failed(played.planned.index, played.reason, played.traceback)
@@ -144,8 +126,9 @@ class Worker:
         card = certificate["policy"]
         checkpoint, repositories = str(card.get("checkpoint") or ""), card.get("repositories", {})
         source = self._settings.source
-        suite = source.suite if isinstance(source, SceneSettings) else None
-        sources = RunSources.of(self._settings.model, suite, source.files(), checkpoint, repositories)
+        files = source.files()
+        suite = files.pop("suite", None)
+        sources = RunSources.of(self._settings.model, suite, files, checkpoint, repositories)
         return {**certificate, SOURCES: sources.to_json()}
 
     def _pictures(self, rollout: Rollout) -> dict[str, bytes]:
@@ -161,7 +144,7 @@ class Worker:
     def _frame_count(self, rollout: Rollout) -> int | None:
         return len(rollout.small_frames) or None if self._settings.machine.frames == "all" else None
 
-    def _is_filmed(self, planned: PlannedRow) -> bool:
+    def _is_filmed(self, planned: Row) -> bool:
         return self._settings.machine.video == "all" or (
             self._settings.machine.video == "first" and planned.index == 0
         )

@@ -38,26 +38,25 @@ def show_dataset(
     """
     from rich.table import Table
 
-    from probe_kit.extract.prepared import check_recording, load_acting_policy, open_recording
-    from probe_kit.extract.rollout.recorded.described import describe_fit, describe_recording
-    from probe_kit.extract.rollout.recorded.recorded_controller import check_recorded_units, fit
+    from probe_kit.extract.preparation import check_recording, load_acting_policy
+    from probe_kit.extract.sources.recording_source import RecordingSource
 
     settings = ExtractSettings.of_command({**typed, "model": model or "pi0-tiny", "dataset": folder})
     assert isinstance(settings.source, LeRobotSource)
     with err.status("reading the data set"):
-        recording = open_recording(settings.source)
-        recording.check()
-        facts, fitted = describe_recording(recording), None
+        recording = RecordingSource.open(settings.source, False)
+        recording.check_frames()
+        facts = recording.facts()
     if model is not None:
         with err.status("loading the model"):
             check_recording(settings, recording)
-            fitted = fit(recording, load_acting_policy(settings))
-        facts |= describe_fit(fitted)
+            recording, policy = recording.fitted(load_acting_policy(settings))
+        facts |= recording.facts_of(policy)
     table = Table(show_header=False, box=None)
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
     for name, value in facts.items():
         table.add_row(name, marked("{}", terminal_safe(value)))
     out.print(table)
-    if fitted is not None:
-        check_recorded_units(fitted, settings.machine.accept_units)
+    if model is not None:
+        recording.check_recorded_units(policy, settings.machine.accept_units)

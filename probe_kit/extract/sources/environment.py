@@ -51,12 +51,16 @@ class EnvSource(SourceSettings):
     pixels: Pixels = True
 
     command: ClassVar[str] = "--env MODULE:CLASS"
+    opens: ClassVar[str] = "probe_kit.extract.sources.environment_source:EnvironmentSource"
     subject: ClassVar[str] = "environments"
     loads: ClassVar[str] = "environment"
+    refuses: ClassVar[tuple[str, ...]] = (
+        "protocol", "rotation", "video", "batch=auto", "capture_only", "frames=all",
+    )  # fmt: skip
     shows: ClassVar[str] = "--env, in which the model acts in its own units"
 
-    def __init__(self, environment: str, **choices: Any) -> None:
-        super().__init__(**{"environment": environment, **choices})
+    def __init__(self, environment: str, options: Any = None, **choices: Any) -> None:
+        super().__init__(**{"environment": environment, "options": options, **choices})
 
     @property
     def name(self) -> str:

@@ -167,9 +167,12 @@ class LeRobotSource(SourceSettings):
     pixels: Pixels = True
 
     command: ClassVar[str] = "--dataset FOLDER"
+    opens: ClassVar[str] = "probe_kit.extract.sources.recording_source:RecordingSource"
     subject: ClassVar[str] = "recordings"
     loads: ClassVar[str] = "recordings"
-    decides: ClassVar[tuple[str, ...]] = ("captured_calls",)
+    refuses: ClassVar[tuple[str, ...]] = (
+        "protocol", "rotation", "video", "batch=auto", "execute", "later_views", "edits",
+    )  # fmt: skip
     shows: ClassVar[str] = "--dataset, which shows recorded frames and executes no action"
 
     def __init__(self, folder: str | Path, **choices: Any) -> None:

@@ -104,6 +104,7 @@ class SceneSettings(SourceSettings):
     ] = None
     scene: Scene
 
+    opens: ClassVar[str] = "probe_kit.extract.sources.scene_source:SceneSource"
     subject: ClassVar[str] = "scenes"
     loads: ClassVar[str] = "suite"
 
@@ -117,6 +118,6 @@ class SceneSettings(SourceSettings):
         return self.scene.max_steps
 
     def files(self) -> dict[str, Path]:
-        """Return the files of the scene, by its field."""
-        named = {"arm_urdf": self.scene.arm_urdf, "background": self.scene.background}
+        """Return the suite, where it is a folder, and the files of the scene by its field."""
+        named = {"suite": self.suite, "arm_urdf": self.scene.arm_urdf, "background": self.scene.background}
         return {name: path for name, path in named.items() if path is not None}

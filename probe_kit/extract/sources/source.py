@@ -1,41 +1,193 @@
-"""`Source`: where the observations of a run come from."""
+"""`Source`: where the observations of a run come from. A source is one class and its settings.
 
+A source knows neither what a model does with its observations nor how runs are stored.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from probe_kit._terminal.field_options import Part
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from probe_kit.extract.plan import Row
+    from probe_kit.extract.sources.player import Opens
+    from probe_kit.hooks import Policy
+    from probe_kit.hooks.contract.observation import Observation
+    from probe_kit.suite import Suite
 
 
 class SourceSettings(Part):
     """Settings of a source, which open it.
 
-    kind: the name of the source in files. command: the option that a command names it with; empty for the scene.
-    shows: the reason why options of other sources do not apply. subject, loads: what its options are about, and
-    what is loaded of it, in words. decides:
-    fields of other parts that the source itself decides.
+    kind: the name of the source in files. opens: MODULE:CLASS of the `Source`, which is imported when it is
+    opened. command: the option that a command names it with; empty for the scene. shows: the reason why options of
+    other sources do not apply. subject, loads: what its options are about, and what is loaded of it, in words.
+    refuses: fields of other parts that do not apply, some with the only value that does not.
     """
 
     kind: str
 
     command: ClassVar[str] = ""
     shows: ClassVar[str] = ""
+    opens: ClassVar[str] = ""
     subject: ClassVar[str] = ""
     loads: ClassVar[str] = ""
-    decides: ClassVar[tuple[str, ...]] = ()
+    refuses: ClassVar[tuple[str, ...]] = ()
 
     @property
     def name(self) -> str:
         """The name in tables."""
         return self.kind
 
+    def open(self, selects_only: bool = False) -> "Source[Any]":
+        """Open the source. selects_only: nothing but the chosen rows is needed. Raises what is wrong with it."""
+        return self._source.open(self, selects_only)
+
+    def decided(self) -> Mapping[str, Any]:
+        """Return fields of a run's settings that the source itself decides, by name. Raises as `open`."""
+        return self._source.decided(self)
+
+    @property
+    def _source(self) -> "type[Source[Any]]":
+        module, _, name = self.opens.partition(":")
+        source: type[Source[Any]] = getattr(import_module(module), name)
+        return source
+
     def steps(self) -> int:
         """Count the actions that an episode can have; 0 where nothing acts."""
         return 0
 
-    def marks(self) -> list[str]:
-        """The parts of a run's label that name the source."""
-        return []
-
     def files(self) -> dict[str, Path]:
         """Return the files that the source reads beside its rows, by field."""
         return {}
+
+    def marks(self) -> list[str]:
+        """Return the parts of a run's label that name the source."""
+        return []
+
+
+@dataclass(frozen=True)
+class Played:
+    """What a player needs to know beside its source: frames to keep, inferences whose inputs count, a script."""
+
+    frames: str = "none"
+    calls: int = 1
+    script: str | None = None
+
+
+class Source[Chosen: SourceSettings](ABC):
+    """An opened source; `check` gives the same source as it is shown to a model.
+
+    own_units: whether actions are predictions in the checkpoint's own units; those of an arm otherwise.
+    executes: whether actions move anything. columns: names of numbers that become labels, such as facts.
+    suite: of questions with two pictures. chunk: actions that a policy predicts at a time; 0 where its card says
+    so. groups: what rows are grouped by, in words.
+    """
+
+    own_units: ClassVar[bool] = True
+    executes: ClassVar[bool] = True
+    groups: ClassVar[str] = "groups of episodes"
+    columns: tuple[str, ...] = ()
+    chunk: int = 0
+    settings: Chosen
+    suite: "Suite | None" = None
+
+    @classmethod
+    @abstractmethod
+    def open(cls, settings: Chosen, selects_only: bool) -> Self:
+        """Open the source that settings choose; see `SourceSettings.open`."""
+
+    @classmethod
+    def decided(cls, settings: Chosen) -> Mapping[str, Any]:
+        """Return fields of a run's settings that the source itself decides; see `SourceSettings.decided`."""
+        del settings
+        return {}
+
+    @property
+    @abstractmethod
+    def name(self) -> str:
+        """The name in tables."""
+
+    @abstractmethod
+    def rows(self, seed: int) -> "tuple[Row, ...]":
+        """The rows in order; nothing about a row depends on which others were selected."""
+
+    @abstractmethod
+    def identity(self, execute: int) -> dict[str, Any]:
+        """The part of a run's identity that says where observations come from. execute: actions per inference."""
+
+    @abstractmethod
+    def selection(self, rows: "Sequence[Row]") -> dict[str, Any]:
+        """The settings that say what was selected; no part of a run's identity."""
+
+    @abstractmethod
+    def describe(self, rows: "Sequence[Row]") -> dict[str, str]:
+        """The lines of a plan that say what is shown, by heading."""
+
+    @abstractmethod
+    def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
+        """The source as a policy is shown it, and the policy for its cameras.
+
+        Raises for cameras, states, units or actions that do not fit.
+        """
+
+    @abstractmethod
+    def play(self, played: Played) -> "Opens":
+        """Return what opens a player of this source, here or in a process of its own."""
+
+    @abstractmethod
+    def example(self, instruction: str) -> "Observation":
+        """A blank observation of the source's shapes, of which tokens are counted."""
+
+    @property
+    @abstractmethod
+    def instructions(self) -> tuple[str, ...]:
+        """Every instruction once, in the order of their letters."""
+
+    def early_checks(
+        self, cameras: Sequence[str], state: int | None, checkpoint: str
+    ) -> list[Callable[[], object]]:
+        """Checks against the cameras and numbers of the state that a checkpoint declares, before it is loaded."""
+        del cameras, state, checkpoint
+        return []
+
+    def known_early(self) -> dict[str, Any] | None:
+        """The settings of a run that are known before a model is loaded; None where there are none."""
+        return None
+
+    def name_parts(self) -> list[Any]:
+        """The parts of a run's default name beside its identity."""
+        return []
+
+    def rehearse(self, rows: "Iterable[Row]") -> None:
+        """Set the first rows up. Raises if none can be."""
+        del rows
+
+    @property
+    def suite_parent(self) -> Any:
+        """The hash of the suite that a suite was selected of; None for all else."""
+        return None
+
+    @property
+    def decoder(self) -> str | None:
+        """The name and version of what makes pictures of stored videos here; None where nothing is decoded."""
+        return None
+
+    def targets(self) -> tuple[str, ...]:
+        """The built-in targets of probes that the rows have, such as `side.correct` or `env.left`."""
+        return ()
+
+    def pairs(self, vary: str, rng: "np.random.Generator", rows: "Sequence[Row]") -> "Iterator[Any]":
+        """Pairs of observations of some rows that differ in one input, see `probe_kit.extract.sources.pairs`.
+
+        vary: `instruction`, `state`, or `picture.NAME` of a camera. Raises UsageError for an input without pairs.
+        """
+        from probe_kit.extract.sources.pairs import frames_of, pairs_of
+
+        return pairs_of(frames_of(self.play(Played()), rows), vary, rng)

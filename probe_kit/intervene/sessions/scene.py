@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import NoTrajectoryError, OtherFramesError
-from probe_kit.extract.plan import PlannedEpisode
-from probe_kit.extract.rollout.stage import Seen, Stage
+from probe_kit.extract.plan import Row
+from probe_kit.extract.sources.scene_player import ScenePlayer, Seen
+from probe_kit.extract.sources.scene_source import scene_row
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk, Pair
@@ -39,7 +40,7 @@ class SceneSession(ReplaySession):
     def __init__(self, run: Run, policy: "Policy", scene: SceneSpec, items: Mapping[str, Item]) -> None:
         super().__init__(run, policy)
         self.scene, self.items, self.counterparts = scene, items, counterparts_of(items.values())
-        self.stage = Stage(scene, None)
+        self.stage = ScenePlayer(scene)
         left, right = np.array(scene.tile_left), np.array(scene.tile_right)
         self._middle, self._across = (left + right) / 2, (left - right) / float(np.linalg.norm(left - right))
 
@@ -91,18 +92,16 @@ class SceneSession(ReplaySession):
             )
         return pairs
 
-    def planned(self, pair: Pair) -> PlannedEpisode:
+    def planned(self, pair: Pair) -> Row:
         """Return a pair's episode as the run planned it."""
         assert isinstance(pair.clean, Observation)
         record = self.run.episodes.iloc[pair.row]
         item = replace(self.items[pair.item], instruction=pair.clean.instruction)
         seeds = int(record["scene_seed"]), int(record["policy_seed"])
-        return PlannedEpisode(0, Episode(item, _layout_of(record)), *seeds)
+        return scene_row(0, Episode(item, _layout_of(record)), *seeds)
 
     def _look(self, item: Item, layout: Layout, scene_seed: int) -> Seen:
-        answer = self.stage.look(PlannedEpisode(0, Episode(item, layout), scene_seed, 0))
-        assert isinstance(answer, Seen)
-        return answer
+        return self.stage.look(scene_row(0, Episode(item, layout), scene_seed, 0))
 
     def _check_frame(self, record: Any, seen: Seen) -> None:
         stored, drawn = record.get("first_frame_sha256"), seen.facts["first_frame_sha256"]

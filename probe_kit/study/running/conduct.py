@@ -6,9 +6,7 @@ from pathlib import Path
 from probe_kit._system.optional_dependencies import require
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract.plan import plan_episodes
-from probe_kit.extract.prepared import as_protocol, check_run
-from probe_kit.extract.rollout.preflight import run_preflight
+from probe_kit.extract.preparation import open_checked
 from probe_kit.runs import open_run, seal
 from probe_kit.runs.store import locate
 from probe_kit.study.ledger import NOT_TRIED_AGAIN, Failure, Ledger
@@ -104,10 +102,10 @@ class _Course:
         try:
             if one.state == "damaged":
                 raise ProbeKitError(one.why.removeprefix("damaged: "))
-            settings = as_protocol(one.cell.settings_to_play.changed(ray=self._ray))  # its devices are elsewhere
-            suite = check_run(settings, locate(one.location))
+            chosen = one.cell.settings_to_play.changed(ray=self._ray)  # its devices are elsewhere
+            settings, source = open_checked(chosen, locate(one.location))
             if settings.scene not in rehearsed:
-                run_preflight(settings.scene, plan_episodes(suite, settings.seed))
+                source.rehearse(source.rows(settings.seed))
                 rehearsed.append(settings.scene)
         except STOPS_ALL:
             raise

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from probe_kit.errors import DiskSpaceError, EpisodesFailedError, StoreError
 from probe_kit.extract import prepare
 from probe_kit.extract.extraction import Extraction
-from probe_kit.extract.prepared import load_acting_policy, load_answer_model
+from probe_kit.extract.preparation import load_acting_policy, load_answer_model
 from probe_kit.extract.rollout.controllers import SCRIPTED
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.study.ledger import Failure, Played, machine_name, now

@@ -10,15 +10,16 @@ import pytest
 
 from probe_kit.errors import OwnEnvironmentError, UsageError
 from probe_kit.extract import EnvEpisode, EnvSource, Step, check_environment
-from probe_kit.extract.own_environments.environment_plan import PlannedEnvEpisode
-from probe_kit.extract.own_environments.opening import (
+from probe_kit.extract.plan import Row
+from probe_kit.extract.sources.environment_source import EnvironmentPlayer
+from probe_kit.extract.sources.opening import (
     checked_step,
     factory_of,
     listed_episodes,
     open_environment,
 )
-from probe_kit.extract.rollout.own_environments.environment_stage import EnvironmentStage, PlayedEnvironment
-from probe_kit.extract.rollout.stage import Ending
+from probe_kit.extract.sources.player import Ending
+from probe_kit.extract.sources.source import Played
 from probe_kit.hooks import Observation
 from tests.support.reach_env import ReachEnv
 
@@ -160,13 +161,15 @@ def test_steps_that_break_the_contract_are_refused_with_their_place(answer: Any,
         checked_step(answer, EPISODE, "kitchen, step() 3")
 
 
-def stage(name: str = "ReachEnv", **given: Any) -> EnvironmentStage:
-    return EnvironmentStage(PlayedEnvironment(EnvSource(HOME + name, **given), FACTS, 3), None, "ends")
+def stage(name: str = "ReachEnv", **given: Any) -> EnvironmentPlayer:
+    return EnvironmentPlayer(EnvSource(HOME + name, **given), FACTS, Played("ends", 3))
 
 
-def planned(seed: int = 3) -> PlannedEnvEpisode:
+def planned(seed: int = 3) -> Row:
+    """The row of an episode."""
     episode = list(ReachEnv().episodes())[seed]
-    return PlannedEnvEpisode(0, seed, episode, 5)
+    columns = {"episode_id": episode.id, "instruction": episode.instruction, "env_episode": seed, "policy_seed": 5}
+    return Row(0, columns, episode)
 
 
 def test_an_episode_ends_with_its_outcome_its_frames_and_the_inputs_of_its_captured_inferences() -> None:
@@ -204,14 +207,14 @@ def test_an_episode_that_reaches_the_block_succeeds_and_one_that_runs_out_of_ste
 
 def test_an_error_of_the_environment_names_its_episode_and_method() -> None:
     played = stage("Broken")
-    played.begin(planned(), False)
+    played.answer("begin", (planned(), False))
     with pytest.raises(OwnEnvironmentError, match=r"step\(\): ZeroDivisionError") as raised:
-        played.advance(np.zeros((5, 7), np.float32))
-    assert raised.value.__notes__ == ["in reach-03 ('Put the cube on the blue shape')"]
+        played.answer("advance", (np.zeros((5, 7), np.float32),))
+    assert raised.value.__notes__ == ["in episode reach-03 ('Put the cube on the blue shape')"]
 
 
 def test_options_are_arguments_of_the_class() -> None:
-    source = EnvSource.from_options(HOME + "ReachEnv", ["count=4"], "0:4", None, pixels=True)
+    source = EnvSource(HOME + "ReachEnv", options=["count=4"], episodes="0:4")
     assert len(listed_episodes(open_environment(source), source)) == 4
     with pytest.raises(OwnEnvironmentError, match="its constructor: TypeError"):
         open_environment(EnvSource(HOME + "ReachEnv", {"colour": "red"}))  # type: ignore[arg-type]

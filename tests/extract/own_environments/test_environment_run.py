@@ -124,17 +124,17 @@ def test_an_environment_that_fails_costs_its_episode_and_says_where(pi0_tiny: Pi
 def test_options_of_scenes_and_recordings_are_refused_with_an_environment() -> None:
     given = {"model": "pi0-tiny", "env": HOME + "ReachEnv"}
     with pytest.raises(UsageError, match="--light-level does not apply with --env"):
-        ExtractSettings.from_options(**given, light_level=0.7)
-    with pytest.raises(UsageError, match="--select is for recordings; give --dataset"):
-        ExtractSettings.from_options(**given, select="every:2")
-    with pytest.raises(UsageError, match="two sources"):
-        ExtractSettings.from_options(**given, dataset="kitchen")
+        ExtractSettings.of_command({**given, "light_level": 0.7})
+    with pytest.raises(UsageError, match="--select does not apply with --env"):
+        ExtractSettings.of_command({**given, "select": "every:2"})
+    with pytest.raises(UsageError, match="2 sources"):
+        ExtractSettings.of_command({**given, "dataset": "kitchen"})
     with pytest.raises(UsageError, match="--env-option is for environments; give --env"):
-        ExtractSettings("pi0-tiny", env_options=["a=1"])
-    typed = ExtractSettings.from_options(
-        **given, episodes="0:2", max_steps=9, no_pixels=True, captured_calls="all"
+        ExtractSettings.of_command({"model": "pi0-tiny", "env_option": ["a=1"]})
+    typed = ExtractSettings.of_command(
+        {**given, "episodes": "0:2", "max_steps": 9, "no_pixels": False, "captured_calls": "all"}
     )
-    assert typed.source == EnvSource(HOME + "ReachEnv", (), (0, 1), 9, False)
+    assert typed.source == EnvSource(HOME + "ReachEnv", episodes=(0, 1), max_steps=9, pixels=False)
     assert typed.most_inferences(4) == 3
 
 

@@ -8,10 +8,11 @@ import pytest
 
 from probe_kit.errors import OwnEnvironmentError, UnitsError
 from probe_kit.extract import EnvSource, ExtractSettings, Step, check_environment, prepare
-from probe_kit.extract.own_environments.contract import SUCCESS
-from probe_kit.extract.own_environments.opening import checked_step, open_environment
-from probe_kit.extract.rollout.own_environments.environment_stage import EnvironmentStage, PlayedEnvironment
-from probe_kit.extract.rollout.stage import Ending
+from probe_kit.extract.sources.environment_contract import SUCCESS
+from probe_kit.extract.sources.environment_source import EnvironmentPlayer
+from probe_kit.extract.sources.opening import checked_step, open_environment
+from probe_kit.extract.sources.player import Ending
+from probe_kit.extract.sources.source import Played
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs.layout import AT_END, ONCE
@@ -34,7 +35,7 @@ def played(monkeypatch: pytest.MonkeyPatch, successes: list[bool], steps: int) -
         found = plain(self, np.zeros(7, np.float32))
         return Step(found.observation, False, {**found.facts, SUCCESS: next(after)})
 
-    stage = EnvironmentStage(PlayedEnvironment(EnvSource("reach_env:ReachEnv", max_steps=steps), FACTS, 1))
+    stage = EnvironmentPlayer(EnvSource("reach_env:ReachEnv", max_steps=steps), FACTS, Played())
     monkeypatch.setattr(type(stage._environment), "step", step)
     stage.begin(planned(), film=False)
     ending = stage.advance(np.zeros((steps, 7), np.float32))
@@ -96,10 +97,8 @@ def test_an_environment_may_write_into_the_arrays_that_it_gave() -> None:
 @pytest.mark.parametrize("name", ["ReachEnv", "Reusing"])
 def test_small_frames_are_the_first_and_the_last_picture(name: str) -> None:
     environment = open_environment(EnvSource("reach_env:ReachEnv"))
-    first = environment.reset(planned().episode).observation.image  # type: ignore[union-attr]
-    stage = EnvironmentStage(
-        PlayedEnvironment(EnvSource(f"reach_env:{name}", max_steps=3), FACTS, 1), frames="ends"
-    )
+    first = environment.reset(planned().content).observation.image  # type: ignore[union-attr]
+    stage = EnvironmentPlayer(EnvSource(f"reach_env:{name}", max_steps=3), FACTS, Played("ends"))
     stage.begin(planned(), film=False)
     stage.advance(np.tile(np.float32([0, 0.02, 0, 0, 0, 0, 0]), (3, 1)))
     np.testing.assert_array_equal(stage._first[1:], first[1:])

@@ -18,11 +18,11 @@ from PIL import Image
 from probe_kit.env import SceneSpec
 from probe_kit.errors import RecordingError, SettingsMismatchError, UnitsError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run, prepare
-from probe_kit.extract.plan import Plan
-from probe_kit.extract.recordings.lerobot_folder import open_lerobot
-from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
-from probe_kit.extract.recordings.recorded_plan import SIDE, RecordedPlan
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
+from probe_kit.extract.sources.lerobot_folder import open_lerobot
+from probe_kit.extract.sources.lerobot_frames import LeRobotFrames
+from probe_kit.extract.sources.player import SIDE
+from probe_kit.extract.sources.recording_source import RecordingSource
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import Run, compare_actions, verify_run
@@ -62,28 +62,29 @@ def test_a_data_set_written_from_a_scene_run_gives_that_runs_activations_bit_for
 ) -> None:
     """Pictures of 640 × 480 as PNG, batch 1, the seeds of the scene run."""
     seen: dict[int, list[Observation]] = {}
-    act = PolicyController.act
+    infer = PolicyController.infer
 
     def watched(controller: PolicyController, turns: list[Turn]) -> Any:
         for turn in turns:
-            seen.setdefault(turn.seed, []).append(turn.seen)
-        return act(controller, turns)
+            seen.setdefault(turn.row.policy_seed, []).append(turn.seen)
+        return infer(controller, turns)
 
-    monkeypatch.setattr(PolicyController, "act", watched)
+    monkeypatch.setattr(PolicyController, "infer", watched)
     scene = ExtractSettings(
         "pi0-tiny", suite=small_suite.folder, categories=("color",), items=2, scene=SceneSpec(max_steps=6),
         captured_calls=3, execute=2, env_workers=0,
     )  # fmt: skip
     prepared = prepare(scene, policy=pi0_tiny)
-    assert isinstance(prepared.plan, Plan)
     acted = prepared.run(tmp_path / "scene")
-    monkeypatch.setattr(PolicyController, "act", act)
+    monkeypatch.setattr(PolicyController, "infer", infer)
     seeds = [int(seed) for seed in acted.episodes["policy_seed"]]
     folder = write_recording(tmp_path / "rec", [seen[seed] for seed in seeds])
 
     again = prepare(settings(folder), policy=pi0_tiny)
-    assert isinstance(again.plan, RecordedPlan)
-    stretches = tuple(replace(one, policy_seed=seed) for one, seed in zip(again.plan.episodes, seeds, strict=True))
+    stretches = tuple(
+        replace(row, columns={**row.columns, "policy_seed": seed})
+        for row, seed in zip(again.plan.episodes, seeds, strict=True)
+    )
     replayed = replace(again, plan=replace(again.plan, episodes=stretches)).run(tmp_path / "run")
     ours, theirs = rows(replayed), rows(acted)
     assert ours.keys() == theirs.keys()
@@ -400,8 +401,8 @@ def test_trap_1_videos_are_decoded_without_torchcodec_and_without_a_word(tmp_pat
         "import sys\n"
         "sys.modules['torchcodec'] = None\n"
         "from probe_kit.extract import LeRobotSource\n"
-        "from probe_kit.extract.recordings.lerobot_folder import open_lerobot\n"
-        "from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames\n"
+        "from probe_kit.extract.sources.lerobot_folder import open_lerobot\n"
+        "from probe_kit.extract.sources.lerobot_frames import LeRobotFrames\n"
         f"frames = LeRobotFrames(open_lerobot(LeRobotSource({str(folder)!r})))\n"
         f"seen = frames.pictures(0, 3, [{CAMERA!r}])[{CAMERA!r}]\n"
         "print(seen.shape, abs(int(seen[..., 2].mean()) - 60) < 10)\n"
@@ -416,7 +417,7 @@ def test_a_run_of_videos_is_not_continued_with_another_decoder(
 ) -> None:
     folder = write_recording(tmp_path / "video", observations(2), videos=True)
     shown(folder, tmp_path / "run", pi0_tiny, episodes=(0,))
-    monkeypatch.setattr(RecordedPlan, "decoder", "PyAV 1.0")
+    monkeypatch.setattr(RecordingSource, "decoder", "PyAV 1.0")
     with pytest.raises(SettingsMismatchError, match=r"decoder: stored 'PyAV .+', here 'PyAV 1\.0'"):
         shown(folder, tmp_path / "run", pi0_tiny)
 
@@ -442,9 +443,11 @@ def test_an_interrupted_run_continues_with_the_same_bytes(
 
 
 def test_the_python_interface_is_that_of_the_command_line(recording: Path, tmp_path: Path) -> None:
-    typed = ExtractSettings.from_options(
-        model="pi0-tiny", dataset=str(recording), episodes="0:2", select="every:3", cameras=[f"base={CAMERA}"],
-        env_workers=0,
+    typed = ExtractSettings.of_command(
+        {
+            "model": "pi0-tiny", "dataset": str(recording), "episodes": "0:2", "select": "every:3",
+            "camera": [f"base={CAMERA}"], "env_workers": 0,
+        }
     )  # fmt: skip
-    assert typed.source == LeRobotSource(str(recording), range(2), 3, {"base": CAMERA})  # type: ignore[arg-type]
+    assert typed.source == LeRobotSource(str(recording), episodes=range(2), every=3, cameras={"base": CAMERA})
     assert len(extract_run(typed, tmp_path / "run").episodes) == 2

@@ -8,17 +8,18 @@ import pytest
 
 from probe_kit.errors import MissingExtraError, RecordingError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, prepare
-from probe_kit.extract.recordings.lerobot_folder import open_lerobot, resolved_commit
-from probe_kit.extract.recordings.recorded_plan import PlannedStretch, mapped_cameras
-from probe_kit.extract.rollout.settings_checks import check_meaningless
-from probe_kit.extract.sources.recording import read_episodes, read_every
+from probe_kit.extract.plan import Row
+from probe_kit.extract.preparation import check_meaningless
+from probe_kit.extract.sources.lerobot_folder import open_lerobot, resolved_commit
+from probe_kit.extract.sources.recording import read_episodes
+from probe_kit.extract.sources.recording_source import mapped_cameras
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 TOP, WRIST = "observation.images.top", "observation.images.wrist"
 
 
 @pytest.mark.parametrize(
-    ("text", "episodes"), [("0:3", (0, 1, 2)), ("7", (7,)), ("5:7,1", (5, 6, 1)), ("0:1", (0,))]
+    ("text", "episodes"), [("0:3", (0, 1, 2)), ("7", (7,)), ("5:7,1", (1, 5, 6)), ("0:1", (0,))]
 )
 def test_episodes_are_ranges_or_single_indices(text: str, episodes: tuple[int, ...]) -> None:
     assert read_episodes(text) == episodes
@@ -37,13 +38,13 @@ def test_episodes_are_shown_in_the_order_of_the_data_set_each_once() -> None:
 
 @pytest.mark.parametrize(("text", "every"), [("every:1", 1), ("every:25", 25)])
 def test_frames_are_chosen_by_their_distance(text: str, every: int) -> None:
-    assert read_every(text) == every
+    assert LeRobotSource("folder", every=text).every == every
 
 
 @pytest.mark.parametrize("text", ["every:0", "every", "5", "all", "every:-3"])
 def test_other_words_for_frames_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="expected every:N"):
-        read_every(text)
+        LeRobotSource("folder", every=text)
 
 
 @pytest.mark.parametrize(
@@ -58,7 +59,7 @@ def test_other_words_for_frames_are_refused(text: str) -> None:
 )
 def test_maps_that_cannot_be_meant_are_refused(given: dict[str, list[str]], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        LeRobotSource.from_options("folder", **given)  # type: ignore[arg-type]
+        LeRobotSource("folder", **given)  # type: ignore[arg-type]
 
 
 # -- cameras --------------------------------------------------------------------------------------------------
@@ -103,16 +104,9 @@ def test_a_map_of_what_is_not_there_is_refused(pair: tuple[str, str]) -> None:
 
 
 def test_a_frame_has_the_same_seed_whichever_other_frames_were_chosen() -> None:
-    every = PlannedStretch(0, 3, 0, 0, 1, 20, 20, "open it", 5, "")
-    third = PlannedStretch(9, 3, 0, 0, 3, 7, 20, "open it", 5, "")
+    every, third = Row(0, {}, frames=range(20)), Row(9, {}, frames=range(0, 20, 3))
     assert [every.noise_of(call) for call in (0, 3, 6)] == [third.noise_of(call) for call in (0, 1, 2)]
     assert [third.control_step(call, 99) for call in range(3)] == [0, 3, 6]
-
-
-def test_the_parts_of_a_long_episode_have_ids_of_their_own_and_one_group() -> None:
-    parts = [PlannedStretch(part, 12, part, 64 * part, 1, 64, 128, "open it", 5, "") for part in (0, 1)]
-    assert [part.episode_id for part in parts] == ["episode-000012", "episode-000012.1"]
-    assert {part.to_json()["group_id"] for part in parts} == {"episode-000012"}
 
 
 # -- what is refused before lerobot is asked --------------------------------------------------------------------
@@ -161,15 +155,16 @@ def test_a_data_set_of_the_hub_is_told_from_a_folder(tmp_path: Path) -> None:
 
 def test_options_of_scenes_are_refused_with_recordings(tmp_path: Path) -> None:
     source = LeRobotSource(str(tmp_path))
-    for given in ({"items": 4}, {"categories": ("color",)}, {"execute": 2}, {"video": "all"}, {"calibrate": True}):
+    for given in ({"items": 4}, {"categories": ("color",)}, {"execute": 2}, {"video": "all"}, {"batch": "auto"}):
         with pytest.raises(UsageError, match="does not apply with --dataset"):
             check_meaningless(ExtractSettings("pi0-tiny", source=source, **given))  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="expert is scripted and looks at nothing"):
         prepare(ExtractSettings("expert", source=source))
-    with pytest.raises(UsageError, match="--max-steps, --captured-calls does not apply with --dataset"):
-        ExtractSettings("pi0-tiny", dataset="x", max_steps=3, captured_calls=2)
+    for typed, flag in (({"max_steps": 3}, "--max-steps"), ({"captured_calls": 2}, "--captured-calls")):
+        with pytest.raises(UsageError, match=f"{flag} does not apply with --dataset"):
+            ExtractSettings.of_command({"model": "pi0-tiny", "dataset": "x", **typed})
 
 
 def test_options_of_recordings_are_refused_without_them() -> None:
     with pytest.raises(UsageError, match="--episodes, --no-pixels is for recordings; give --dataset"):
-        ExtractSettings("pi0-tiny", episodes="0:5", no_pixels=True)
+        ExtractSettings.of_command({"model": "pi0-tiny", "episodes": "0:5", "no_pixels": False})

@@ -19,10 +19,10 @@ from PIL import Image
 
 from probe_kit.errors import InstructionError, RecordingError, SettingsMismatchError, UnitsError
 from probe_kit.extract import ExtractSettings, LeRobotSource, prepare
-from probe_kit.extract.recordings.hashed_files import HashedFiles
-from probe_kit.extract.recordings.lerobot_folder import LeRobotFolder, open_lerobot
-from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
 from probe_kit.extract.source_commands.dataset_commands import show_dataset
+from probe_kit.extract.sources.hashed_files import HashedFiles
+from probe_kit.extract.sources.lerobot_folder import LeRobotFolder, open_lerobot
+from probe_kit.extract.sources.lerobot_frames import LeRobotFrames
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from tests.extract.recordings.conftest import observations
 from tests.support.lerobot_recordings import CAMERA, FPS, write_recording
@@ -189,7 +189,7 @@ def test_rows_are_the_episodes_own_however_a_file_is_divided(
     copy: Path, groups: int | None, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """most: bytes that are read at once of a whole file."""
-    monkeypatch.setattr("probe_kit.extract.recordings.lerobot_frames.MOST_AT_ONCE", most)
+    monkeypatch.setattr("probe_kit.extract.sources.lerobot_frames.MOST_AT_ONCE", most)
     pq.write_table(pq.read_table(copy / DATA), copy / DATA, row_group_size=groups)
     np.testing.assert_array_equal(shown_states(copy), WRITTEN)
     frames = LeRobotFrames(opened(copy))
@@ -489,6 +489,12 @@ def test_time_ranges_of_videos_that_do_not_fit_are_refused(filmed: Path, tmp_pat
 # -- what is shown, and against what ------------------------------------------------------------------------------
 
 
+def shown_by_command(typed: dict[str, Any], folder: Path, model: str | None = None) -> None:
+    """Print a data set as `probe-kit dataset show` does. typed: options by parameter."""
+    command: Any = show_dataset
+    command.__wrapped__(typed, str(folder), model)
+
+
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
@@ -507,11 +513,11 @@ def test_time_ranges_of_videos_that_do_not_fit_are_refused(filmed: Path, tmp_pat
 def test_a_data_set_is_not_described_where_extract_would_refuse_it(
     copy: Path, break_it: Callable[[Path], None], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    show_dataset(str(copy))
+    shown_by_command({}, copy)
     assert "3 of 3, 5 to 7 frames each" in capsys.readouterr().out
     break_it(copy)
     with pytest.raises(RecordingError, match=message):
-        show_dataset(str(copy), instruction="Put the cube on the red shape")
+        shown_by_command({"instruction": "Put the cube on the red shape"}, copy)
 
 
 def test_a_data_set_in_other_units_is_shown_and_then_refused_unless_accepted(
@@ -519,9 +525,9 @@ def test_a_data_set_in_other_units_is_shown_and_then_refused_unless_accepted(
 ) -> None:
     change(copy / DATA, STATE, lambda rows: [[1000 * number for number in row] for row in rows])
     with pytest.raises(UnitsError, match=r"rec, observation\.state: .* lie outside the statistics"):
-        show_dataset(str(copy), model="pi0-tiny")
+        shown_by_command({}, copy, "pi0-tiny")
     assert "outside the checkpoint's statistics: s0 100" in capsys.readouterr().out
-    show_dataset(str(copy), model="pi0-tiny", accept_units=True)
+    shown_by_command({"accept_units": True}, copy, "pi0-tiny")
 
 
 @pytest.mark.parametrize(
@@ -564,7 +570,7 @@ def misfit(folder: Path, state: int, words: str, camera: str) -> ExtractSettings
 def test_camera_words_and_state_that_do_not_fit_are_refused_together_before_a_network_is_loaded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("probe_kit.extract.prepared.load_acting_policy", lambda _: pytest.fail("it was loaded"))
+    monkeypatch.setattr("probe_kit.extract.preparation.load_acting_policy", lambda _: pytest.fail("it was loaded"))
     settings = misfit(tmp_path / "rec", 6, "Stack the plates", "wrist")
     with pytest.raises(RecordingError) as refused:
         prepare(settings)

@@ -7,11 +7,13 @@ import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings
+from probe_kit.extract.plan import Row
+from probe_kit.extract.preparation import check_reachable
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
 from probe_kit.extract.rollout.executed_actions import ensemble
-from probe_kit.extract.rollout.settings_checks import check_unreachable
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, load_policy
+from probe_kit.suite import Suite
 from tests.support.spatialvla_checkpoints import write_checkpoint
 
 
@@ -41,20 +43,24 @@ def test_the_gripper_stays_open_or_closed() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:the model put out tokens")
-def test_an_episode_is_played_by_the_mean_of_its_plans(tmp_path: Path, observation: Observation) -> None:
+def test_an_episode_is_played_by_the_mean_of_its_plans(
+    tmp_path: Path, observation: Observation, small_suite: Suite
+) -> None:
     checkpoint = str(write_checkpoint(tmp_path))
     policy = load_policy("spatialvla", checkpoint, ensemble="true", constrained=True, camera="default")
-    controller = PolicyController(policy, "spatialvla", [observation], None, 0, with_tokens=False)
+    asked = ExtractSettings("spatialvla", checkpoint, suite=small_suite.folder, categories=("color",), items=2)
+    source = asked.source.open()
+    controller = PolicyController(policy, source, asked)
     past: list[np.ndarray] = []
     planned: list[np.ndarray] = []
     for call in range(3):
         seen = replace(observation, image=np.roll(observation.image, call, axis=1))
-        turn = Turn(seen, seed=5, call=call, buffers=cast(Any, None), past=past)
-        executed = controller.act([turn])[0]
-        planned.append(policy.act([seen], [derive_seed(5, "inference", call)])[0])
+        turn = Turn(seen, Row(0, {"policy_seed": 5}), call + 1, cast(Any, None), past)
+        executed = controller.infer([turn])[0].actions
+        planned.append(policy.act([seen], [derive_seed(5, "inference", call + 1)])[0])
         np.testing.assert_array_equal(executed, ensemble(planned, 0.8)[None])
     assert len(past) == 3
-    asked = ExtractSettings("spatialvla", checkpoint, execute=2)
+    asked = asked.changed(execute=2)
     with pytest.raises(UsageError, match="needs an inference per action"):
-        check_unreachable(asked, policy.card)
-    check_unreachable(replace(asked, execute=None), policy.card)
+        check_reachable(asked, policy.card, source)
+    check_reachable(asked.changed(execute=None), policy.card, source)

@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -12,10 +13,11 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ActionError
 from probe_kit.extract import ExtractSettings, prepare
-from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.extract.plan import Row
+from probe_kit.extract.rollout.controllers import Inference
 from probe_kit.extract.rollout.episode_loop import EpisodeLoop, Failure, Rollout
-from probe_kit.extract.rollout.stage import Ending, LocalStage, Seen, Stage
-from probe_kit.extract.rollout.stage_process import ProcessStage
+from probe_kit.extract.sources.player import Ending, LocalPlayer, ProcessPlayer
+from probe_kit.extract.sources.scene_player import ScenePlayer
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite import Suite, build_suite
 
@@ -64,14 +66,12 @@ class Quick:
 class Thinking:
     """A policy that says in `log` which episodes it is asked about."""
 
-    flagged = None
-
     def __init__(self, log: list[tuple[str, int]], capture_only: bool) -> None:
         self._log, self.capture_only = log, capture_only
 
-    def act(self, turns: Any) -> list[np.ndarray]:
-        self._log.append(("asked for actions", turns[0].seed))
-        return [np.zeros((1, 7), np.float32) for _ in turns]
+    def infer(self, turns: Any) -> list[Inference]:
+        self._log.append(("asked for actions", turns[0].row.policy_seed))
+        return [Inference(None if self.capture_only else np.zeros((1, 7), np.float32)) for _ in turns]
 
     def instruction_ids(self, _instruction: str) -> None:
         return None
@@ -81,8 +81,7 @@ def played(
     episodes: int, batch: int = 1, length: int = 1, bad: set[int] | None = None, capture_only: bool = False
 ) -> tuple[list[Rollout | Failure], list[tuple[str, int]]]:
     log: list[tuple[str, int]] = []
-    nothing: Any = None
-    left = iter([PlannedEpisode(number, nothing, scene_seed=0, policy_seed=number) for number in range(episodes)])
+    left = iter([Row(number, {"policy_seed": number}) for number in range(episodes)])
     ring: Any = SimpleNamespace(take=lambda: object(), give_back=lambda _buffers: None)
     stages: Any = [Quick(log, length, bad or set()) for _ in range(2 * batch)]
     controller: Any = Thinking(log, capture_only)
@@ -126,23 +125,22 @@ def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
     return build_suite(tmp_path_factory.mktemp("suite") / "two", ["color"], 2)
 
 
-@pytest.fixture(params=[LocalStage, ProcessStage])
-def stage(request: pytest.FixtureRequest) -> Iterator[LocalStage | ProcessStage]:
-    made = request.param(SceneSpec(max_steps=2), None)
+@pytest.fixture(params=[LocalPlayer, ProcessPlayer])
+def stage(request: pytest.FixtureRequest) -> Iterator[LocalPlayer | ProcessPlayer]:
+    made = request.param(partial(ScenePlayer, SceneSpec(max_steps=2)))
     yield made
     made.close()
 
 
 def test_a_stage_goes_on_by_itself_where_an_episode_ends_and_only_there(
-    stage: LocalStage | ProcessStage, suite: Suite
+    stage: LocalPlayer | ProcessPlayer, suite: Suite
 ) -> None:
     first, second = prepare(ExtractSettings("expert", suite=suite.folder)).plan.episodes[:2]
     begin = ("begin", (second, False))
-    alone = Stage(SceneSpec(max_steps=2), None)
+    alone = ScenePlayer(SceneSpec(max_steps=2))
     expected = alone.begin(second, False)
     alone.close()
     assert isinstance(expected, Observation)
-    assert not isinstance(expected, Seen)
 
     still = np.zeros((1, 7), np.float32)
     stage.ask("begin", first, False)

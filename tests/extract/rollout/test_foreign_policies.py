@@ -13,7 +13,7 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ActionError, CheckpointError, EpisodesFailedError, PolicyFailedError
 from probe_kit.extract import ExtractSettings, extract_run
-from probe_kit.extract.rollout.events import LONGEST_TRACEBACK, add_traceback, traceback_of
+from probe_kit.extract.events import LONGEST_TRACEBACK, add_traceback, traceback_of
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.family import Family
 from probe_kit.runs import open_run

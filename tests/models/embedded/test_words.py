@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import InstructionError
 from probe_kit.extract import AskSettings, ExtractSettings
-from probe_kit.extract.prepared import check_run
+from probe_kit.extract.preparation import open_checked
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.models.embedded.words import SPECIAL, WORDS, known_words, words_in
@@ -71,4 +71,4 @@ def test_a_suite_with_an_unknown_word_is_refused_before_the_model_is_loaded(
     table.write_text("instruction,correct,wrong\nPut it on the xylophone,red.png,blue.png\n", encoding="utf-8")
     suite = suite_from_csv(table, tmp_path / "suite", terms=Terms("CC0-1.0", "the test"))
     with pytest.raises(InstructionError, match=r"does not know .*'xylophone'"):
-        check_run(settings.changed(suite=suite.folder))
+        open_checked(settings.changed(suite=suite.folder))

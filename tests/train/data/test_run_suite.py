@@ -15,8 +15,7 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SuiteError, SuiteNotFoundError
 from probe_kit.extract import ExtractSettings, extract_run
-from probe_kit.extract.plan import make_plan
-from probe_kit.extract.prepared import check_run
+from probe_kit.extract.preparation import open_checked
 from probe_kit.runs import Run, open_run, seal
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
@@ -27,6 +26,7 @@ from probe_kit.train import ArrayRun, train_probes
 from probe_kit.train.data.run_suite import suite_of
 from tests.support.changed_suites import CHANGES, other_name, save_changed
 from tests.support.little_run import STREAMS, certify, episode, little_settings, suite_record
+from tests.support.plans import make_plan
 
 SHORT = SceneSpec(max_steps=2)
 CONTROL_LEFT_OUT = "the controls random-features and pixels are on by default and NOT run"
@@ -58,7 +58,10 @@ def filled(cache: Path, drawn: Path) -> Path:
 
 def extracted_suite(items: int | None = None) -> Suite:
     """What `extract --categories color --items ITEMS` runs on."""
-    return check_run(ExtractSettings("expert", scene=SHORT, categories=("color",), items=items))
+    settings = ExtractSettings("expert", scene=SHORT, categories=("color",), items=items)
+    suite = open_checked(settings)[1].suite
+    assert suite is not None
+    return suite
 
 
 def run_on(
@@ -72,7 +75,7 @@ def run_on(
     plan = make_plan(suite, list(STREAMS), 0, calls, True, wordings)
     settings = {**little_settings(), "suite": suite_record(suite), "captured_calls": calls}
     if wordings is not None:
-        settings["wordings"] = plan.wordings
+        settings["wordings"] = plan.selection["wordings"]
     writer = RunWriter(locate(where), plan, settings)
     certify(writer)
     for number in writer.remaining()[:episodes]:

@@ -1,76 +1,20 @@
-"""Checks before the first episode: a test build of the scene, units of its states, and the order of actions.
+"""Units of states and the order of actions, compared with the statistics and names of a checkpoint."""
 
-A source is a scene, a recording or an environment. States of its first inferences are compared with the statistics
-of the checkpoint, and names of actions with the names that the checkpoint has.
-"""
-
-from collections.abc import Iterable, Sequence
-from itertools import islice
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.env import Act2AnswerEnv, SceneSpec
-from probe_kit.errors import SceneError, UnitsError
-from probe_kit.extract.plan import PlannedEpisode
+from probe_kit.errors import PolicyFailedError, UnitsError
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
-EPISODES = 3
-"""If the scene of one episode cannot be built, so many are tried: a single one costs no run."""
 MOST_UNUSUAL = 0.2
 """Share of unusual values of one number of the state, above which a run is refused."""
 FIRST_EPISODES = 4
 """Episodes of a scene or environment whose first states are compared, before any is played."""
-
-
-def run_preflight(scene: SceneSpec, episodes: Iterable[PlannedEpisode]) -> None:
-    """Set up the first episode, or the next ones if its start cannot be reached.
-
-    Raises SceneError if none of the first episodes can be set up, such as for an arm whose meshes are not
-    installed, and SuiteError if a picture of the first one is not what the suite says.
-    """
-    env = Act2AnswerEnv(scene)
-    failed: SceneError | None = None
-    try:
-        for planned in islice(episodes, EPISODES):
-            try:
-                env.reset(
-                    seed=planned.scene_seed,
-                    options={"item": planned.episode.item, "layout": planned.episode.layout},
-                )
-            except SceneError as error:
-                failed = error
-            else:
-                return
-    finally:
-        env.close()
-    if failed is not None:
-        raise failed
-
-
-def first_states(scene: SceneSpec, episodes: Iterable[PlannedEpisode]) -> NDArray[np.float32]:
-    """(n, 8) states of the arm at the first inference of some episodes; those that cannot be set up are left out.
-
-    Raises SceneError if none can be set up.
-    """
-    env = Act2AnswerEnv(scene)
-    states, failed = [], None
-    try:
-        for planned in episodes:
-            try:
-                options = {"item": planned.episode.item, "layout": planned.episode.layout}
-                seen, _ = env.reset(seed=planned.scene_seed, options=options)
-                states.append(seen["agent_pos"])
-            except SceneError as error:
-                failed = error
-    finally:
-        env.close()
-    if not states and failed is not None:
-        raise failed
-    return np.stack(states)
 
 
 def unusual_shares(policy: "Policy", states: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -119,3 +63,14 @@ def exchanged_names(policy: "Policy", names: Sequence[str]) -> str | None:
     places = {name: place for place, name in enumerate(own)}
     moved = [name for place, name in enumerate(names) if places.get(name, place) != place]
     return other_order(policy, names) if moved else None
+
+
+def check_predictions(chunks: Any, count: int) -> None:
+    """Raise PolicyFailedError unless these are (count, chunk, D) float32."""
+    if not (
+        isinstance(chunks, np.ndarray) and chunks.ndim == 3 and len(chunks) == count and chunks.dtype == np.float32
+    ):
+        seen = f"{chunks.shape} {chunks.dtype}" if isinstance(chunks, np.ndarray) else type(chunks).__name__
+        raise PolicyFailedError(
+            f"the policy predicted {seen} for {count} observations; expected float32 ({count}, chunk, actions)"
+        )

@@ -13,7 +13,7 @@ from probe_kit._system.bounded_json import read_json_object
 from probe_kit._system.optional_dependencies import require
 from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
-from probe_kit.extract.recordings.hashed_files import HashedFiles
+from probe_kit.extract.sources.hashed_files import HashedFiles
 
 CONVERTER = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
 EXTRA = "datasets"

@@ -4,6 +4,33 @@ import traceback
 from dataclasses import dataclass
 from typing import Any
 
+from probe_kit.errors import (
+    ActionError,
+    EmptyRoleError,
+    InstructionError,
+    NonFiniteActivationError,
+    ObservationError,
+    OwnEnvironmentError,
+    PolicyFailedError,
+    RecordingError,
+    SceneError,
+    StageDiedError,
+)
+
+# What one episode can get wrong by itself; everything else is wrong with the whole run and stops it.
+EPISODE_ERRORS = (
+    ActionError,
+    EmptyRoleError,
+    InstructionError,
+    NonFiniteActivationError,
+    ObservationError,
+    OwnEnvironmentError,
+    PolicyFailedError,
+    RecordingError,
+    SceneError,
+    StageDiedError,
+)
+
 
 @dataclass(frozen=True)
 class Done:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import RecordingError, UsageError
-from probe_kit.extract.recordings.hashed_files import HashedFiles
-from probe_kit.extract.recordings.lerobot_meta import IMAGE, KEYS, NUMERIC, EpisodeMeta, LeRobotMeta
+from probe_kit.extract.sources.hashed_files import HashedFiles
+from probe_kit.extract.sources.lerobot_meta import IMAGE, KEYS, NUMERIC, EpisodeMeta, LeRobotMeta
 from probe_kit.extract.sources.recording import LeRobotSource
 from probe_kit.hooks.checkpoints.hub import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from probe_kit.errors import MissingExtraError, ProbeKitError, UsageError
-from probe_kit.extract.own_environments.contract import EnvEpisode, OwnEnvironment, Step
-from probe_kit.extract.own_environments.opening import (
+from probe_kit.extract.sources.environment import EnvSource
+from probe_kit.extract.sources.environment_contract import EnvEpisode, OwnEnvironment, Step
+from probe_kit.extract.sources.opening import (
     checked_step,
     fact_values,
     listed_episodes,
@@ -15,7 +16,6 @@ from probe_kit.extract.own_environments.opening import (
     open_environment,
     started,
 )
-from probe_kit.extract.sources.environment import EnvSource
 
 STEPS = 5
 """Actions per episode that the check executes."""

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from probe_kit._system.optional_dependencies import require
 from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
-from probe_kit.extract.recordings.lerobot_folder import LeRobotFolder
-from probe_kit.extract.recordings.lerobot_meta import EXTRA, HALF, EpisodeMeta
+from probe_kit.extract.sources.lerobot_folder import LeRobotFolder
+from probe_kit.extract.sources.lerobot_meta import EXTRA, HALF, EpisodeMeta
 from probe_kit.suite.pictures import LARGEST_PICTURE, decode_bytes
 
 OFF_GRID_S = 1e-4

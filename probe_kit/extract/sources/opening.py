@@ -14,8 +14,8 @@ import numpy as np
 
 from probe_kit._terminal.plain_text import UNSAFE
 from probe_kit.errors import ObservationError, OwnEnvironmentError, ProbeKitError, UsageError
-from probe_kit.extract.own_environments.contract import SUCCESS, EnvEpisode, OwnEnvironment, Step
 from probe_kit.extract.sources.environment import LEROBOT, EnvSource
+from probe_kit.extract.sources.environment_contract import SUCCESS, EnvEpisode, OwnEnvironment, Step
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 
 ENTRY_POINTS = "probe_kit.sources"
@@ -46,7 +46,7 @@ def factory_of(name: str) -> Callable[..., Any]:
     if module == LEROBOT and colon:
         from functools import partial
 
-        from probe_kit.extract.own_environments.lerobot_env import LeRobotEnvironment
+        from probe_kit.extract.sources.lerobot_env import LeRobotEnvironment
 
         return partial(LeRobotEnvironment, attribute)
     if not colon:

@@ -1,1 +1,0 @@
-"""Playing of environments of the user's own: their stage, and the controller that acts in them."""

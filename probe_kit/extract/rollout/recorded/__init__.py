@@ -1,1 +1,0 @@
-"""Showing recorded frames to a policy: the stage that reads them, and the controller that only predicts."""

@@ -1,0 +1,316 @@
+"""Opened environments of the user's own: chosen episodes, and the player that plays them."""
+
+from collections.abc import Sequence
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._terminal.plain_text import terminal_safe
+from probe_kit.errors import CheckpointError, ObservationError, OwnEnvironmentError, UsageError
+from probe_kit.extract.plan import Row
+from probe_kit.extract.sources.environment import EnvSource
+from probe_kit.extract.sources.environment_contract import SUCCESS, EnvEpisode, Step
+from probe_kit.extract.sources.opening import (
+    checked_step,
+    fact_values,
+    listed_episodes,
+    naming_environment,
+    open_environment,
+    started,
+)
+from probe_kit.extract.sources.player import SIDE, Answer, Ending, InputsPlayer, Opens
+from probe_kit.extract.sources.source import Played, Source
+from probe_kit.extract.sources.units import (
+    FIRST_EPISODES,
+    check_predictions,
+    check_units,
+    exchanged_names,
+    unusual_shares,
+)
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.checkpoints.containment import copied
+from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.layout import AT_END, ENVIRONMENT, ONCE, TRUTHS
+from probe_kit.runs.small_frames import SmallFrames, shrink
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+CATEGORY = "all"
+"""Of every row: environments have no categories."""
+SUCCEEDED, FAILED, ENDED = "success", "failure", "ended"
+"""Outcomes: whether the fact `success` is true at the last step; the last one where there is no such fact."""
+
+
+class EnvironmentSource(Source[EnvSource]):
+    """Names and chosen episodes of an environment, read once.
+
+    Once checked against a policy: seen, the first observation; cameras, by the model's names; columns, the facts;
+    truths, those that are truth values; chunk, the actions that the policy predicts at a time.
+    """
+
+    def __init__(
+        self, settings: EnvSource, revision: str, actions: Sequence[str], episodes: Sequence[Any]
+    ) -> None:
+        """episodes: pairs of the index in the environment and the episode."""
+        self.settings, self.revision, self.actions = settings, revision, tuple(actions)
+        self.episodes: list[tuple[int, EnvEpisode]] = list(episodes)
+        self.seen: Observation | None = None
+        self.cameras: list[str] = []
+        self.truths: list[str] = []
+        self.chunk = 0
+
+    @classmethod
+    def open(cls, settings: EnvSource, selects_only: bool) -> Self:
+        """Open the environment once, and list its episodes. Raises as `open_environment` and `listed_episodes`."""
+        del selects_only
+        environment = open_environment(settings)
+        try:
+            listed = listed_episodes(environment, settings)
+            return cls(settings, environment.revision, [str(name) for name in environment.action_names], listed)
+        finally:
+            environment.close()
+
+    @property
+    def name(self) -> str:
+        """The name that the command has."""
+        return self.settings.name
+
+    @cached_property
+    def instructions(self) -> tuple[str, ...]:
+        """Every instruction once, in the order of their letters."""
+        return tuple(sorted({episode.instruction for _, episode in self.episodes}))
+
+    def rows(self, seed: int) -> tuple[Row, ...]:
+        """A row per episode."""
+        return tuple(
+            Row(
+                index,
+                {
+                    "episode_id": episode.id,
+                    "item_id": episode.id,
+                    "category": CATEGORY,
+                    "group_id": episode.group or episode.id,
+                    "instruction": episode.instruction,
+                    "env_episode": number,
+                    "env_seed": episode.seed,
+                    "policy_seed": derive_seed(seed, "policy", episode.id),
+                },
+                episode,
+            )
+            for index, (number, episode) in enumerate(self.episodes)
+        )
+
+    # -- a model -------------------------------------------------------------------------------------
+
+    def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
+        """Set up the first chosen episodes, let the policy predict once, and execute one action of the first.
+
+        Raises OwnEnvironmentError for cameras, states or actions that do not fit, UnitsError for states far
+        outside the checkpoint's statistics, and CheckpointError for a policy whose predictions are no actions.
+        """
+        if policy.predicts_relative:
+            raise CheckpointError(
+                f"{policy.card.checkpoint} predicts changes relative to the state (use_relative_actions), and "
+                "nothing adds the state. Take a checkpoint that predicts actions"
+            )
+        if policy.card.ensemble is not None:
+            raise UsageError(
+                f"{policy.card.family} averages overlapping chunks of the arm's actions; an environment has its "
+                "own units. Leave that option out"
+            )
+        environment, name = open_environment(self.settings), self.name
+        try:
+            first = started(environment, self.episodes[0][1], name)
+            policy = self._with_cameras(policy, first.observation)
+            self._check_state(policy, first.observation)
+            chunk = self._predicted(policy, first.observation)
+            with naming_environment(name, "step()"):
+                second = environment.step(np.array(chunk[0]))
+            facts = checked_step(second, self.episodes[0][1], f"{name}, step() 1").facts
+            self.columns = tuple(sorted(facts))
+            self.truths = [fact for fact in self.columns if isinstance(facts[fact], bool | np.bool_)]
+            later = [episode for _, episode in self.episodes[1:FIRST_EPISODES]]
+            later = later if policy.state_numbers is not None else []
+            begins = [first, *(started(environment, episode, name) for episode in later)]
+            for begin in begins:
+                self._check_state(policy, begin.observation)
+            unusual = unusual_shares(policy, np.stack([begin.observation.state for begin in begins]))
+        finally:
+            environment.close()
+        self.seen, self.chunk = first.observation, len(chunk)
+        check_units(unusual, self._state_names, f"{name}, the state after reset()", policy, accept_units)
+        return self, policy
+
+    def _with_cameras(self, policy: "Policy", seen: Observation) -> "Policy":
+        self.cameras = [*policy.card.cameras[:1], *seen.cameras]
+        try:
+            return policy.with_cameras(self.cameras)
+        except ObservationError as error:
+            raise OwnEnvironmentError(
+                f"{self.name}: {error}. `Observation.image` is the model's first camera; name the others in "
+                "`Observation.cameras` as the model does"
+            ) from error
+
+    def _check_state(self, policy: "Policy", seen: Observation) -> None:
+        expected = policy.state_numbers
+        if expected is not None and seen.state.shape != (expected,):
+            raise OwnEnvironmentError(
+                f"{self.name} has a state of {seen.state.size} numbers; {policy.card.checkpoint} reads {expected}"
+                ". Take a checkpoint of this environment"
+            )
+
+    def _predicted(self, policy: "Policy", seen: Observation) -> NDArray[np.float32]:
+        """(chunk, D) of one prediction. Raises OwnEnvironmentError for actions of another width or order."""
+        with while_acting(policy.card.family, policy.card.checkpoint):
+            chunks = policy.predict(copied([seen]), [0])
+            check_predictions(chunks, 1)
+        if chunks.shape[2] != len(self.actions):
+            raise OwnEnvironmentError(
+                f"{self.name} takes {len(self.actions)} numbers as an action ({', '.join(self.actions)}); "
+                f"{policy.card.checkpoint} predicts {chunks.shape[2]}. Take a checkpoint of this environment"
+            )
+        if (reason := exchanged_names(policy, self.actions)) is not None:
+            raise OwnEnvironmentError(
+                f"{self.name}: {reason}. Let step() take actions in the checkpoint's order, and name them so"
+            )
+        predicted: NDArray[np.float32] = chunks[0]
+        return predicted
+
+    def example(self, instruction: str) -> Observation:
+        """The first observation with a blank picture."""
+        from dataclasses import replace
+
+        assert self.seen is not None
+        return replace(self.seen, image=np.zeros_like(self.seen.image), instruction=instruction)
+
+    def play(self, played: Played) -> Opens:
+        """Open a player, with an environment of its own."""
+        return partial(EnvironmentPlayer, self.settings, self.columns, played)
+
+    # -- what a run says of it -----------------------------------------------------------------------
+
+    @property
+    def _state_names(self) -> list[str]:
+        return [] if self.seen is None else [str(place) for place in range(self.seen.state.size)]
+
+    def identity(self, execute: int) -> dict[str, Any]:
+        """The environment by its revision, and what it shows; empty before a model is loaded."""
+        if self.seen is None:
+            return {ENVIRONMENT: {}}
+        settings, seen = self.settings, self.seen
+        shapes: dict[str, list[int]] = {
+            "action": [execute, len(self.actions)],
+            **({"columns": [len(self.columns)]} if self.columns else {}),
+            "state": [int(seen.state.size)],
+            **({"pixels": [1 + len(seen.cameras), SIDE, SIDE, 3]} if settings.pixels else {}),
+        }
+        environment = {
+            "kind": "env",
+            "environment": settings.environment,
+            "options": dict(settings.options),
+            "revision": self.revision,
+            "max_steps": settings.max_steps,
+            "cameras": self.cameras,
+            "inputs": shapes,
+            "columns": list(self.columns),
+            "names": {
+                "action": list(self.actions),
+                "state": self._state_names,
+                **({TRUTHS: self.truths} if self.truths else {}),
+            },
+        }
+        return {ENVIRONMENT: environment}
+
+    def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
+        """Which episodes were chosen."""
+        return {"played": {"name": self.name, "episodes": [row.columns["env_episode"] for row in rows]}}
+
+    def targets(self) -> tuple[str, ...]:
+        """The facts of the environment."""
+        return tuple(f"env.{name}" for name in self.columns)
+
+    def describe(self, rows: Sequence[Row]) -> dict[str, str]:
+        """Environment, cameras, actions, facts and episodes."""
+        groups = f"{len(rows)} in {len({row.columns['group_id'] for row in rows})} groups"
+        if self.seen is None:
+            return {"environment": terminal_safe(self.name), "episodes": groups}
+        return {
+            "environment": terminal_safe(f"{self.name} ({self.revision})"),
+            "cameras": terminal_safe(", ".join(self.cameras)),
+            "actions": terminal_safe(", ".join(self.actions)),
+            "facts": terminal_safe(", ".join(self.columns)) or "none",
+            "episodes": f"{groups}, at most {self.settings.max_steps} actions each",
+        }
+
+
+class EnvironmentPlayer(InputsPlayer):
+    """Plays the episodes of one environment, and keeps what labels and controls are made of.
+
+    facts: names, in stored order.
+    """
+
+    def __init__(self, settings: EnvSource, facts: Sequence[str], played: Played) -> None:
+        self._settings, self._facts, self._played = settings, tuple(facts), played
+        self._environment = open_environment(settings)
+
+    def begin(self, row: Row, film: bool) -> Answer:
+        """Set an episode up."""
+        del film
+        self.row, self._steps, self._succeeded = row, 0, False
+        self._clear()
+        step = started(self._environment, row.content, self._settings.name)
+        self._first = step.observation.image
+        return self._see(step)
+
+    def advance(self, actions: NDArray[np.float32]) -> Answer:
+        """Execute actions (n, D) until they or the episode end."""
+        self._keep("action", actions, self._played.calls)
+        name = self._settings.name
+        for action in actions:
+            with naming_environment(name, "step()"):
+                answer = self._environment.step(action.copy())
+            self._steps += 1
+            step = checked_step(answer, self.row.content, f"{name}, step() {self._steps}")
+            self._succeeded |= _succeeds(step)
+            if step.done or self._steps >= self._settings.max_steps:
+                return self._end(step)
+        return self._see(step)
+
+    def close(self) -> None:
+        """Free the environment."""
+        with naming_environment(self._settings.name, "close()"):
+            self._environment.close()
+
+    def _see(self, step: Step) -> Observation:
+        seen, most = step.observation, self._played.calls
+        self._keep_pictures([seen.image, *seen.cameras.values()], self._settings.pixels, most)
+        self._keep("state", seen.state, most)
+        where = f"{self._settings.name}, step() {self._steps}"
+        unknown = self._steps == 0 and not step.facts  # nothing is said of the beginning
+        facts = [np.nan] * len(self._facts) if unknown else fact_values(step.facts, self._facts, where)
+        if self._facts:
+            self._keep("columns", np.array(facts, np.float64), most)
+        return seen
+
+    def _end(self, step: Step) -> Ending:
+        fact_values(step.facts, self._facts, f"{self._settings.name}, step() {self._steps}")
+        at_end, has_success = _succeeds(step), SUCCESS in self._facts
+        outcome = {
+            "outcome": (SUCCEEDED if at_end else FAILED) if has_success else ENDED,
+            **({ONCE: self._succeeded, AT_END: at_end} if has_success else {}),
+            "steps": self._steps,
+            "done": bool(step.done),
+        }
+        return self._ending(outcome, self._small_frames(step.observation.image))
+
+    def _small_frames(self, last: NDArray[np.uint8]) -> SmallFrames:
+        """The first and the last frame, in small."""
+        return () if self._played.frames == "none" else (shrink(self._first), shrink(last))
+
+
+def _succeeds(step: Step) -> bool:
+    return bool(step.facts.get(SUCCESS, False))

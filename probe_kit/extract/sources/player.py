@@ -1,0 +1,221 @@
+"""`Player`: what shows the observations of a source, in this process or in one of its own."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from hashlib import blake2b
+from multiprocessing.connection import Connection
+from time import perf_counter
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from probe_kit._execution.child_process import Child
+from probe_kit.errors import ProbeKitError, StageDiedError
+from probe_kit.extract.events import add_traceback
+from probe_kit.extract.plan import Row
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.small_frames import SmallFrames
+
+SIDE = 32
+"""Pixels along the stored pictures."""
+
+
+@dataclass(frozen=True)
+class Ending:
+    """The end of an episode: its record as flat columns, a frame per action if it was filmed, its small frames.
+
+    trajectory: (T + 1, C) float32; see `probe_kit.env.scoring.trajectory`. seconds: that the player worked on the
+    episode, by the wall clock. inputs: (n, …) by kind what was shown in n inferences, of sources without a scene.
+    """
+
+    outcome: dict[str, Any]
+    frames: list[NDArray[np.uint8]]
+    small_frames: SmallFrames = ()
+    trajectory: NDArray[np.float32] | None = None
+    seconds: float = 0.0
+    inputs: Mapping[str, NDArray[Any]] | None = None
+
+
+Answer = Observation | Ending
+
+
+class Player(ABC):
+    """One source of observations with its current episode, and the seconds it worked on that."""
+
+    row: Row
+    _seconds = 0.0
+
+    @abstractmethod
+    def begin(self, row: Row, film: bool) -> Answer:
+        """Set an episode up and show its beginning. film: whether every frame is kept."""
+
+    @abstractmethod
+    def advance(self, actions: NDArray[np.float32]) -> Answer:
+        """Execute actions (n, D) until they or the episode end."""
+
+    def dismiss(self) -> Ending:
+        """End the episode without an action."""
+        raise NotImplementedError
+
+    def close(self) -> None:  # noqa: B027 - most players hold nothing
+        """Free what it holds."""
+
+    def answer(self, method: str, arguments: tuple[Any, ...]) -> Answer:
+        """Call `begin`, `advance` or `dismiss`; an ending says how many seconds all calls of its episode took.
+
+        Errors carry a note naming the episode.
+        """
+        if method == "begin":
+            self._seconds, self.row = 0.0, arguments[0]
+        started = perf_counter()
+        try:
+            answer: Answer = getattr(self, method)(*arguments)
+        except ProbeKitError as error:
+            error.add_note(f"in episode {self.row.episode_id} ({self.row.instruction!r})")
+            raise error from None
+        self._seconds += perf_counter() - started
+        return answer if isinstance(answer, Observation) else replace(answer, seconds=self._seconds)
+
+
+class InputsPlayer(Player):
+    """A player that keeps what labels and controls are made of: arrays of every inference, a hash of pictures."""
+
+    def _clear(self) -> None:
+        self._inputs: dict[str, list[NDArray[Any]]] = {}
+        self._hash = blake2b(digest_size=16)
+
+    def _keep(self, name: str, values: Any, most: int | None = None) -> None:
+        """Keep the values of one inference, unless `most` were kept already."""
+        kept = self._inputs.setdefault(name, [])
+        if most is None or len(kept) < most:
+            kept.append(np.array(values))
+
+    def _keep_pictures(self, pictures: list[NDArray[np.uint8]], stored: bool, most: int | None = None) -> None:
+        """Hash the pictures of one inference, and keep them in small if they are stored."""
+        for picture in pictures:
+            self._hash.update(f"{picture.shape}".encode() + np.ascontiguousarray(picture).tobytes())
+        if stored:
+            self._keep("pixels", np.stack([small_picture(picture) for picture in pictures]), most)
+
+    def _ending(self, outcome: Mapping[str, Any], small_frames: SmallFrames = ()) -> Ending:
+        inputs = {name: np.stack(values) for name, values in self._inputs.items()}
+        return Ending({**outcome, "frames_blake2b": self._hash.hexdigest()}, [], small_frames, inputs=inputs)
+
+
+def small_picture(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(SIDE, SIDE, 3): each pixel the mean of its part of the picture."""
+    return np.asarray(Image.fromarray(picture).resize((SIDE, SIDE), Image.Resampling.BOX))
+
+
+# -- where a player works -------------------------------------------------------------------------------------
+
+Request = tuple[str, tuple[Any, ...]]
+"""A method of `Player` and its arguments."""
+Opens = Callable[[], Player]
+"""What opens a player; a child process imports it by its name."""
+
+
+class AskablePlayer(Protocol):
+    """A player somewhere: asked first, answered later, so that several can work at a time."""
+
+    def ask(self, method: str, *arguments: Any, then: Request | None = None) -> None:
+        """Start `begin`, `advance` or `dismiss`.
+
+        then: what to start at once where that ends the episode, and only there; its answer is the next one.
+        """
+
+    def answer(self) -> Answer:
+        """Return what the last request gave; raise what it raised."""
+
+    def close(self) -> None:
+        """Free what it holds."""
+
+
+class LocalPlayer:
+    """A player in this process: the work is done when the answer is wanted."""
+
+    def __init__(self, opens: Opens) -> None:
+        self._player = opens()
+
+    def ask(self, method: str, *arguments: Any, then: Request | None = None) -> None:
+        """Remember the request."""
+        self._request, self._then = (method, arguments), then
+
+    def answer(self) -> Answer:
+        """Do the work."""
+        answer = self._player.answer(*self._request)
+        if self._then is not None and isinstance(answer, Ending):
+            self._request, self._then = self._then, None
+        return answer
+
+    def close(self) -> None:
+        """Free what the player holds."""
+        self._player.close()
+
+
+class ProcessPlayer:
+    """A player in a child process; a child that dies costs its episode and is replaced."""
+
+    def __init__(self, opens: Opens) -> None:
+        self._opens = opens
+        self._start()
+
+    def _start(self) -> None:
+        self._child = Child("probe_kit.extract.sources.player:serve")
+        self._child.connection.send(self._opens)
+
+    def ask(self, method: str, *arguments: Any, then: Request | None = None) -> None:
+        """Send the request; the child works while this process continues."""
+        try:
+            self._child.connection.send(((method, arguments), then))
+        except (BrokenPipeError, ConnectionResetError):
+            return  # `answer` finds out and says so
+
+    def answer(self) -> Answer:
+        """Wait for the answer."""
+        try:
+            answer = self._child.connection.recv()
+        except (EOFError, ConnectionResetError):
+            code = self._child.close()
+            self._start()
+            raise StageDiedError(
+                f"the process that simulates the episode ended with code {code}; look above for its last words"
+            ) from None
+        if isinstance(answer, ProbeKitError):
+            raise answer
+        result: Answer = answer
+        return result
+
+    def close(self) -> None:
+        """End the child."""
+        self._child.close()
+
+
+def serve(connection: Connection) -> None:
+    """Answer requests until the parent hangs up: the child's side."""
+    try:
+        player = connection.recv()()
+    except ProbeKitError as error:
+        connection.recv()
+        connection.send(error)
+        return
+    try:
+        while True:
+            request, then = connection.recv()
+            answer = _answered(player, request)
+            connection.send(answer)
+            if then is not None and isinstance(answer, Ending):
+                connection.send(_answered(player, then))
+    finally:
+        player.close()
+
+
+def _answered(player: Player, request: Request) -> Answer | ProbeKitError:
+    try:
+        return player.answer(*request)
+    except ProbeKitError as error:  # what it costs, an episode or the run, is decided by the parent
+        add_traceback(error)
+        return error

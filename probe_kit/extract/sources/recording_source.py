@@ -1,0 +1,529 @@
+"""Opened recordings: chosen frames of a LeRobotDataset that lies here, and the player that shows them."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from importlib.metadata import version
+from itertools import groupby
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._terminal.plain_text import terminal_safe
+from probe_kit.errors import InstructionError, ObservationError, RecordingError
+from probe_kit.extract.plan import Row
+from probe_kit.extract.sources.lerobot_folder import MOST_FRAMES, LeRobotFolder, fetched, open_lerobot
+from probe_kit.extract.sources.lerobot_frames import LeRobotFrames
+from probe_kit.extract.sources.lerobot_meta import IMAGE
+from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
+from probe_kit.extract.sources.recording import ACTION, IMAGES, STATE, LeRobotSource, Pairs
+from probe_kit.extract.sources.source import Played, Source
+from probe_kit.extract.sources.units import (
+    MOST_UNUSUAL,
+    check_predictions,
+    check_units,
+    other_order,
+    unusual_shares,
+)
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.checkpoints.containment import copied
+from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
+from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+CATEGORY = "all"
+"""Of every row: recordings have no categories."""
+NO_STATE = np.zeros(ARM_NUMBERS, np.float32)
+"""The state for a policy that reads none, of a data set without one."""
+NAMED = 0.01
+"""Share of unusual values of a number of the state, from which on it is named."""
+_LONGEST = 12
+"""Tasks and numbers that are listed."""
+_TASK = "task_index"
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Chosen frames of one recorded episode under one instruction, at most 64. content: hash of its files."""
+
+    episode: int
+    content: str
+
+
+class RecordingSource(Source[LeRobotSource]):
+    """A data set that lies here, and what was chosen of it.
+
+    prediction: (chunk, D) of the policy that was checked. unusual: (D,) share of the chosen frames whose number of
+    the state is unusual; empty where the policy normalises none. other_actions: why recorded actions are not what
+    the policy predicts; None if they are.
+    """
+
+    executes = False
+    groups = "recorded episodes"
+
+    def __init__(self, settings: LeRobotSource, folder: LeRobotFolder) -> None:
+        """Raises RecordingError for an episode that is not there."""
+        self.settings, self.folder = settings, folder
+        self.episodes = tuple(folder.chosen(settings.episodes))
+        self.reader = LeRobotFrames(folder)
+        self.prediction: tuple[int, int] = (0, 0)
+        self.other_actions: str | None = None
+        self.unusual: NDArray[np.float64] = np.zeros(0)
+
+    @classmethod
+    def open(cls, settings: LeRobotSource, selects_only: bool) -> Self:
+        """The data set, with the numbers of the chosen episodes here. Raises as `open_lerobot`."""
+        del selects_only
+        opened = cls(settings, open_lerobot(settings))
+        fetched(opened.folder, opened.episodes, ())
+        opened.folder.check_files(opened.episodes, ())
+        return opened
+
+    @classmethod
+    def decided(cls, settings: LeRobotSource) -> Mapping[str, Any]:
+        """Return that every frame of a row is captured and nothing acts; a revision of the hub is its commit."""
+        folder = open_lerobot(settings)
+        source = settings if folder.repo is None else settings.changed(folder=f"{folder.repo}@{folder.revision}")
+        calls = cls(source, folder).most_frames
+        return {"source": source, "captured_calls": calls, "capture_only": True, "frames": "none"}
+
+    @property
+    def name(self) -> str:
+        """The name of the folder, or of the data set on the hub."""
+        return self.settings.name
+
+    @property
+    def features(self) -> list[str]:
+        """Pictures of the data set, in the order of the model's cameras."""
+        return [feature for _, feature in self.settings.cameras]
+
+    @property
+    def most_frames(self) -> int:
+        """Chosen frames of the longest row that any episode of the data set can have."""
+        return min(MOST_FRAMES, -(-max(self.folder.lengths, default=1) // self.settings.every))
+
+    @cached_property
+    def instructions(self) -> tuple[str, ...]:
+        """Every instruction once, in the order of their letters."""
+        return tuple(sorted({text for episode in self.episodes for text in self._texts(episode)}))
+
+    def rows(self, seed: int) -> tuple[Row, ...]:
+        """Stretches of the chosen episodes, in order."""
+        return tuple(row for row in self._rows(seed))
+
+    def _rows(self, seed: int) -> Iterator[Row]:
+        every, index = self.settings.every, 0
+        for episode in self.episodes:
+            texts, content = self._texts(episode), self.folder.content_blake2b(episode, self.features)
+            item, part = f"episode-{episode:06d}", 0
+            chosen = range(0, len(texts), every)
+            for text, group in groupby(chosen, key=lambda frame, texts=texts: texts[frame]):  # type: ignore[misc]
+                frames = list(group)
+                for start in range(0, len(frames), MOST_FRAMES):
+                    stretch = frames[start : start + MOST_FRAMES]
+                    columns = {
+                        "episode_id": item + (f".{part}" if part else ""),
+                        "item_id": item,
+                        "category": CATEGORY,
+                        "group_id": item,
+                        "instruction": text,
+                        "source_episode": episode,
+                        "first_frame": stretch[0],
+                        "frame_step": every,
+                        "frames": len(stretch),
+                        "recorded_frames": len(texts),
+                        "policy_seed": derive_seed(seed, "policy", item),
+                        "content_blake2b": content,
+                    }
+                    yield Row(index, columns, Stretch(episode, content), tuple(stretch))
+                    index, part = index + 1, part + 1
+
+    def _texts(self, episode: int) -> list[str]:
+        """The instruction at every frame of an episode."""
+        if self.settings.instruction is not None:
+            return [self.settings.instruction] * self.folder.lengths[episode]
+        numbers = self.reader.numbers(episode, [_TASK])[_TASK][:, 0].astype(int)
+        return [self.folder.task(number) for number in numbers]
+
+    # -- a model -------------------------------------------------------------------------------------
+
+    def early_checks(
+        self, cameras: Sequence[str], state: int | None, checkpoint: str
+    ) -> list[Callable[[], object]]:
+        """Cameras and the width of the state."""
+        return [lambda: self.mapped(cameras), lambda: self.check_state_width(checkpoint, state)]
+
+    def mapped(self, cameras: Sequence[str]) -> Self:
+        """The same with a feature for the model's cameras. Raises RecordingError where none follows."""
+        pairs = mapped_cameras(self.settings.cameras, cameras, self.folder.cameras)
+        names = [camera for camera, _ in pairs]
+        if strange := [camera for camera, _ in self.settings.rotations if camera not in names]:
+            raise RecordingError(
+                f"--rotate {strange[0]}=…: that camera gets no picture; those with one are {', '.join(names)}"
+            )
+        return type(self)(self.settings.changed(cameras=pairs), self.folder)
+
+    def check_state_width(self, checkpoint: str, expected: int | None) -> None:
+        """Raise RecordingError unless the recorded state has as many numbers as the model reads."""
+        width = self.folder.width(STATE)
+        if expected is None or width == expected:
+            return
+        seen = "no " + STATE if width is None else f"{width} numbers as {STATE}"
+        raise RecordingError(
+            f"{self.folder.path.name} has {seen}; {checkpoint} reads {expected}. Take the data set's own "
+            "checkpoint, or a data set of this robot"
+        )
+
+    def check_frames(self) -> None:
+        """Raise RecordingError for files, numbers or pictures of the chosen episodes that cannot be shown.
+
+        Pictures are those of the mapped cameras, or of all where none is mapped. Of a hub data set they are not
+        here before that.
+        """
+        features = self.features or ([] if self.folder.repo is not None else self.folder.cameras)
+        if strange := [feature for feature in features if feature not in self.folder.cameras]:
+            raise RecordingError(
+                f"{self.folder.path.name} has no picture {strange[0]!r}; it has "
+                f"{', '.join(self.folder.cameras) or 'none'}. Correct --camera"
+            )
+        self.folder.check_files(self.episodes, features)
+        self.reader.check(self.episodes, features)
+
+    def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
+        """Map the cameras, read all numbers of the chosen episodes, and let the policy predict once about nothing.
+
+        Raises RecordingError for cameras, states or files that do not fit, UnitsError for states far outside the
+        checkpoint's statistics, and CheckpointError for a checkpoint without statistics.
+        """
+        fitted, policy = self.fitted(policy)
+        fitted.check_recorded_units(policy, accept_units)
+        return fitted, policy
+
+    def fitted(self, policy: "Policy") -> "tuple[Self, Policy]":
+        """As `check`, whatever the units."""
+        card = policy.card
+        raise_together(self.early_checks(card.cameras, policy.state_numbers, card.checkpoint))
+        fitted = self.mapped(card.cameras)
+        fetched(fitted.folder, fitted.episodes, fitted.features)
+        fitted.check_frames()
+        try:
+            policy = policy.with_cameras([camera for camera, _ in fitted.settings.cameras])
+        except ObservationError as error:
+            raise RecordingError(f"{error}. Map the model's first cameras with --camera") from error
+        numbers = fitted._chosen_numbers()
+        fitted.unusual = fitted._unusual(policy, numbers.get(STATE))
+        with while_acting(card.family, card.checkpoint):
+            chunk = policy.predict(copied([fitted.example(fitted.instructions[0])]), [0])
+            check_predictions(chunk, 1)
+        fitted.prediction = chunk.shape[1], chunk.shape[2]
+        fitted.other_actions = fitted._other_actions(policy, chunk.shape[2], numbers.get(ACTION))
+        return fitted, policy
+
+    def check_recorded_units(self, policy: "Policy", accepted: bool) -> None:
+        """Raise UnitsError for recorded states outside the checkpoint's statistics, unless that is accepted."""
+        names = self.folder.names(STATE) if self.unusual.size else []
+        check_units(self.unusual, names, f"{self.folder.path.name}, {STATE}", policy, accepted)
+
+    def _chosen_numbers(self) -> dict[str, NDArray[np.float32]]:
+        """(n, D) state and action of every chosen frame, as far as they are recorded."""
+        names = [name for name in (STATE, ACTION) if self.folder.width(name) is not None]
+        episodes, every = [self.reader.numbers(episode, names) for episode in self.episodes], self.settings.every
+        return {
+            name: np.concatenate([numbers[name][::every] for numbers in episodes]).astype(np.float32)
+            for name in names
+        }
+
+    def _unusual(self, policy: "Policy", states: NDArray[np.float32] | None) -> NDArray[np.float64]:
+        if states is None:
+            return np.zeros(0)
+        if not np.isfinite(states).all():
+            name = self.folder.path.name
+            raise RecordingError(f"{name}: {STATE} holds NaN or infinity; leave such episodes out")
+        return unusual_shares(policy, states)
+
+    def _other_actions(self, policy: "Policy", predicted: int, actions: NDArray[np.float32] | None) -> str | None:
+        """Why the recorded actions are not what a policy predicts; None if they are, as far as anything says."""
+        if actions is None:
+            return "the data set has no actions"
+        if actions.shape[1] != predicted:
+            return f"the policy predicts {predicted} numbers, the data set has {actions.shape[1]}"
+        if policy.predicts_relative:
+            return "the policy predicts changes relative to the state (use_relative_actions)"
+        if (reason := other_order(policy, self.folder.meta.names(ACTION) or ())) is not None:
+            return reason
+        shares = policy.unusual_actions(actions).mean(axis=0)
+        if not (shares > MOST_UNUSUAL).any():
+            return None
+        names = self.folder.names(ACTION)
+        far = ", ".join(f"{names[place]} {shares[place]:.0%}" for place in np.flatnonzero(shares > MOST_UNUSUAL))
+        return f"recorded actions lie outside the statistics of the checkpoint ({far}), so the units differ"
+
+    def example(self, instruction: str) -> Observation:
+        """Blank pictures and a state of zeros."""
+        turned, pictures = dict(self.settings.rotations), {}
+        for camera, feature in self.settings.cameras:
+            height, width = self.folder.picture_shape(feature)
+            shape = (width, height) if turned.get(camera) in (90, 270) else (height, width)
+            pictures[camera] = np.zeros((*shape, 3), np.uint8)
+        numbers = self.folder.width(STATE)
+        state = NO_STATE if numbers is None else np.zeros(numbers, np.float32)
+        return observation_of(pictures, state, instruction)
+
+    def play(self, played: Played) -> Opens:
+        """Open a player, which opens the data set again."""
+        del played
+        return partial(RecordingPlayer, self.settings)
+
+    # -- what a run says of it -----------------------------------------------------------------------
+
+    def identity(self, execute: int) -> dict[str, Any]:
+        """The data set by its content, and how it is shown."""
+        del execute
+        settings, folder = self.settings, self.folder
+        state, action = folder.width(STATE), folder.width(ACTION)
+        shapes: dict[str, list[int]] = {"columns": [len(folder.columns)], "prediction": list(self.prediction)}
+        shapes |= {} if state is None else {"state": [state]}
+        shapes |= {} if action is None else {"action": [self.prediction[0], action]}
+        shapes |= {"pixels": [len(settings.cameras), SIDE, SIDE, 3]} if settings.pixels else {}
+        truths = [name for name in folder.columns if folder.features[name]["dtype"] == "bool"]
+        data_set = {
+            "kind": "lerobot",
+            **({} if folder.repo is None else {"repo": folder.repo, "revision": folder.revision}),
+            "meta_blake2b": folder.meta_blake2b,
+            "fps": folder.fps,
+            "frames": f"every:{settings.every}",
+            "cameras": [[camera, feature, folder.encoding(feature)] for camera, feature in settings.cameras],
+            "rotations": [list(turn) for turn in settings.rotations],
+            "instruction": settings.instruction,
+            "inputs": dict(sorted(shapes.items())),
+            "columns": folder.columns,
+            "names": {
+                **{
+                    name: folder.names(feature)
+                    for name, feature, width in (("state", STATE, state), ("action", ACTION, action))
+                    if width is not None
+                },
+                **({TRUTHS: truths} if truths else {}),
+            },
+        }
+        return {DATASET: data_set}
+
+    def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
+        """Which episodes were chosen, and whether their actions are those that the policy predicts."""
+        chosen = sorted({row.columns["source_episode"] for row in rows})
+        recording = {"name": self.name, "episodes": chosen, RECORDED_EPISODES: len(self.folder.lengths)}
+        return {"recording": {**recording, OTHER_ACTIONS: self.other_actions}}
+
+    @property
+    def decoder(self) -> str | None:
+        """PyAV where a camera is a video: pixels of lossy videos are those of their decoder."""
+        encodings = {self.folder.encoding(feature) for feature in self.features}
+        return f"PyAV {version('av')}" if encodings - {IMAGE} else None
+
+    def targets(self) -> tuple[str, ...]:
+        """The recorded numbers."""
+        parts = [("state", STATE), ("action", ACTION)]
+        numbers = [f"dataset.{part}.{name}" for part, feature in parts for name in self._names(feature)]
+        return (*numbers, *(f"dataset.{name}" for name in self.folder.columns))
+
+    def _names(self, feature: str) -> list[str]:
+        return [] if self.folder.width(feature) is None else self.folder.names(feature)
+
+    def describe(self, rows: Sequence[Row]) -> dict[str, str]:
+        """Data set, cameras and frames of a plan."""
+        settings, folder = self.settings, self.folder
+        turned = dict(settings.rotations)
+        cameras = [
+            f"{camera} from {feature} ({folder.encoding(feature)})"
+            + (f", rotated by {turned[camera]}°" if camera in turned else "")
+            for camera, feature in settings.cameras
+        ]
+        where = self.name if folder.repo is None else f"{folder.repo}@{folder.revision}"
+        shown, episodes = (
+            sum(row.columns["frames"] for row in rows),
+            {row.columns["source_episode"] for row in rows},
+        )
+        return {
+            "data set": f"{terminal_safe(where)}, {folder.fps:g} frames per second",
+            "cameras": terminal_safe("; ".join(cameras)) or "mapped when the model is loaded",
+            "frames": f"{shown} of {len(episodes)} episodes (every:{settings.every}), in {len(rows)} rows",
+        }
+
+    def facts(self) -> dict[str, str]:
+        """Format, episodes, frames, tasks and features of the data set, in words, for `dataset show`."""
+        folder, lengths = self.folder, [self.folder.lengths[episode] for episode in self.episodes]
+        every, texts = self.settings.every, self.instructions
+        more = f" and {len(texts) - _LONGEST} more" if len(texts) > _LONGEST else ""
+        return {
+            "data set": self.name + (f"@{folder.revision}" if folder.revision else ""),
+            "frames per second": f"{folder.fps:g}",
+            "episodes": f"{len(lengths)} of {len(folder.lengths)}, {_span(lengths)} frames each",
+            "frames": f"{sum(-(-length // every) for length in lengths)} of {sum(lengths)} (every:{every})",
+            "instructions": "; ".join(texts[:_LONGEST]) + more,
+            "cameras": "; ".join(map(self._camera, folder.cameras)) or "none",
+            STATE: self._numbers(STATE),
+            ACTION: self._numbers(ACTION),
+            "columns": ", ".join(folder.columns) or "none",
+            "data sha": f"meta {folder.meta_blake2b[:12]}",
+        }
+
+    def facts_of(self, policy: "Policy") -> dict[str, str]:
+        """How a policy that fits is shown the data set, in words."""
+        shown = dict(self.settings.cameras)
+        masked = [camera for camera in policy.card.cameras if camera not in shown]
+        chunk, width = self.prediction
+        recorded = self.folder.width(ACTION)
+        return {
+            "model": f"{policy.card.family}  weights {policy.card.weights_sha256[:12]}",
+            "shown": "; ".join(f"{camera} from {feature}" for camera, feature in shown.items())
+            + (f"; without a picture: {', '.join(masked)}" if masked else ""),
+            "predicts": f"{chunk} actions of {width} numbers; the data set has {recorded or 'no actions'}"
+            + (f" of {recorded} numbers" if recorded and recorded != width else ""),
+            "recorded actions": "not compared: " + self.other_actions
+            if self.other_actions
+            else "compared with the recorded ones, see `probe-kit run show RUN --action-errors`",
+            "state": self._shares(),
+        }
+
+    def _shares(self) -> str:
+        if not self.unusual.size:
+            return "not compared: this model normalises no state"
+        names = self.folder.names(STATE)
+        shares = [f"{names[place]} {share:.0%}" for place, share in enumerate(self.unusual) if share >= NAMED]
+        return "outside the checkpoint's statistics: " + (
+            ", ".join(shares[:_LONGEST]) or "less than 1 % of each number"
+        )
+
+    def _camera(self, feature: str) -> str:
+        height, width = self.folder.picture_shape(feature)
+        return f"{feature} {width}×{height} ({self.folder.encoding(feature)})"
+
+    def _numbers(self, feature: str) -> str:
+        width = self.folder.width(feature)
+        return "none" if width is None else f"{width} numbers: {', '.join(self.folder.names(feature)[:_LONGEST])}"
+
+
+class RecordingPlayer(InputsPlayer):
+    """Shows the stretches of one data set, frame by frame, and keeps what controls are made of.
+
+    settings: with every camera of the model mapped.
+    """
+
+    def __init__(self, settings: LeRobotSource) -> None:
+        self._recording = RecordingSource(settings, open_lerobot(settings))
+
+    def begin(self, row: Row, film: bool) -> Answer:
+        """Show the first frame of a stretch."""
+        del film
+        self.row, self._position = row, 0
+        self._clear()
+        self._check_content(row)
+        recording = self._recording
+        names = [name for name in (STATE, ACTION) if recording.folder.width(name) is not None]
+        self._numbers = recording.reader.numbers(row.content.episode, [*names, *recording.folder.columns])
+        return self._see()
+
+    def advance(self, actions: NDArray[np.float32]) -> Answer:
+        """Keep the chunk (chunk, D) that was predicted for the frame, and show the next one."""
+        self._keep("prediction", actions)
+        if ACTION in self._numbers:
+            self._keep("action", _ahead(self._numbers[ACTION], self._frame, len(actions)))
+        self._position += 1
+        assert self.row.frames is not None
+        return self._see() if self._position < len(self.row.frames) else self._ending({"outcome": CAPTURE_ONLY})
+
+    def _check_content(self, row: Row) -> None:
+        """Raise RecordingError unless the files of an episode are those that the plan was made of."""
+        recording = self._recording
+        now = recording.folder.content_blake2b(row.content.episode, recording.features)
+        if now != row.content.content:
+            raise RecordingError(
+                f"{recording.folder.path.name}: the files of {row.columns['item_id']} were changed after the run "
+                f"was planned: their hash was {row.content.content}, now it is {now}. Leave the data set as it is "
+                "until the run ends"
+            )
+
+    @property
+    def _frame(self) -> int:
+        assert self.row.frames is not None
+        return self.row.frames[self._position]
+
+    def _see(self) -> Observation:
+        recording, frame = self._recording, self._frame
+        by_feature = recording.reader.pictures(self.row.content.episode, frame, recording.features)
+        pictures = {camera: by_feature[feature] for camera, feature in recording.settings.cameras}
+        for camera, degrees in recording.settings.rotations:
+            pictures[camera] = np.ascontiguousarray(np.rot90(pictures[camera], degrees // 90))
+        state = NO_STATE
+        if STATE in self._numbers:
+            state = self._numbers[STATE][frame].astype(np.float32)
+            self._keep("state", state)
+        self._keep("columns", [self._numbers[name][frame, 0] for name in recording.folder.columns])
+        self._keep_pictures(list(pictures.values()), recording.settings.pixels)
+        return observation_of(pictures, state, self.row.instruction)
+
+
+def _span(lengths: Sequence[int]) -> str:
+    least, most = min(lengths), max(lengths)
+    return f"{least}" if least == most else f"{least} to {most}"
+
+
+def raise_together(checks: Iterable[Callable[[], object]]) -> None:
+    """Make all checks, and raise the error of one that fails, or one error that names those of all that fail."""
+    errors: list[RecordingError | InstructionError] = []
+    for check in checks:
+        try:
+            check()
+        except (RecordingError, InstructionError) as error:
+            errors.append(error)
+    if len(errors) == 1:
+        raise errors[0]
+    if errors:
+        listed = "\n".join(f"  {number}. {error}" for number, error in enumerate(errors, start=1))
+        raise RecordingError(f"{len(errors)} things about the recordings do not fit the model:\n{listed}")
+
+
+def mapped_cameras(chosen: Pairs, model: Sequence[str], recorded: Sequence[str]) -> Pairs:
+    """Camera of the model and feature of the data set, in the model's order.
+
+    chosen: as the user mapped them; empty for equal names, or the only one of either. Raises RecordingError.
+    """
+    both = f"the model has {', '.join(model) or 'none'}; the data set has {', '.join(recorded) or 'none'}"
+    how = (
+        f"Map them, such as --camera {model[0] if model else 'base'}={recorded[0] if recorded else IMAGES + 'top'}"
+    )
+    for camera, feature in chosen:
+        if camera not in model:
+            raise RecordingError(f"--camera {camera}=…: the model has no such camera ({both}). {how}")
+        if feature not in recorded:
+            raise RecordingError(f"--camera {camera}={feature}: the data set has no such picture ({both}). {how}")
+    pairs = dict(chosen)
+    if not chosen:
+        names = {feature.removeprefix(IMAGES): feature for feature in recorded}
+        pairs = {camera: names[camera] for camera in model if camera in names}
+        if not pairs and len(model) == len(recorded) == 1:
+            pairs = {model[0]: recorded[0]}
+    if not pairs or model[0] not in pairs:
+        raise RecordingError(f"no picture is mapped to the model's first camera: {both}. {how}")
+    return tuple((camera, pairs[camera]) for camera in model if camera in pairs)
+
+
+def observation_of(
+    pictures: Mapping[str, NDArray[np.uint8]], state: NDArray[np.float32], instruction: str
+) -> Observation:
+    """The observation of pictures by camera, the first of which is the main one."""
+    first, *others = pictures
+    return Observation(pictures[first], state, instruction, None, {name: pictures[name] for name in others})
+
+
+def _ahead(actions: NDArray[np.float64], frame: int, count: int) -> NDArray[np.float32]:
+    """(count, D) the recorded actions from a frame on; behind the end of the episode they are not numbers."""
+    ahead = np.full((count, actions.shape[1]), np.nan, np.float32)
+    recorded = actions[frame : frame + count]
+    ahead[: len(recorded)] = recorded
+    return ahead

@@ -1,0 +1,274 @@
+"""The opened scene: every item of a suite in both layouts, played by an arm."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from probe_kit._system.counting import counted
+from probe_kit.env import Act2AnswerEnv
+from probe_kit.errors import SceneError, UsageError
+from probe_kit.extract.plan import Row
+from probe_kit.extract.sources.pairs import Pair
+from probe_kit.extract.sources.player import Opens
+from probe_kit.extract.sources.scene import SceneSettings
+from probe_kit.extract.sources.scene_player import ScenePlayer
+from probe_kit.extract.sources.source import Played, Source
+from probe_kit.extract.sources.units import FIRST_EPISODES, check_units, unusual_shares
+from probe_kit.hashing import derive_seed, sha256_json
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.suite import Episode, Suite, default_suite, load_suite
+from probe_kit.suite.build import ITEMS, default_folder
+from probe_kit.suite.validation.sufficiency import Smallest
+from probe_kit.suite.wording import Wording, in_words
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+EPISODES = 3
+"""If the scene of one episode cannot be built, so many are tried: a single one costs no run."""
+LAYOUT = "layout"
+"""The input of a pair whose donor has the two pictures in each other's place."""
+
+
+class SceneSource(Source[SceneSettings]):
+    """Questions of a suite in a scene. suite: with the chosen categories and items."""
+
+    own_units = False
+    suite: Suite
+
+    def __init__(self, settings: SceneSettings, suite: Suite) -> None:
+        self.settings, self.suite = settings, suite
+
+    @classmethod
+    def open(cls, settings: SceneSettings, selects_only: bool) -> Self:
+        """The suite of some settings, its chosen items. selects_only: its first items alone are needed."""
+        chosen, count = settings.categories, settings.items
+        if settings.suite is not None:
+            return cls(settings, load_suite(settings.suite).select(chosen, count))
+        # Of a category drawn alone every item is the same: drawing all eleven takes minutes.
+        if selects_only and count is not None and not default_folder(chosen).is_dir():
+            return cls(settings, _first_items(chosen, count))
+        return cls(settings, default_suite(chosen).select(None, count))
+
+    @property
+    def name(self) -> str:
+        """Name, version and hash of the suite."""
+        return self.suite.identity
+
+    @cached_property
+    def instructions(self) -> tuple[str, ...]:
+        """Every instruction once, in the order of their letters."""
+        return tuple(sorted({episode.item.instruction for episode in self._episodes()}))
+
+    def rows(self, seed: int) -> tuple[Row, ...]:
+        """Every episode in order, with its seeds, in each wording that its item has.
+
+        Both layouts of an item start from the same scene, and all wordings of an episode from the same seeds.
+        Raises UsageError for a wording that no item has, SuiteError if an item's own words for one are none.
+        """
+        # Of the items themselves: an episode in another wording holds its item with that wording as instruction.
+        content = {item.item_id: item.content_sha256 for item in self.suite.items}
+        rows = tuple(
+            scene_row(
+                index, episode, derive_seed(seed, "scene", episode.item.item_id),
+                derive_seed(seed, "policy", episode.seed_id), content[episode.item.item_id],
+            )
+            for index, episode in enumerate(self._episodes())
+        )  # fmt: skip
+        self._skipped(rows)
+        return rows
+
+    def _episodes(self) -> Iterator[Episode]:
+        wordings = self.settings.wordings
+        for episode in self.suite.episodes():
+            yield from filter(
+                None, [episode] if wordings is None else (in_words(episode, one) for one in wordings)
+            )
+
+    def _skipped(self, rows: Sequence[Row]) -> dict[Wording, int]:
+        """By wording, how many items have none. Raises UsageError for a wording that no item has."""
+        skipped = {}
+        for wording in self.settings.wordings or ():
+            items = {row.columns["item_id"] for row in rows if row.columns.get("wording") == wording}
+            if not items:
+                raise UsageError(
+                    f"no item of {self.suite.identity} has the wording {wording!r}. Leave it out of --wordings, "
+                    "or write it into the suite's metadata (field `wordings`)"
+                )
+            skipped[wording] = len(self.suite.items) - len(items)
+        return skipped
+
+    # -- what a run says of it -----------------------------------------------------------------------
+
+    def known_early(self) -> dict[str, Any]:
+        """The suite and the scene, which no model decides."""
+        return self.identity(0)
+
+    def identity(self, execute: int) -> dict[str, Any]:
+        """Name and version of the suite, and the scene; items are compared one by one, by their content."""
+        del execute
+        suite = {"name": self.suite.name, "version": self.suite.version}
+        return {"suite": suite, "scene": self.settings.scene.to_json()}
+
+    def name_parts(self) -> list[Any]:
+        """The whole suite, the selected categories, and the wordings."""
+        return [self.suite.whole.content_sha256, self.suite.categories, self.settings.wordings]
+
+    @property
+    def suite_parent(self) -> Any:
+        """The suite that this one was selected of."""
+        return self.suite.parent
+
+    def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
+        """The selected part of the suite, and the texts of wordings."""
+        suite = self.suite
+        selected: dict[str, Any] = {
+            "suite": {
+                "identity": suite.identity,
+                "content_sha256": suite.content_sha256,
+                "seed_text": suite.seed_text,
+            },
+            "categories": list(suite.categories),
+            "items": len(suite.items),
+        }
+        if self.settings.wordings is not None:
+            texts, skipped = [[row.episode_id, row.instruction] for row in rows], self._skipped(rows)
+            selected["wordings"] = {
+                "names": list(skipped),
+                "skipped": skipped,
+                "texts_sha256": sha256_json(texts),
+            }
+        return selected
+
+    def describe(self, rows: Sequence[Row]) -> dict[str, str]:
+        """Suite, categories, scene, episodes and wordings."""
+        scene, skipped = self.settings.scene, self._skipped(rows)
+        early = ", less once the cube was released and rests" if scene.early_stop else ""
+        wordings = ", ".join(
+            f"{name} ({count} items have none: skipped)" if count else name for name, count in skipped.items()
+        )
+        return {
+            "suite": self.suite.identity,
+            "categories": ", ".join(self.suite.categories),
+            "scene": f"{scene.name}, at most {scene.max_steps} actions{early}",
+            "episodes": f"{len(rows)} ({counted(len(self.suite.items), 'item')} in both layouts)",
+            **({"wordings": wordings} if skipped else {}),
+        }
+
+    def targets(self) -> tuple[str, ...]:
+        """The sides of the correct and of the chosen picture."""
+        return ("side.correct", "side.chosen")
+
+    # -- what a model sees ---------------------------------------------------------------------------
+
+    def example(self, instruction: str) -> Observation:
+        """A blank picture of the scene's size."""
+        scene = self.settings.scene
+        blank, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
+        return Observation(blank, state, instruction, scene.intrinsics)
+
+    def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
+        """Raise UnitsError for a scene whose first states lie outside the statistics of a policy."""
+        if accept_units or policy.state_numbers is None or "state" in policy.zero_filled_inputs():
+            return self, policy
+        states = policy.laid_out(self._first_states())
+        names = [str(place) for place in range(states.shape[1])]
+        where = f"the scene {self.settings.scene.name}"
+        check_units(unusual_shares(policy, states), names, where, policy, accept_units)
+        return self, policy
+
+    def _first_states(self) -> Any:
+        """(n, 8) states of the arm at the first inference of some rows; those that cannot be set up are left out.
+
+        Raises SceneError if none can be set up.
+        """
+        states, failed = [], None
+        player = ScenePlayer(self.settings.scene)
+        try:
+            for row in self.rows(0)[:FIRST_EPISODES]:
+                try:
+                    states.append(player.look(row).observation.state)
+                except SceneError as error:
+                    failed = error
+        finally:
+            player.close()
+        if not states and failed is not None:
+            raise failed
+        return np.stack(states)
+
+    def rehearse(self, rows: Iterable[Row]) -> None:
+        """Set up the first row, or the next ones if its start cannot be reached.
+
+        Raises SceneError if none of the first rows can be set up, such as for an arm whose meshes are not
+        installed, and SuiteError if a picture of the first one is not what the suite says.
+        """
+        env, failed = Act2AnswerEnv(self.settings.scene), None
+        try:
+            for row in islice(rows, EPISODES):
+                try:
+                    options = {"item": row.content.item, "layout": row.content.layout}
+                    env.reset(seed=row.columns["scene_seed"], options=options)
+                except SceneError as error:
+                    failed = error
+                else:
+                    return
+        finally:
+            env.close()
+        if failed is not None:
+            raise failed
+
+    def play(self, played: Played) -> Opens:
+        """Open a player of the scene."""
+        return partial(ScenePlayer, self.settings.scene, played)
+
+    def pairs(self, vary: str, rng: np.random.Generator, rows: Sequence[Row]) -> Iterator[Pair]:
+        """As of every source; with `layout`, the donor has the two pictures in each other's place."""
+        return self._layouts(rows) if vary == LAYOUT else super().pairs(vary, rng, rows)
+
+    def _layouts(self, rows: Sequence[Row]) -> Iterator[Pair]:
+        player = ScenePlayer(self.settings.scene)
+        try:
+            for row in rows:
+                clean = player.look(row).observation
+                donor = player.look_swapped().observation
+                yield Pair(LAYOUT, row, row, clean, donor, None, row.policy_seed)
+        finally:
+            player.close()
+
+
+def _first_items(categories: Sequence[str] | None, count: int) -> Suite:
+    """The first items of the embedded suite, drawn alone: fewer items are the beginning of more.
+
+    It is said to be selected from the category that a plan looks at for further items, which is drawn in full.
+    """
+    drawn = min(max(2, count + count % 2), ITEMS)
+    suite = default_suite(categories, drawn).select(None, count)
+    return replace(suite, selected_from=default_suite((Smallest.of(suite).category,)))
+
+
+def scene_row(
+    index: int, episode: Episode, scene_seed: int, policy_seed: int, content_sha256: str | None = None
+) -> Row:
+    """The row of an episode. content_sha256: of its item; None outside a plan."""
+    item, wording = episode.item, episode.wording
+    columns: Mapping[str, Any] = {
+        "episode_id": episode.episode_id,
+        "item_id": item.item_id,
+        "category": item.category,
+        "group_id": item.group_id,
+        "pair_id": item.pair_id,
+        "layout": episode.layout,
+        "side_correct": episode.side_correct,
+        "instruction": item.instruction,
+        "target_concept": item.target_concept,
+        "distractor_concept": item.distractor_concept,
+        "scene_seed": scene_seed,
+        "policy_seed": policy_seed,
+        **({} if wording is None else {"wording": wording}),
+        **({} if content_sha256 is None else {"item_content_sha256": content_sha256}),
+    }
+    return Row(index, columns, episode)
