@@ -89,8 +89,8 @@ class RecordedFrames(Frames):
     """Frames of the LeRobotDataset that a run showed."""
 
     def __init__(self, run: Run, source: ReplaySource) -> None:
-        from probe_kit.extract.recordings.lerobot_folder import open_lerobot
-        from probe_kit.extract.recordings.lerobot_frames import LeRobotFrames
+        from probe_kit.extract.sources.lerobot_folder import open_lerobot
+        from probe_kit.extract.sources.lerobot_frames import LeRobotFrames
         from probe_kit.extract.sources.recording import LeRobotSource
 
         self._dataset = run.settings[DATASET]
@@ -134,8 +134,8 @@ class EnvironmentFrames(Frames):
     """The first observation of every episode of the environment that a run played."""
 
     def __init__(self, run: Run, source: ReplaySource) -> None:
-        from probe_kit.extract.own_environments.opening import listed_episodes, open_environment
         from probe_kit.extract.sources.environment import EnvSource
+        from probe_kit.extract.sources.opening import listed_episodes, open_environment
 
         stored = run.settings["environment"]
         options = {**stored["options"], **source.environment_options}
@@ -162,7 +162,7 @@ class EnvironmentFrames(Frames):
 
     def observe(self, frame: Frame) -> Observation:
         """Set an episode up, and return what it shows first."""
-        from probe_kit.extract.own_environments.opening import started
+        from probe_kit.extract.sources.opening import started
 
         if frame.episode not in self._episodes:
             raise OtherFramesError(
