@@ -13,7 +13,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import Incomplete
 from probe_kit.train.controls.fit import add_controls, prepare_controls
-from probe_kit.train.controls.untrained import add_untrained, check_untrained
+from probe_kit.train.controls.untrained import add_untrained, check_same_source, check_untrained
 from probe_kit.train.crossval.site_probe import SiteProbe
 from probe_kit.train.data.run_reader import RunReader, check_several_wordings, seed_text_of
 from probe_kit.train.data.samples import is_token_view, read_samples, sites_of
@@ -109,6 +109,7 @@ def train_probes(
     )  # fmt: skip
     beside = None
     if untrained is not None:
+        check_same_source(run, untrained, sweep.samples, own.is_side)
         same: Target | str = own.target if own.is_side else sweep.target
         beside = Sweep.of(untrained, same, own.categories, crew, progress, **options)
         check_untrained(run, untrained, sweep.samples, beside.samples, own.is_side, call)

@@ -23,6 +23,27 @@ _SHOWN = (DATASET, "suite", "scene", "seed")
 """Settings that decide which frames a network is shown."""
 
 
+def check_same_source(run: RunReader, untrained: RunReader, samples: TargetSamples, is_side: bool) -> None:
+    """Raise UsageError for the run itself; of a target that is no side also for other frames or missing episodes.
+
+    samples: of the run.
+    """
+    if run.location.address == untrained.location.address:
+        raise UsageError(
+            f"{run.location} cannot be its own untrained control; give another run of the same episodes"
+        )
+    if is_side:
+        return
+    _check_settings(run, untrained)
+    names = run.episodes["episode_id"].to_numpy(str)[samples.rows]
+    missing = names[~np.isin(names, untrained.episodes["episode_id"].to_numpy(str))]
+    if missing.size:
+        raise UsageError(
+            f"the untrained control {untrained.location} has no episode {str(missing[0])!r}; expected all that "
+            f"{run.location} has with a label. Finish it, or extract it again by the same command"
+        )
+
+
 def check_untrained(
     run: RunReader, untrained: RunReader, samples: TargetSamples, others: TargetSamples, is_side: bool, call: int
 ) -> None:
@@ -31,12 +52,6 @@ def check_untrained(
     samples, others: of the two runs. Of a target that is no side also for inferences after the first of a network
     that acted: the frames it was shown then follow from its own actions.
     """
-    if run.location.address == untrained.location.address:
-        raise UsageError(
-            f"{run.location} cannot be its own untrained control; give another run of the same episodes"
-        )
-    if not is_side:
-        _check_settings(run, untrained)
     own, other = (_identities(*pair) for pair in ((run, samples), (untrained, others)))
     if own != other:
         advice = "Extract both by the same command, one with --random-weights"

@@ -74,7 +74,7 @@ def test_other_frames_are_refused(run: Run, tmp_path: Path, labelled_run: Path) 
     with pytest.raises(UsageError, match="another dataset"):
         probed(run, untrained=open_run(labelled_run))
     fewer = write_recorded_run(tmp_path / "fewer", episodes=8, weights="1" * 64)
-    with pytest.raises(UsageError, match=r"has 8 samples|not the same in episode"):
+    with pytest.raises(UsageError, match=r"has no episode .*expected all"):
         probed(run, untrained=fewer)
 
 
