@@ -263,6 +263,7 @@ STAND_INS = {
 """By page, patterns of what is shortened or replaced by the embedded models; all else is typed as it stands."""
 
 NOT_TYPED = {
+    r"--vary|mine\.csv": "a run on recordings",
     r"^cd probe_kit": "this is that checkout",
     r"^\. \.venv": "this runs in that environment",
     r"^\./with-uv --extra": "the extras are installed here",

@@ -79,7 +79,8 @@ Direction = Annotated[
     str | None,
     _inside_option(
         "--direction",
-        help="Direction or subspace: none, mean-difference, probe, mean-difference:K, leace, inlp:K.",
+        help="Direction or subspace: none, mean-difference, probe, mean-difference:K, leace, inlp:K, or FILE#NAME "
+        "of a safetensors or npz file.",
     ),
 ]
 Controls = Annotated[

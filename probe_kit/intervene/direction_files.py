@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,7 +126,7 @@ def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping
                 arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - no mapping
                 said = (opened.metadata() or {}).get(ENTRY, "{}")
         return arrays, json.loads(said)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise UsageError(f"{path} holds no directions: {str(error)[:200]}") from error
     except Exception as error:
         if type(error).__name__ != "SafetensorError":

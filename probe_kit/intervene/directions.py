@@ -21,6 +21,7 @@ from probe_kit.errors import NoDirectionError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.intervene.direction_files import FileDirection
 from probe_kit.intervene.erasers import (
     NO_DIRECTION,
     Eraser,
@@ -86,15 +87,21 @@ class Directed(Protocol):
     def seed(self) -> int:
         """Of controls and folds."""
 
+    @property
+    def vector(self) -> FileDirection | None:
+        """Of a file."""
 
-def check_direction(direction: str) -> None:
-    """Raise UsageError for a name that is no direction to patch tokens within."""
+
+def check_direction(direction: str, vector: FileDirection | None = None) -> None:
+    """Raise UsageError for a name that is no direction to patch tokens within. vector: of a file."""
+    if vector is not None:
+        return
     if direction.startswith(f"{MEAN_DIFFERENCE}:"):
         Method.of(direction)
     elif direction not in DIRECTIONS:
         raise UsageError(
-            f"unknown direction {direction!r}; expected {', '.join(DIRECTIONS)}, or {MEAN_DIFFERENCE}:K for K "
-            "directions of the tokens themselves"
+            f"unknown direction {direction!r}; expected {', '.join(DIRECTIONS)}, {MEAN_DIFFERENCE}:K for K "
+            "directions of the tokens themselves, or FILE#NAME of a safetensors or npz file"
         )
 
 
@@ -114,6 +121,8 @@ def fit_token_directions(
     stored, NoDirectionError for a named place without a direction, UsageError where there are too few episodes to
     learn from.
     """
+    if intervention.vector is not None:
+        return {cell: _of_file(session, cell, intervention.vector, intervention) for cell in cells}
     items = items_of(session.run, intervention.categories, None)
     direction, controls, seed = intervention.direction, intervention.controls, intervention.seed
     passed_over = PassedOver(session, patterns)
@@ -141,6 +150,45 @@ def fit_token_directions(
         cell: TokenDirections(by_name, halves[cell], control_names(controls))
         for cell, by_name in passed_over.left(bases).items()
     }
+
+
+@dataclass(frozen=True)
+class FixedDirections:
+    """Directions of a file and its controls, the same for every episode. bases, vectors: by name."""
+
+    bases: Mapping[str, Vector]
+    vectors: Mapping[str, Vector]
+    control_names: tuple[str, ...]
+
+    def basis(self, name: str, episode: str, category: str) -> Vector:
+        """Return (K, D) orthonormal rows."""
+        del episode, category
+        return self.bases[name]
+
+    def shift(self, name: str, episode: str, category: str, strength: float) -> Vector:
+        """Return (D,) so many vectors of the file; of a control one of the same length."""
+        del episode, category
+        return np.float32(strength) * self.vectors[name]
+
+
+def _of_file(session: ReplaySession, cell: Cell, vector: FileDirection, asked: Directed) -> FixedDirections:
+    """Return a file's direction in a cell. Raises UsageError for another site, width or model."""
+    run, site = session.run, cell.place.only_site
+    vector.check(cell.place.name, run.streams[site.stream].width, run.weights_sha256)
+    basis, total = vector.basis.astype(np.float64), vector.vectors.sum(axis=0)
+    bases, vectors = {vector.name: vector.basis}, {vector.name: total.astype(np.float32)}
+    names = control_names(asked.controls)
+    if names:
+        view = resolve_view(view_of(cell.role), run.views(site.stream))
+        features = run.column(site, view).astype(np.float64)
+    for name in names:
+        draw = np.random.default_rng(derive_seed("control", asked.seed, str(site), cell.role, name))
+        rows = list[NDArray[np.float64]]()
+        for _ in basis:
+            rows.append(_control(features, [*basis, *rows], draw))
+        bases[name] = np.array(rows, np.float32)
+        vectors[name] = (np.linalg.norm(total) * rows[0]).astype(np.float32)
+    return FixedDirections(bases, vectors, names)
 
 
 class PassedOver:

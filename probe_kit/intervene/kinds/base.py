@@ -5,7 +5,7 @@ Loads neither torch nor a simulator, and neither do the kinds: tables read them 
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, Self, get_args
 
@@ -17,6 +17,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS
 from probe_kit.hooks.contract.interventions import InterventionKind, Readout
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.direction_files import FileDirection, names_file, read_direction
 from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
 from probe_kit.intervene.places import SEPARATOR
 from probe_kit.intervene.replay import Condition, ReplayBatch, replay
@@ -165,8 +166,8 @@ class Intervention(ABC):
 
     def parameters(self) -> dict[str, Any]:
         """Return its own settings as plain JSON; with the run they decide its numbers."""
-        common = {field.name for field in fields(Intervention)}
-        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name not in common}
+        common = {own.name for own in fields(Intervention)}
+        values = {own.name: getattr(self, own.name) for own in fields(self) if own.init and own.name not in common}
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     def check_run(self, run: Run) -> None:
@@ -249,6 +250,47 @@ class Intervention(ABC):
         """Return keys of the stored ones that tables and figures read; None if none is preferred."""
         del run
         return None
+
+
+NONE = "none"
+"""No direction: tokens are patched in full."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlongDirection(Intervention):
+    """An intervention along a direction, with matched random ones as controls.
+
+    direction: `mean-difference` or `probe`, one vector per place found in means over tokens without the episode it
+    is used on; `mean-difference:K`, K directions found in the tokens themselves, see `directions`; FILE#NAME, see
+    `direction_files`; some kinds take `none`. controls: so many random directions of the data's own covariance,
+    orthogonal to it. vector: of a file; then `direction` is its name.
+    """
+
+    direction: str = NONE
+    controls: int = 0
+    seed: int = 0
+    vector: FileDirection | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if names_file(self.direction):
+            vector = read_direction(self.direction)
+            object.__setattr__(self, "vector", vector)
+            object.__setattr__(self, "direction", vector.name)
+
+    @property
+    def fits_first(self) -> bool:
+        """Whether its direction is of tokens."""
+        return ":" in self.direction
+
+    def check_run(self, run: Run) -> None:
+        """Raise UsageError also for a direction of an answer in a run without sides."""
+        super().check_run(run)
+        if not has_sides(run) and self.direction != NONE and self.vector is None:
+            raise UsageError(
+                f"{run.location} has no correct picture on a side, so that {self.direction} is no direction "
+                "there. Give one of a file: --direction FILE#NAME"
+            )
 
 
 def capabilities_for(sites: Sequence[str], roles: Sequence[str]) -> tuple[InterventionKind, ...]:

@@ -21,9 +21,10 @@ from probe_kit.hooks.capturing.token_edits import Identity
 from probe_kit.hooks.contract.interventions import InterventionKind
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.kinds.base import (
+    NONE,
+    AlongDirection,
     ConditionName,
     EffectRow,
-    Intervention,
     Measurement,
     TableContext,
     capabilities_for,
@@ -39,7 +40,7 @@ from probe_kit.intervene.kinds.base import (
     text_of,
 )
 from probe_kit.intervene.kinds.image_swap import SMALLEST_EFFECT_OF_INTEREST, net_interval
-from probe_kit.intervene.kinds.interchange import NONE, patch_of, patches_within
+from probe_kit.intervene.kinds.interchange import patch_of, patches_within
 from probe_kit.intervene.kinds.site_maps import best_patch_targets
 from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
@@ -95,7 +96,7 @@ class IdentityPatch:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClosedLoop(Intervention):
+class ClosedLoop(AlongDirection):
     """Interchange at a few targets in closed loop: identity patch, image swap, every target and its controls.
 
     targets: `PLACE|ROLE`, such as `backbone.02|image`; see `best_patch_targets`. direction: as of `Interchange`;
@@ -118,7 +119,6 @@ class ClosedLoop(Intervention):
     targets: tuple[str, ...]
     direction: str = "mean-difference:1"
     controls: int = 1
-    seed: int = 0
 
     def __post_init__(self) -> None:
         from probe_kit.intervene.directions import check_direction
@@ -129,7 +129,7 @@ class ClosedLoop(Intervention):
         if not self.targets or any(target.count(SEPARATOR) != 1 for target in self.targets):
             raise UsageError(f"targets are {self.targets}; expected PLACE|ROLE, such as backbone.02|image")
         if self.direction != NONE:
-            check_direction(self.direction)
+            check_direction(self.direction, self.vector)
         elif self.controls:
             raise UsageError("controls are directions beside another one; choose --direction, or --controls 0")
 
@@ -155,11 +155,6 @@ class ClosedLoop(Intervention):
         """Return edits; and `kv`, where one of its places is."""
         sites, roles = zip(*map(self._split, self.targets), strict=True)
         return capabilities_for(sites, roles)
-
-    @property
-    def fits_first(self) -> bool:
-        """Whether its direction is of tokens."""
-        return ":" in self.direction
 
     def parameters(self) -> dict[str, Any]:
         """Return where and along what; it is read where the cube ends."""

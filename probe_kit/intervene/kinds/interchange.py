@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.kinds.base import (
+    NONE,
+    AlongDirection,
     ConditionName,
-    Intervention,
     Measurement,
     TableContext,
     category_sentences,
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from probe_kit.intervene.sessions.session import ReplaySession
 
 
-NONE = "none"
 _LEGEND = (
     "effect: share of what the whole image swap does, n/a where that is not beyond chance; net flip rate: share "
     "of episodes that flip to the target side, minus those that flip away from it; p: family-wise over all edits "
@@ -78,14 +78,12 @@ def check_sites_and_roles(sites: Sequence[str], roles: Sequence[str], subject: s
 
 
 @dataclass(frozen=True, kw_only=True)
-class Interchange(Intervention):
+class Interchange(AlongDirection):
     """Every place is tried at every role, alone.
 
     sites: patterns, see `resolve_sites`. roles: of the tokens that are patched; a stream is tried at those
-    that it has. direction: `none` patches tokens in full; `mean-difference` or `probe` only along that direction
-    of each place (rank 1), found in means over tokens without the episode it is used on; `mean-difference:K` along
-    K directions found in the tokens themselves, see `directions`. controls: so many times as many random
-    directions of the data's own covariance, orthogonal to it, per place and role.
+    that it has. direction: patches tokens within it alone; `none` in full. controls: so many times as many random
+    directions, per place and role; see `AlongDirection`.
     """
 
     kind: ClassVar[str] = "interchange"
@@ -95,16 +93,13 @@ class Interchange(Intervention):
     options: ClassVar[Mapping[str, str]] = {
         "sites": "where tokens are patched; default backbone.*",
         "roles": "of the patched tokens; default all,image,language",
-        "direction": "patch within it: mean-difference or probe (mean over tokens), mean-difference:K (tokens)",
+        "direction": "patch within it: mean-difference, probe (of means), mean-difference:K (tokens), FILE#NAME",
         "controls": "random directions; default 5 with --direction",
         "seed": "of controls and folds; default 0",
     }
 
     sites: tuple[str, ...] = ("backbone.*",)
     roles: tuple[str, ...] = (ALL, "image", "language")
-    direction: str = NONE
-    controls: int = 0
-    seed: int = 0
 
     def __post_init__(self) -> None:
         from probe_kit.intervene.directions import check_direction
@@ -118,7 +113,7 @@ class Interchange(Intervention):
                 "--direction out"
             )
         if self.direction != NONE:
-            check_direction(self.direction)
+            check_direction(self.direction, self.vector)
         elif self.controls:
             raise UsageError("controls are directions beside another one; choose --direction, or no --controls")
 
@@ -127,11 +122,6 @@ class Interchange(Intervention):
         """Return it with five controls where a direction is given and their number is not."""
         options.setdefault("controls", 5 if "direction" in options else 0)
         return super().from_options(run, **options)
-
-    @property
-    def fits_first(self) -> bool:
-        """Whether its direction is of tokens."""
-        return ":" in self.direction
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean, images swapped, and every place at every role. Raises UnknownSiteError, NoProbesError."""

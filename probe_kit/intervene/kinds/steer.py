@@ -16,14 +16,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edit_engine import apply_patch
 from probe_kit.hooks.capturing.token_edits import AddVector
-from probe_kit.intervene.kinds.base import ConditionName, Intervention, Measurement
+from probe_kit.intervene.kinds.base import AlongDirection, ConditionName, Measurement
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
 from probe_kit.intervene.kinds.interchange import Interchange
 from probe_kit.intervene.kinds.site_maps import PatchEffect
 from probe_kit.intervene.patching.patch import Cell
 from probe_kit.intervene.places import resolve_all
 from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, SourceRun
-from probe_kit.intervene.settings import has_sides
 from probe_kit.intervene.tokens import TILES, role_tokens
 from probe_kit.runs.run import Run
 
@@ -54,9 +53,9 @@ class Steered:
     def play(self, context: ConditionContext) -> ConditionResult:
         """Infer with these tokens moved."""
         pair, session, place = context.pair, context.session, self.cell.place
-        left = pair.side == "left"
+        left = pair.side != "right"
         side = {"left": 1.0, "right": -1.0, "correct": 1.0 if left else -1.0, "wrong": -1.0 if left else 1.0}
-        strength = self.coefficient * side[self.target_side]
+        strength = self.coefficient * (1.0 if pair.side is None else side[self.target_side])
         shift = self.axes.shift(self.direction, pair.episode, pair.category, strength)
         tokens = role_tokens(session.policy, pair, place.stream, self.cell.role, context.memo)
         with apply_patch(session.policy, place.sites, tokens, AddVector(shift)) as edit_log:
@@ -65,7 +64,7 @@ class Steered:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Steering(Intervention):
+class Steering(AlongDirection):
     """Every place and coefficient, toward one side, and the same for the controls; 0 is always played as well.
 
     sites: patterns of places. role: whose tokens are moved. direction: `mean-difference` or `probe`, one vector
@@ -83,7 +82,7 @@ class Steering(Intervention):
     options: ClassVar[Mapping[str, str]] = {
         "sites": "where tokens are moved; required",
         "roles": "the one whose tokens are moved; required",
-        "direction": "mean-difference (default), probe or mean-difference:K",
+        "direction": "mean-difference (default), probe, mean-difference:K or FILE#NAME, whose vector is the unit",
         "controls": "random directions; default 5",
         "coefficients": "in half class-mean differences; default 1,2,4",
         "target_side": "wrong (default), correct, left or right",
@@ -96,7 +95,6 @@ class Steering(Intervention):
     coefficients: tuple[float, ...] = (1.0, 2.0, 4.0)
     target_side: TargetSide = "wrong"
     controls: int = 5
-    seed: int = 0
 
     def __post_init__(self) -> None:
         from probe_kit.intervene.directions import check_direction
@@ -107,7 +105,7 @@ class Steering(Intervention):
                 f"{self.role} has no mean in the run from which a direction could be found; steer `image`, or "
                 "patch the tile (--kind interchange)"
             )
-        check_direction(self.direction)
+        check_direction(self.direction, self.vector)
         if self.target_side not in get_args(TargetSide):
             raise UsageError(
                 f"target_side is {self.target_side!r}; expected one of {', '.join(get_args(TargetSide))}"
@@ -126,19 +124,6 @@ class Steering(Intervention):
                 "--kind steer needs --sites and one of --roles, such as --sites backbone.02 --roles image"
             )
         return super().from_options(run, role=roles[0], **options)
-
-    def check_run(self, run: Run) -> None:
-        """Raise UsageError for a run without sides, whose answers have no direction of their own."""
-        super().check_run(run)
-        if not has_sides(run):
-            raise UsageError(
-                f"{run.location} has no correct picture on a side, so that {self.direction} is no direction there"
-            )
-
-    @property
-    def fits_first(self) -> bool:
-        """Whether its direction is of tokens."""
-        return ":" in self.direction
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean, images swapped, then every place at every coefficient, with its controls.

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.hooks.registry import get_family
-from probe_kit.intervene.directions import MEAN_DIFFERENCE
+from probe_kit.intervene.directions import DIRECTIONS, MEAN_DIFFERENCE
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps
 from probe_kit.intervene.kinds.joint import (
     EVERY,
@@ -154,7 +154,7 @@ def stored_ties(run: RunReader, results: "ProbeResults | None", view: str | None
         return {}
     scores = results.scores
     own = scores[(scores["stream"] == BACKBONE) & (scores["view"] == (view or results.settings.views[0]))]
-    whole, along = stored_site_effects(run), stored_subspace_effects(run)
+    whole, along = stored_site_effects(run), _of_answers(stored_subspace_effects(run))
     jointly = stored_joint_places(run)
     found = {}
     for category, rows in own.groupby("category", sort=False):
@@ -177,6 +177,18 @@ def stored_ties(run: RunReader, results: "ProbeResults | None", view: str | None
         inside = {at: tie for at, tie in sites.items() if tie != "not tested" or not is_upstream(at[0])}
         found[name] = describe_tie(inside, is_read_jointly(jointly.get(name, ())))
     return found
+
+
+def _of_answers(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str, list[PatchEffect]]:
+    """Return rows along directions of the answer and their controls; one of a file need not be the answer's."""
+    return {
+        name: [row for row in rows if row.is_control or _is_of_answer(row.direction)]
+        for name, rows in along.items()
+    }
+
+
+def _is_of_answer(direction: str) -> bool:
+    return direction in DIRECTIONS or direction.startswith(f"{MEAN_DIFFERENCE}:")
 
 
 def _is_pooled_carrier(row: PatchEffect) -> bool:

@@ -1,0 +1,134 @@
+"""Directions from outside: read from safetensors, npz and sparse autoencoders, and patched or added."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from probe_kit.errors import UsageError
+from probe_kit.intervene import Interchange, Steering
+from probe_kit.intervene.direction_files import names_file, read_direction, write_directions
+from probe_kit.intervene.kinds.steer import Steered
+from probe_kit.intervene.patching import run_with_hooks
+from probe_kit.intervene.replay import ConditionContext, replay
+from probe_kit.intervene.sessions.scene import SceneSession
+
+SITE, WIDTH = "backbone.02", 96
+
+
+def written(path: Path, vectors: dict[str, Any], **about: str) -> Path:
+    write_directions(path, vectors, dict.fromkeys(vectors, about))
+    return path
+
+
+@pytest.mark.parametrize("ending", ["safetensors", "npz"])
+def test_a_written_direction_is_read_again_with_what_is_said_of_it(tmp_path: Path, ending: str) -> None:
+    vector = np.arange(1, 5)
+    path = written(tmp_path / f"some.{ending}", {"a": vector, "b": 2 * vector}, site=SITE, weights="0f" * 32)
+    assert names_file(f"{path}#a")
+    a, b = read_direction(f"{path}#a"), read_direction(f"{path}#b")
+    assert (a.site, a.weights) == (SITE, "0f" * 32)
+    assert a.name.startswith("a-")
+    assert a.name != b.name
+    np.testing.assert_array_equal(a.vectors, [vector])
+    np.testing.assert_allclose(np.abs(a.basis), [vector / np.linalg.norm(vector)], rtol=1e-6)
+
+
+def test_a_standardised_direction_is_scaled_to_the_raw_space(tmp_path: Path) -> None:
+    arrays = {"w": np.ones(3), "w.scale": np.array([1.0, 2.0, 4.0])}
+    path = tmp_path / "probe.npz"
+    write_directions(path, arrays, {"w": {"space": "standardised"}})
+    np.testing.assert_array_equal(read_direction(str(path)).vectors, [[1, 2, 4]])
+
+
+def test_a_feature_of_an_autoencoder_is_its_row_of_the_decoder(tmp_path: Path) -> None:
+    from safetensors.numpy import save_file
+
+    decoder = np.random.default_rng(0).normal(size=(5, 3)).astype(np.float32)
+    save_file({"W_dec": decoder, "b_dec": np.zeros(3, np.float32)}, tmp_path / "sae_weights.safetensors")
+    (tmp_path / "cfg.json").write_text(json.dumps({"metadata": {"hook_name": SITE}}), encoding="utf-8")
+    feature = read_direction(f"{tmp_path}#3")
+    np.testing.assert_array_equal(feature.vectors, decoder[3:4])
+    assert feature.site == SITE
+    with pytest.raises(UsageError, match="has 5 features"):
+        read_direction(f"{tmp_path}#9")
+
+
+@pytest.mark.parametrize(
+    ("vectors", "name", "named"),
+    [
+        ({"a": np.ones(3), "b": np.ones(3)}, "", "directions a, b"),
+        ({"a": np.ones(3)}, "#c", "directions a"),
+        ({"a": np.zeros(3)}, "", "not zero"),
+        ({"a": np.ones((2, 2, 2))}, "", "shape"),
+    ],
+)
+def test_a_file_without_the_direction_is_refused(
+    tmp_path: Path, vectors: dict[str, Any], name: str, named: str
+) -> None:
+    path = written(tmp_path / "some.npz", vectors)
+    with pytest.raises(UsageError, match=named):
+        read_direction(f"{path}{name}")
+
+
+def test_what_is_no_file_of_directions_is_refused(tmp_path: Path) -> None:
+    for ending in ("npz", "safetensors"):
+        path = tmp_path / f"broken.{ending}"
+        path.write_bytes(b"no such format")
+        with pytest.raises(UsageError, match="broken"):
+            read_direction(str(path))
+    with pytest.raises(UsageError, match="there is no file"):
+        read_direction(str(tmp_path / "absent.npz"))
+
+
+@pytest.mark.parametrize(
+    ("width", "about", "named"),
+    [
+        (WIDTH - 1, {}, "has 95 numbers; backbone.02 has 96"),
+        (WIDTH, {"weights": "0" * 64}, "was found in the weights"),
+        (WIDTH, {"site": "backbone.01"}, "not of backbone.02|is a direction of backbone.01"),
+    ],
+)
+def test_another_width_model_or_site_is_refused(
+    session: SceneSession, tmp_path: Path, width: int, about: dict[str, str], named: str
+) -> None:
+    path = written(tmp_path / "some.npz", {"a": np.ones(width)}, **about)
+    asked = Interchange(sites=(SITE,), roles=("image",), direction=str(path), controls=0)
+    with pytest.raises(UsageError, match=named):
+        asked.conditions(session)
+
+
+def test_patching_within_the_whole_space_is_patching_in_full(session: SceneSession, tmp_path: Path) -> None:
+    path = written(tmp_path / "all.npz", {"all": np.eye(WIDTH)})
+    within = Interchange(sites=(SITE,), roles=("image",), direction=str(path))
+    full = Interchange(sites=(SITE,), roles=("image",))
+    pairs = session.pairs(str(session.run.episodes["item_id"][0]))
+    (*_, a), (*_, b) = (replay(session, pairs, asked.conditions(session)).displacement for asked in (within, full))
+    np.testing.assert_allclose(a, b, atol=1e-5)
+    assert within.parameters()["direction"].startswith("all-")
+    assert "vector" not in within.parameters()
+
+
+def test_steering_adds_so_many_vectors_of_the_file(session: SceneSession, tmp_path: Path) -> None:
+    """By hand: a hook that adds the vector to the picture's tokens."""
+    vector = np.random.default_rng(0).normal(size=WIDTH)
+    path = written(tmp_path / "one.safetensors", {"one": vector}, site=SITE)
+    asked = Steering(sites=(SITE,), role="image", direction=f"{path}#one", coefficients=(2.0,), controls=1)
+    conditions = asked.conditions(session)
+    steered = next(one for one in conditions if isinstance(one, Steered) and one.coefficient == 2.0)
+    pair = replace(session.pairs(str(session.run.episodes["item_id"][0]))[0], side=None)
+    chunk = steered.play(ConditionContext(session, pair)).chunk
+
+    def add(activation: Any, point: Any) -> Any:
+        activation[0, point.roles.mask("image")] += 2 * activation.new_tensor(vector)
+        return activation
+
+    np.testing.assert_allclose(
+        chunk, run_with_hooks(session.policy, pair.clean, {SITE: add}, pair.seed), atol=1e-5
+    )
+    control = steered.axes.shift("control-1", pair.episode, pair.category, 1.0)
+    assert np.linalg.norm(control) == pytest.approx(np.linalg.norm(vector), rel=1e-5)
+    assert abs(float(control @ vector)) < 1e-3 * np.linalg.norm(vector) ** 2
