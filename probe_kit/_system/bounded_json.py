@@ -77,21 +77,30 @@ def load_gzipped_json(file: Path) -> Any:
     return parse_json(content)
 
 
-def read_json(file: Path, raises: type[ProbeKitError], advice: str) -> Any:
-    """What the file says. Raises `raises` with `advice` if it is missing, too large, unreadable or no JSON."""
+_KINDS: dict[type, str] = {dict: "an object", list: "a list"}
+
+
+def read_json(
+    file: Path, raises: type[ProbeKitError], advice: str, most: int = MOST_BYTES, kind: type = object
+) -> Any:
+    """The value in a file. most: bytes. kind: `dict` or `list`, if it must be one.
+
+    Raises `raises` with `advice` if the file is missing, too large, unreadable, no JSON, or of another kind.
+    """
     try:
-        return load_json(file)
+        value = load_json(file, most)
     except FileNotFoundError:
         raise raises(f"{file} is missing. {advice}") from None
     except OSError as error:
         raise raises(f"{file} cannot be read ({error.strerror}). {advice}") from error
     except ValueError as error:
         raise raises(f"{file} is not JSON ({error}). {advice}") from error
+    if not isinstance(value, kind):
+        raise raises(f"{file} holds a JSON {type(value).__name__}; expected {_KINDS[kind]}. {advice}")
+    return value
 
 
 def read_json_object(file: Path, raises: type[ProbeKitError], advice: str) -> dict[str, Any]:
-    """What the file says, if that is an object; raises as `read_json` does."""
-    value = read_json(file, raises, advice)
-    if not isinstance(value, dict):
-        raise raises(f"{file} holds a JSON {type(value).__name__}; expected an object. {advice}")
+    """The object in a file; raises as `read_json` does."""
+    value: dict[str, Any] = read_json(file, raises, advice, kind=dict)
     return value

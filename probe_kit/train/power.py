@@ -48,21 +48,10 @@ class Power:
     absent: float
     spread: float
 
-
-@dataclass(frozen=True)
-class Needed:
-    """The fewest items at which all three tests see a signal of `above` in a share `power` of experiments.
-
-    items: None if `MOST_ITEMS` are too few. resolution: the next smaller number that was tried is so many items
-    below, and sees it less often. reached: the least share of the three with so many items; spread: its error.
-    """
-
-    above: float
-    power: float
-    items: int | None
-    resolution: int | None = None
-    reached: float | None = None
-    spread: float | None = None
+    @property
+    def least(self) -> float:
+        """The share of experiments in which the weakest of the three tests sees the signal."""
+        return min(self.chance, self.random_features, self.untrained)
 
 
 def simulate(items: int, above: float, sites: int = 19, draws: int = 400, seed: int = 0) -> Power:
@@ -88,22 +77,22 @@ def simulate(items: int, above: float, sites: int = 19, draws: int = 400, seed: 
     return Power(items, above, chance, random_features, untrained, absent, spread)
 
 
-def items_needed(above: float, power: float, sites: int = 19, draws: int = 400, seed: int = 0) -> Needed:
-    """The fewest items at which all three tests reach `power`; see `fewest` for how they are looked for.
+def items_needed(
+    above: float, power: float, sites: int = 19, draws: int = 400, seed: int = 0
+) -> tuple[Power, int] | None:
+    """The power of the fewest items at which all three tests reach `power`; None if `MOST_ITEMS` are too few.
 
+    The second value is the resolution: so many items fewer were tried, and reach it less often; see `fewest`.
     Raises UsageError as `simulate` does.
     """
-    found: dict[int, Power] = {}
+    tried: dict[int, Power] = {}
 
     def reaches(items: int) -> bool:
-        found[items] = simulate(items, above, sites, draws, seed)
-        return _least(found[items]) >= power
+        tried[items] = simulate(items, above, sites, draws, seed)
+        return tried[items].least >= power
 
-    place = fewest(reaches, FEWEST_ITEMS, MOST_ITEMS)
-    if place is None:
-        return Needed(above, power, None)
-    items, step = place
-    return Needed(above, power, items, step, _least(found[items]), found[items].spread)
+    needed = fewest(reaches, FEWEST_ITEMS, MOST_ITEMS)
+    return None if needed is None else (tried[needed[0]], needed[1])
 
 
 def fewest(reaches: Callable[[int], bool], low: int, high: int) -> tuple[int, int] | None:
@@ -144,10 +133,6 @@ def fewest(reaches: Callable[[int], bool], low: int, high: int) -> tuple[int, in
 def _resolution(items: int) -> int:
     """A group of items, and above 200 of them about 2 %."""
     return max(1, items // 50 // ITEMS_PER_GROUP) * ITEMS_PER_GROUP
-
-
-def _least(found: Power) -> float:
-    return min(found.chance, found.random_features, found.untrained)
 
 
 def _carriers(sites: int) -> slice:

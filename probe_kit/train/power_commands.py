@@ -11,7 +11,7 @@ from probe_kit._terminal.options import AsJson
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
-    from probe_kit.train.power import Needed, Power
+    from probe_kit.train.power import Power
 
 MOST_ITEMS = 100_000
 INVERSE = "Number of items for a goal"
@@ -74,33 +74,43 @@ def power(
     counts = [_whole(part) for part in split(items or ITEMS) or ()]
     signals = [_points(part) for part in split(signal) or ()]
     if width is not None:
-        needed = items_for_width(width / 100)
-        print_json({"width": width, "items": needed}) if as_json else out.print(f"{needed} items per category")
+        count = items_for_width(width / 100)
+        print_json({"width": width, "items": count}) if as_json else out.print(f"{count} items per category")
         return
     with err.status("simulating"):
-        if wanted is not None:
-            fewest = [items_needed(above, wanted / 100, sites, draws) for above in signals]
+        if wanted is None:
+            powers = [simulate(count, above, sites, draws) for count in counts for above in signals]
         else:
-            found = [simulate(count, above, sites, draws) for count in counts for above in signals]
-    if wanted is not None:
-        if as_json:
-            print_json([asdict(one) for one in fewest])
-        for one in fewest if not as_json else ():
-            out.print(f"{100 * one.above:g} points above chance, seen in {wanted:g} %: {_answer(one)}")
+            needed_for = {above: items_needed(above, wanted / 100, sites, draws) for above in signals}
+    if wanted is None:
+        print_json([asdict(one) for one in powers]) if as_json else _print(powers)
     elif as_json:
-        print_json([asdict(one) for one in found])
+        print_json([_as_json(above, wanted / 100, needed) for above, needed in needed_for.items()])
     else:
-        _print(found)
+        for above, needed in needed_for.items():
+            out.print(f"{100 * above:g} points above chance, seen in {wanted:g} %: {_answer(needed)}")
 
 
-def _answer(one: "Needed") -> str:
+def _as_json(above: float, power: float, needed: "tuple[Power, int] | None") -> dict[str, float | None]:
+    """One answer as plain values. reached: the least share of the three tests; spread: its error."""
+    head: dict[str, float | None] = {"above": above, "power": power}
+    if needed is None:
+        return head | dict.fromkeys(("items", "resolution", "reached", "spread"))
+    found, resolution = needed
+    return head | {
+        "items": found.items, "resolution": resolution, "reached": found.least, "spread": found.spread,
+    }  # fmt: skip
+
+
+def _answer(needed: "tuple[Power, int] | None") -> str:
     from probe_kit.train.power import MOST_ITEMS as MOST_SEARCHED
 
-    if one.items is None or one.reached is None or one.spread is None:
+    if needed is None:
         return f"more than {MOST_SEARCHED} items per category"
+    found, resolution = needed
     return (
-        f"{one.items} items per category (to {one.resolution}; simulated there {100 * one.reached:.0f} % "
-        f"± {100 * one.spread:.1f}; more --draws narrow it)"
+        f"{found.items} items per category (to {resolution}; simulated there {100 * found.least:.0f} % "
+        f"± {100 * found.spread:.1f}; more --draws narrow it)"
     )
 
 

@@ -137,11 +137,11 @@ def test_a_number_that_reaches_the_goal_by_luck_is_not_the_fewest() -> None:
 @pytest.mark.slow
 def test_the_items_needed_reach_the_power_and_a_step_less_does_not() -> None:
     needed = items_needed(0.25, 0.8, sites=3, draws=60)
-    assert needed.items is not None
-    assert needed.resolution is not None
-    here, less = (simulate(count, 0.25, 3, 60) for count in (needed.items, needed.items - needed.resolution))
-    assert min(here.chance, here.random_features, here.untrained) == needed.reached >= 0.8
-    assert min(less.chance, less.random_features, less.untrained) < 0.8
+    assert needed is not None
+    found, resolution = needed
+    assert found == simulate(found.items, 0.25, 3, 60)
+    assert min(found.chance, found.random_features, found.untrained) == found.least >= 0.8
+    assert simulate(found.items - resolution, 0.25, 3, 60).least < 0.8
 
 
 def test_the_width_of_an_interval_asks_for_items_too() -> None:

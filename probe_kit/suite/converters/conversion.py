@@ -235,10 +235,10 @@ class _Conversion:
         for category, accepted in bundles.items():
             self.stages[category]["accepted"] = sum(map(len, accepted))
             chosen = sample(accepted, self.n)
-            emitted = emit(self.kind.name, chosen, self.reading, self.load, self._random(category, "sides"))
-            self.stages[category]["emitted"] = len(emitted.items)
-            items += emitted.items
-            pictures |= emitted.pictures
+            emitted, files = emit(self.kind.name, chosen, self.reading, self.load, self._random(category, "sides"))
+            self.stages[category]["emitted"] = len(emitted)
+            items += emitted
+            pictures |= files
         if not items:
             raise SuiteError(f"{self.kind.name}: no item left to write. {self._why_none()}")
         grouped = with_groups(items)

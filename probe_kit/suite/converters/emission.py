@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image
@@ -12,14 +11,6 @@ from probe_kit.suite.converters.candidates import Reading, SourcePicture
 from probe_kit.suite.converters.pairing import Bundle, Proposal
 from probe_kit.suite.items import Item, Side, other_side
 from probe_kit.suite.making import Picture, make_item, squared_picture
-
-
-@dataclass(frozen=True)
-class Emitted:
-    """Items without groups, and their pictures by file name."""
-
-    items: list[Item]
-    pictures: dict[str, bytes]
 
 
 def sample(bundles: Sequence[Bundle], count: int) -> list[Bundle]:
@@ -36,8 +27,11 @@ def sample(bundles: Sequence[Bundle], count: int) -> list[Bundle]:
 def emit(
     source: str, bundles: Sequence[Bundle], reading: Reading, render: Callable[[SourcePicture], Image.Image],
     rng: np.random.Generator,
-) -> Emitted:  # fmt: skip
-    """The items of the bundles. Twins keep their two pictures where they are; all sides balance."""
+) -> tuple[list[Item], dict[str, bytes]]:  # fmt: skip
+    """The items of the bundles without groups, and their pictures by file name.
+
+    Twins keep their two pictures where they are; all sides balance.
+    """
     store: dict[str, Picture] = {}
 
     def stored(picture: SourcePicture) -> Picture:
@@ -49,7 +43,7 @@ def emit(
         _item(source, proposal, side, stored(proposal.target), stored(proposal.distractor), reading)
         for proposal, side in _with_sides(bundles, rng)
     ]
-    return Emitted(items, {entry.file_name: entry.png for entry in store.values()})
+    return items, {entry.file_name: entry.png for entry in store.values()}
 
 
 def _with_sides(bundles: Sequence[Bundle], rng: np.random.Generator) -> Iterator[tuple[Proposal, Side]]:

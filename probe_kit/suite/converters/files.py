@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_json import read_json
 from probe_kit.errors import SuiteError
 from probe_kit.suite.pictures import WHITE, decode_picture
 
@@ -18,16 +18,9 @@ MOST_BYTES = 1 << 30
 _TRIM_STEP = 12  # levels that ink differs from white
 
 
-def read_json(path: Path, source: str, remedy: str) -> Any:
-    """The JSON value in a file. Raises SuiteError naming file and remedy."""
-    if not path.is_file():
-        raise SuiteError(f"{source}: {path} not found. {remedy}")
-    try:
-        return load_json(path, MOST_BYTES)
-    except OSError as problem:
-        raise SuiteError(f"{source}: {path} cannot be read: {problem.strerror}. {remedy}") from problem
-    except ValueError as problem:
-        raise SuiteError(f"{source}: {path} is not valid JSON ({problem}). {remedy}") from problem
+def read_annotations(path: Path, source: str, remedy: str, kind: type = dict) -> Any:
+    """The JSON value of `kind` in a file. Raises SuiteError naming source, file and remedy."""
+    return read_json(path, SuiteError, f"{remedy} It is needed to convert {source}.", MOST_BYTES, kind)
 
 
 def first_existing(tried: Sequence[Path], source: str, record: str, remedy: str) -> Path:

@@ -18,7 +18,7 @@ from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.suite.categories import CATEGORIES, check_categories
 from probe_kit.suite.converters.benchmarks.glb import YAWS, Tile, read_tile
-from probe_kit.suite.converters.files import field_of, read_json
+from probe_kit.suite.converters.files import field_of, read_annotations
 from probe_kit.suite.converters.options import Act2AnswerOptions, options_from
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item, Side
@@ -52,9 +52,9 @@ def read_pairs(root: Path) -> list[Pair]:
     has one body per name), and for indices that are not 0, 1, 2 … (it asks for them one by one).
     """
     path = root / PAIRS
-    records = read_json(path, SOURCE, REMEDY)
-    if not isinstance(records, list) or not records:
-        raise SuiteError(f"{SOURCE}: {path} holds {type(records).__name__}; expected a list of questions.")
+    records = read_annotations(path, SOURCE, REMEDY, list)
+    if not records:
+        raise SuiteError(f"{SOURCE}: {path} holds no question. {REMEDY}")
     read = (_pair(record, position, path) for position, record in enumerate(records))
     pairs = sorted(read, key=attrgetter("index"))
     gap = next((place for place, pair in enumerate(pairs) if pair.index != place), None)
@@ -166,12 +166,7 @@ class _Assets:
 
     @cached_property
     def _records(self) -> dict[str, Any]:
-        path = self._root / TILES
-        records = read_json(path, SOURCE, REMEDY)
-        if not isinstance(records, dict):
-            raise SuiteError(
-                f"{SOURCE}: {path} holds a {type(records).__name__}; expected an object by tile name."
-            )
+        records: dict[str, Any] = read_annotations(self._root / TILES, SOURCE, REMEDY)
         return records
 
     def item(self, category: str, pair: Pair) -> Item:

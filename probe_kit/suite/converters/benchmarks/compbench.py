@@ -6,7 +6,7 @@ from typing import Any
 
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture
-from probe_kit.suite.converters.files import field_of, first_existing, photo, read_json
+from probe_kit.suite.converters.files import field_of, first_existing, photo, read_annotations
 from probe_kit.suite.converters.options import CompBenchOptions
 
 SOURCE = "mllm-compbench"
@@ -73,9 +73,7 @@ def _read_file(
     root: Path,
     reading: Reading,
 ) -> None:
-    records = read_json(path, SOURCE, "Unpack the archive `Annotations` again.")
-    if not isinstance(records, list):
-        raise SuiteError(f"{SOURCE}: {path} holds a {type(records).__name__}; expected a list of records.")
+    records = read_annotations(path, SOURCE, "Unpack the archive `Annotations` again.", list)
     for number, record in enumerate(records):
         if record == {}:
             reading.reasons["empty record"] += 1

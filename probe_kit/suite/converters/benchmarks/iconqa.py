@@ -8,7 +8,7 @@ from typing import Any
 from probe_kit.errors import SuiteError
 from probe_kit.hashing import derive_seed
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
-from probe_kit.suite.converters.files import by_key, field_of, first_existing, read_json, trimmed_art
+from probe_kit.suite.converters.files import by_key, field_of, first_existing, read_annotations, trimmed_art
 from probe_kit.suite.converters.options import IconQaOptions
 from probe_kit.suite.pictures import decode_picture, pixels_sha256
 
@@ -70,9 +70,9 @@ def read(root: Path, categories: Sequence[str], options: IconQaOptions) -> Readi
 
 
 def _mapping(path: Path, reading: Reading) -> dict[str, Any]:
-    value = read_json(path, SOURCE, f"Name the folder that holds problems.json, and {_REMEDY}")
-    if not isinstance(value, dict):
-        raise SuiteError(f"{SOURCE}: {path} holds a {type(value).__name__}; expected an object. Unpack it again.")
+    value: dict[str, Any] = read_annotations(
+        path, SOURCE, f"Name the folder that holds problems.json, and {_REMEDY}"
+    )
     reading.files.append(path)
     return value
 

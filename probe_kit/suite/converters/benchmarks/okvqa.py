@@ -9,7 +9,7 @@ from typing import Any
 
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture
-from probe_kit.suite.converters.files import by_key, field_of, first_existing, photo, read_json
+from probe_kit.suite.converters.files import by_key, field_of, first_existing, photo, read_annotations
 from probe_kit.suite.converters.options import OkVqaOptions
 from probe_kit.suite.converters.rewriting import rewrite
 
@@ -137,7 +137,7 @@ def _by_question(path: Path, key: str, name: str) -> dict[int, Any]:
 
 
 def _records(path: Path, key: str) -> list[Any]:
-    value = read_json(path, SOURCE, "Unpack the questions and the annotations of the same release.")
+    value = read_annotations(path, SOURCE, "Unpack the questions and the annotations of the same release.")
     records: list[Any] = field_of(value, key, list, SOURCE, path.name)
     return records
 
@@ -199,7 +199,7 @@ def _read_boxes(options: OkVqaOptions, split: str, reading: Reading) -> _Boxes |
     if options.instances is None:
         return None
     path = Path(options.instances) / f"instances_{split}.json"
-    value = read_json(path, SOURCE, "Pass the folder with COCO's instances files, or leave the option out.")
+    value = read_annotations(path, SOURCE, "Pass the folder with COCO's instances files, or leave the option out.")
     reading.files.append(path)
     names = {entry["id"]: entry["name"] for entry in field_of(value, "categories", list, SOURCE, path.name)}
     areas = {

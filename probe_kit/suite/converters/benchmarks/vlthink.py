@@ -13,7 +13,7 @@ from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
-from probe_kit.suite.converters.files import read_json, trimmed
+from probe_kit.suite.converters.files import read_annotations, trimmed
 from probe_kit.suite.converters.options import VlThinkOptions
 from probe_kit.suite.pictures import WHITE, decode_bytes
 from probe_kit.suite.wording import side_words
@@ -63,9 +63,7 @@ def read(root: Path, categories: Sequence[str], options: VlThinkOptions) -> Read
 
 def _read_set(folder: Path, name: str, category: str, options: VlThinkOptions, reading: Reading) -> None:
     path = folder / "model_db.json"
-    records = read_json(path, SOURCE, "Check out the repository with its assets.")
-    if not isinstance(records, dict):
-        raise SuiteError(f"{SOURCE}: {path} holds a {type(records).__name__}; expected an object by board key.")
+    records = read_annotations(path, SOURCE, "Check out the repository with its assets.")
     reading.files.append(path)
     for key in sorted(records):
         reading.pool[category] += 1

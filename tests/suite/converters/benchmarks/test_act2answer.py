@@ -121,14 +121,14 @@ def _forget(name: str) -> Callable[[Path], None]:
         (_change(2, right="fox"), "show the same picture"),
         (_forget("dog"), "names the tile 'dog', which .* does not describe"),
         (lambda folder: (folder / "shapes/dog/textured.glb").unlink(), "dog/textured.glb not found"),
-        (lambda folder: (folder / "pairs.json").unlink(), "pairs.json not found"),
+        (lambda folder: (folder / "pairs.json").unlink(), "pairs.json is missing"),
         (
             lambda folder: (folder / "pairs.json").write_text("[]", encoding="utf-8"),
-            "expected a list of questions",
+            "pairs.json holds no question",
         ),
         (
             lambda folder: (folder / "model_db.json").write_text("[]", encoding="utf-8"),
-            "expected an object by tile name",
+            "model_db.json holds a JSON list; expected an object",
         ),
     ],
 )

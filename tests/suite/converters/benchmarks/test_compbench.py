@@ -83,8 +83,8 @@ def test_a_missing_picture_is_named_with_its_record_what_was_tried_and_a_remedy(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "is not valid JSON"),
-        ("{}", "holds a dict; expected a list"),
+        ("{", "is not JSON"),
+        ("{}", "holds a JSON dict; expected a list"),
         ('[{"image_1": "a"}]', "record 0 of .*: field 'answer' is None"),
     ],
 )

@@ -70,7 +70,7 @@ def test_an_answer_beyond_the_choices_is_refused(iconqa_root: Path, tmp_path: Pa
 
 
 def test_a_folder_without_problems_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SuiteError, match=r"problems\.json not found. Name the folder"):
+    with pytest.raises(SuiteError, match=r"problems\.json is missing\. Name the folder"):
         convert("iconqa", tmp_path, tmp_path / "suite")
 
 
