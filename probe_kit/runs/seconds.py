@@ -60,7 +60,7 @@ def write_seconds(root: Root, number: int, seconds: Seconds) -> None:
         inference=round(seconds.inference, 6),
         simulation=round(seconds.simulation, 6),
     )
-    root.location.write(seconds_key(number), record.to_bytes(), durable=False)
+    root.location.write(seconds_key(number), record.to_bytes())
 
 
 def read_seconds(root: Root, commits: Mapping[int, Commit]) -> dict[int, Seconds]:

@@ -1,11 +1,11 @@
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import xarray as xr
-import zarr
 
 from probe_kit.errors import (
     NoProbesError,
@@ -69,10 +69,14 @@ def test_bfloat16_bits_decode_exactly() -> None:
     np.testing.assert_array_equal(decode_bfloat16(bits), values.float().numpy())
 
 
-def test_plain_zarr_and_plain_xarray_read_the_store(recorded_run: Run) -> None:
-    pooled = zarr.open(recorded_run.path / "data.zarr", mode="r")["expert/pooled"]
-    assert pooled.shape[1:] == (1, 10, recorded_run.streams["expert"].layers, 4, 64)
-    np.testing.assert_array_equal(pooled[:48, 0, 7, 3, 0], recorded_run.column(Site("expert", 3, iteration=7)))
+def test_the_page_reads_a_run_with_plain_zarr_and_json(recorded_run: Run) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "storage.md").read_text(encoding="utf-8")
+    code = next(block for block in page.split("```python\n") if "import zarr" in block).partition("```")[0]
+    assert "probe_kit" not in code
+    names: dict[str, Any] = {}
+    exec(code.replace('"RUN"', repr(str(recorded_run.path))), names)
+    column = [row[0, 3, 0] for row in names["rows"]]
+    np.testing.assert_array_equal(column, recorded_run.column(Site("backbone", 3)))
     dataset = xr.open_zarr(recorded_run.path / "data.zarr", group="backbone", consolidated=False, chunks=None)
     assert dataset["pooled"].dims == ("episode", "call", "layer", "view", "feature")
 
