@@ -2,7 +2,7 @@
 
     uv run python scripts/record_keys.py FAMILY FILE
 
-FAMILY: pi05, pi0-fast, molmoact2, groot or xvla. FILE: `real_keys.json.gz`. Sizes are those of the published
+FAMILY: pi05, pi0-fast, molmoact2, groot, xvla or eo1. FILE: `real_keys.json.gz`. Sizes are those of the published
 configurations; of probe_kit only these are used, none of its builders. `probe-kit verify FAMILY --keys FILE`
 compares the adapter's network with the list.
 """
@@ -79,8 +79,22 @@ def xvla() -> dict[str, torch.Tensor]:
     return XVLAPolicy(_on_meta(config)).state_dict()
 
 
+def eo1() -> dict[str, torch.Tensor]:
+    """As EO-1's authors have it: Qwen2.5-VL-3B."""
+    from lerobot.policies.eo1.configuration_eo1 import EO1Config
+    from lerobot.policies.eo1.modeling_eo1 import EO1Policy
+
+    from probe_kit.models.qwen import full_size_qwen2_5_vl
+
+    sizes = full_size_qwen2_5_vl("3B").config.to_dict()
+    config = EO1Config(device="cpu", dtype="float32", vlm_config=sizes, input_features=PICTURE)
+    config.pretrained_path = Path()
+    return EO1Policy(_on_meta(config)).state_dict()
+
+
 FAMILIES: dict[str, Callable[[], dict[str, torch.Tensor]]] = {
     "pi05": pi05, "pi0-fast": pi0_fast, "molmoact2": molmoact2, "groot": groot, "xvla": xvla,
+    "eo1": eo1,
 }  # fmt: skip
 
 

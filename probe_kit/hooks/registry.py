@@ -28,6 +28,7 @@ FOLDERS = (
     "molmoact2",
     "groot",
     "xvla",
+    "eo1",
     "smolvla",
     "openvla",
     "spatialvla",

@@ -14,7 +14,7 @@ REFERENCES = {
     **{
         name: GOLDEN / name.replace("-", "_")
         for name in (
-            *("pi0", "pi05", "pi0-fast", "smolvla", "molmoact2", "groot", "xvla", "openvla", "prismatic"),
+            *("pi0", "pi05", "pi0-fast", "smolvla", "molmoact2", "groot", "xvla", "eo1", "openvla", "prismatic"),
             *("magma", "spatialvla", "xiaomi-r0", "internvla-m1"),
         )
     },

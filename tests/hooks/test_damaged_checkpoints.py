@@ -33,6 +33,7 @@ FOLDERS = {
     "molmoact2": GOLDEN / "molmoact2" / "checkpoint",
     "groot": GOLDEN / "groot" / "checkpoint",
     "xvla": GOLDEN / "xvla" / "checkpoint",
+    "eo1": GOLDEN / "eo1" / "checkpoint",
     "smolvla": GOLDEN / "smolvla" / "checkpoint",
     "openvla": GOLDEN / "openvla" / "checkpoint",
     "magma": GOLDEN / "magma" / "checkpoint",
@@ -41,7 +42,7 @@ FOLDERS = {
     "internvla-m1": GOLDEN / "internvla_m1" / "checkpoint",
 }
 REFUSALS = (CheckpointError, WeightsError)
-COPIED = ("pi0-tiny", "pi0", "pi05", "pi0-fast", "molmoact2", "groot", "xvla", "smolvla")
+COPIED = ("pi0-tiny", "pi0", "pi05", "pi0-fast", "molmoact2", "groot", "xvla", "eo1", "smolvla")
 """Act as they lie there. To the others' golden references a tokenizer or units are missing: they are made here."""
 MADE = {
     "openvla": write_openvla,

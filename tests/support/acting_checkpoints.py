@@ -31,7 +31,7 @@ class Tiny:
         return None if self.write is None else str(self.write(folder))
 
 
-_WRITTEN = ("pi05", "pi0-fast", "molmoact2", "groot", "xvla", "openvla", "spatialvla", "magma", "xiaomi-r0",
+_WRITTEN = ("pi05", "pi0-fast", "molmoact2", "groot", "xvla", "eo1", "openvla", "spatialvla", "magma", "xiaomi-r0",
             "internvla-m1")  # fmt: skip
 FAMILIES = {
     "pi0-tiny": Tiny(),

@@ -173,6 +173,7 @@ LEROBOTS = {
         lambda folder: {"embodiment": "other", "vlm": str(folder / "vlm")}, dtype="float32",
     ),
     "xvla": Case("xvla", others=lambda _: {"domain": 1}),
+    "eo1": Case("eo1"),
     "smolvla": Case("smolvla"),
     "smolvla, golden": Case("smolvla", golden("smolvla"), instructions=_GOLDEN_WORDS, slow=True),
     "smolvla with marked pictures, masked cameras and a fixed prefix": Case(

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.support import (
+    eo1_checkpoints,
     groot_checkpoints,
     internvla_checkpoints,
     magma_checkpoints,
@@ -28,6 +29,7 @@ WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "molmoact2": (molmoact2_checkpoints.write_molmoact2, {}),
     "groot": (groot_checkpoints.write_groot, {}),
     "xvla": (xvla_checkpoints.write_xvla, {}),
+    "eo1": (eo1_checkpoints.write_eo1, {}),
     "smolvla": (smolvla_checkpoints.write_smolvla, {}),
     "openvla": (prismatic_checkpoints.write_checkpoint, _BYTES),
     "prismatic": (prismatic_checkpoints.write_checkpoint, _BYTES),

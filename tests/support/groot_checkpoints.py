@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ def write_nvidias(
     from probe_kit.models.initialisation import initialise
     from probe_kit.models.lerobot.groot import GrootConfig, build_groot, network_config
 
-    _write_vlm(folder / "vlm")
+    write_processor_files(folder / "vlm", write_qwen3_vl)
     _write_processor(folder, cameras, relative)
     config = GrootConfig(device="cpu", base_model_path=str(folder), input_features=_features(cameras)[0])
     policy = build_groot(config, network_config({**NETWORK, **network}, config, str(folder / "vlm")))
@@ -89,13 +89,14 @@ def _features(cameras: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     return inputs, {"action": PolicyFeature(FeatureType.ACTION, (len(MOST),))}
 
 
-def _write_vlm(folder: Path) -> None:
-    """Configuration, tokenizer and processor files, no weights."""
-    write_qwen3_vl(folder)
+def write_processor_files(folder: Path, write: Callable[[Path], Path]) -> None:
+    """Configuration, tokenizer and processor files of a Qwen vision-language model, no weights."""
+    write(folder)
     for weights in folder.glob("model*.safetensors*"):
         weights.unlink()
     card = json.loads((folder / "tokenizer_config.json").read_text(encoding="utf-8"))
     (folder / "tokenizer_config.json").write_text(json.dumps({**card, "chat_template": _CHAT}), encoding="utf-8")
+    (folder / "chat_template.jinja").write_text(_CHAT, encoding="utf-8")
     shutil.copy(folder / "preprocessor_config.json", folder / "video_preprocessor_config.json")
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from probe_kit.hooks.conformance.examples import examples_for
 from torch import Tensor, nn
 
 from probe_kit.errors import CaptureError, RolesMismatchError, UnknownSiteError, UsageError
@@ -29,6 +28,7 @@ from probe_kit.hooks import (
     capture_patterns,
     load_model,
 )
+from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.verification.outputs import outputs_of
 from tests.support.every_checkpoint import WRITERS

@@ -10,7 +10,6 @@ from typing import Any, cast
 
 import pytest
 import torch
-from probe_kit.hooks.conformance.examples import examples_for
 from torch import Tensor
 
 from probe_kit.errors import ProbeKitError
@@ -20,12 +19,12 @@ from probe_kit.hooks.conformance.acting import (
     another_seed_gives_another_chunk_where_noise_is_drawn,
 )
 from probe_kit.hooks.conformance.check import CheckFailedError
-from probe_kit.hooks.conformance.subject import ContractSettings, PolicySubject
+from probe_kit.hooks.conformance.subject import PolicySubject
 from probe_kit.hooks.registry import own_families
 from tests.support.every_checkpoint import WRITERS
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:the model put out tokens")]
-NOISY = {"pi0", "pi05", "smolvla", "molmoact2", "groot", "xvla", "xiaomi-r0", "internvla-m1"}
+NOISY = {"pi0", "pi05", "smolvla", "molmoact2", "groot", "xvla", "eo1", "xiaomi-r0", "internvla-m1"}
 ACTING = [name for name in WRITERS if own_families()[name].acts]
 DRAWN, CONSTANT = (
     actions_have_the_contracts_shape_and_come_from_the_seed_alone,
@@ -37,16 +36,8 @@ IGNORED: dict[str, tuple[Callable[[Tensor], Tensor], Any]] = {
 }
 
 
-class Given:
-    """What both checks ask for."""
-
-    def __init__(self, policy: Policy) -> None:
-        self.model = policy
-        self.observations = examples_for(policy, "put the cube on the red shape")
-
-
 def checked(policy: Policy) -> PolicySubject:
-    return PolicySubject(ContractSettings(), cast(Any, Given(policy)))
+    return PolicySubject(model=policy, instructions=("put the cube on the red shape",))
 
 
 @pytest.mark.parametrize("family", ACTING)

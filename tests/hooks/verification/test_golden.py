@@ -36,6 +36,7 @@ REFERENCES = {
     "molmoact2": ("molmoact2", 13),
     "groot": ("groot", 10),
     "xvla": ("xvla", 7),
+    "eo1": ("eo1", 13),
     "smolvla": ("smolvla", 17),
     "openvla": ("openvla", 23),
     "prismatic": ("prismatic", 6),

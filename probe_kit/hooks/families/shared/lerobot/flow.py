@@ -52,6 +52,7 @@ class DenoisingPolicy(LerobotPolicy):
 
     def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
         """The actions of `act`, bit for bit, with a graph of every step; see the contract."""
+        self.interventions.check("gradients", self.card.family)
         self.check_acting(seen, seeds)
         with frozen(self.network):
             return self.restored(self.denoise(self.batch(seen), self.noise(seeds)))

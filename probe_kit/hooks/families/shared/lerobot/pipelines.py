@@ -57,6 +57,10 @@ _FIELDS: Mapping[str, Mapping[str, tuple[Any, ...] | None]] = {
          "normalize_language", "add_setup_tokens", "add_control_tokens", "num_state_tokens",
          "max_sequence_length", "chunk_size", "max_action_dim", "env_action_dim"), _ANY,
     ),
+    "eo1_conversation_template_processor": dict.fromkeys(("input_features", "chunk_size"), _ANY),
+    "eo1_qwen_processor": dict.fromkeys(
+        ("processor_name", "image_min_pixels", "image_max_pixels", "use_fast_processor"), _ANY
+    ),
     "xvla_image_to_float": {"image_keys": _ANY, "validate_range": _ANY},
     "xvla_imagenet_normalize": {"image_keys": _ANY},
     "xvla_add_domain_id": {"domain_id": _ANY},

@@ -43,17 +43,18 @@ class Stack:
 
 @dataclass(frozen=True)
 class TokenStack(Stack):
-    """A decoder that puts out as many tokens as it likes, in one of its two roles.
+    """A decoder that runs over the prompt and then over what it puts out, in one of these two roles.
 
-    tokens: the positions of its first pass that belong to the stream. iterations: the captured tokens, or None for
-    the prompt.
+    tokens: the positions of its passes that belong to the stream. first: passes before those of the stream.
+    iterations: the captured passes, or None for the prompt.
     """
 
     tokens: slice = EVERY
+    first: int = 0
 
     def tap(self, site: Site) -> Tap:
-        """Calls behind those of the captured tokens belong to no site."""
-        return replace(super().tap(site), tokens=self.tokens, more=True)
+        """Calls behind those of the captured passes belong to no site."""
+        return replace(super().tap(site), tokens=self.tokens, first=self.first, more=True)
 
 
 def _projection(attention: Any) -> Any:

@@ -12,6 +12,7 @@ from probe_kit.errors import CheckpointError, ProbeKitError
 from probe_kit.hooks import Observation, load_policy
 from probe_kit.hooks.families.shared.lerobot.config_fields import known_values
 from tests.support import (
+    eo1_checkpoints,
     groot_checkpoints,
     molmoact2_checkpoints,
     pi0_checkpoints,
@@ -28,6 +29,7 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "molmoact2": molmoact2_checkpoints.write_molmoact2,
     "groot": groot_checkpoints.write_groot,
     "xvla": xvla_checkpoints.write_xvla,
+    "eo1": eo1_checkpoints.write_eo1,
     "smolvla": smolvla_checkpoints.write_smolvla,
 }
 NEWER: dict[str, dict[str, Any]] = {

@@ -16,6 +16,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
     check_steps,
     tokenizer_folder,
 )
+from tests.support.eo1_checkpoints import write_eo1
 from tests.support.lerobot_pipelines import without_hub
 from tests.support.molmoact2_checkpoints import write_molmoact2
 from tests.support.pi0_fast_checkpoints import write_pi0_fast
@@ -29,6 +30,7 @@ WRITERS = {
     "molmoact2": write_molmoact2,
     "smolvla": write_smolvla,
     "xvla": write_xvla,
+    "eo1": write_eo1,
 }
 
 

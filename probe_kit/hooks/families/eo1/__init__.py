@@ -1,0 +1,48 @@
+"""EO-1 through lerobot."""
+
+from probe_kit.hooks.contract.declared import backbone, expert
+from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.sites import QUANTITIES
+from probe_kit.hooks.families.shared.capabilities import MERGED
+from probe_kit.hooks.family import Family
+
+INTERVENTIONS = Interventions(
+    edits={"backbone": QUANTITIES, "expert": QUANTITIES},
+    unread=("backbone",),
+    prompt_kv=True,
+    instead={
+        "attention": "its decoder's fast kernel returns no weights. Patch `kv` instead",
+        "gradients": "lerobot's sampling writes every step's chunk into the same tensor. Patch exactly: `--kind "
+        "interchange`, or `--kind joint`",
+        "tiles": f"{MERGED}Exchange all of `image`",
+    },
+)
+"""One decoder reads the prompt, then the noisy actions at every step, which read its keys and values."""
+
+FAMILIES = (
+    Family(
+        "eo1",
+        "EO-1 (Qwen2.5-VL 3B whose decoder denoises actions) through lerobot",
+        None,
+        "probe_kit.hooks.families.eo1.adapter:Eo1.load",
+        streams="backbone 37 layers, expert 37 layers x 10 steps",
+        embodiment="as the checkpoint's data set",
+        notes=(
+            "A checkpoint in lerobot's layout, with the configuration of its Qwen2.5-VL in config.json; the "
+            "processor's files lie beside it or come from the repository that policy_preprocessor.json names"
+        ),
+        needs_checkpoint=True,
+        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
+        config_types=("eo1",),
+        words="probe_kit.hooks.families.eo1.adapter:Eo1.check_words",
+        full_size="probe_kit.models.lerobot.eo1:full_size_eo1",
+        parameters={"": 3_771_607_072},
+        declared={
+            "": (
+                backbone(37, 2048, 160, "state", camera="image"),
+                expert(37, 2048, 10, 8, ("action",)),
+            )
+        },
+        interventions=INTERVENTIONS,
+    ),
+)
