@@ -150,7 +150,6 @@ def test_the_folder_of_the_extraction_is_found_from_anywhere_as_long_as_it_holds
 
 REFUSED = {
     "another seed": ({"seed": 1}, None, "drawn with another seed"),
-    "another version": ({"version": 1}, None, r"only those of a2a-embedded@2\.0\.0"),
     "a suite of one's own": ({}, "mine", "extracted from mine@2"),
 }
 
