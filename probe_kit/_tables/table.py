@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.escaping import csv_of_rows
 from probe_kit._tables.content import Cell, Content, Heading, Row, grouped
+from probe_kit._tables.formats import render
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,17 +30,17 @@ class Table(Content):
 
         return html(self)
 
-    def to_markdown(self) -> str:
-        """Return the table in Markdown, its notes below it."""
-        from probe_kit._tables.markdown import markdown
+    def to_text(self, style: str) -> str:
+        """Return the table in a format of `probe_kit._tables.formats`, its notes below it."""
+        return render(style, [self])
 
-        return markdown(self)
+    def to_markdown(self) -> str:
+        """Return the table in Markdown."""
+        return self.to_text("markdown")
 
     def to_latex(self) -> str:
-        """Return a LaTeX `table` environment, see `probe_kit._tables.latex`."""
-        from probe_kit._tables.latex import latex
-
-        return latex(self)
+        """Return the table as a LaTeX `table` environment, behind the packages that it needs."""
+        return self.to_text("latex")
 
     def to_frame(self) -> "pd.DataFrame":
         """Return the text as a data frame."""

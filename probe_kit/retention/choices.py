@@ -9,4 +9,5 @@ Section = Literal["success", "rules", "answers", "probes", "retention", "control
 """Groups of tables that `retention --details` shows."""
 Family = Literal["label", "table"]
 """Tests of labels that are corrected together: a stream's sites, or those of every label of the table (Holm)."""
-TableFormat = Literal["table", "json", "csv", "markdown", "latex"]
+TableFormat = str
+"""`table`, `json`, `csv` or a format of `probe_kit._tables.formats`."""

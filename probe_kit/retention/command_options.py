@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
+from probe_kit._tables import formats
 from probe_kit._terminal.console import split, whole_number
-from probe_kit._terminal.options import Names, choices, some_of
+from probe_kit._terminal.options import Names, choices, one_of, some_of
 from probe_kit.errors import UsageError
 from probe_kit.retention.choices import AnswerScore, Family, Section, TableFormat
 from probe_kit.scene_names import RuleName
@@ -209,7 +210,11 @@ AsPaper = Annotated[
         "maxima with ε over all categories. No intervals, no controls.",
     ),
 ]
-Style = Annotated[TableFormat, typer.Option("--format", help="Format of the result.")]
+STYLES = ("table", "json", "csv", *formats.names())
+Style = Annotated[
+    TableFormat,
+    typer.Option("--format", parser=one_of(STYLES), metavar=choices(STYLES), help="Format of the result."),
+]
 Html = Annotated[
     Path | None,
     typer.Option("--html", metavar="FILE", help="Write a report that needs no network."),

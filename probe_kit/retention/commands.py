@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import err, marked, out, print_json_text, print_text, say, split
+from probe_kit._terminal.console import err, marked, out, print_text, say, split
 from probe_kit.errors import UsageError
 from probe_kit.retention import command_options as own
-from probe_kit.retention.label_commands import save_all, say_report
+from probe_kit.retention.label_commands import print_text_of, save_all, say_report
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
@@ -133,8 +133,7 @@ def _print(table: "RetentionTable | Table", style: "TableFormat", notes: Sequenc
     if style == "table":
         out.print(table)
     else:
-        show = print_json_text if style == "json" else print_text
-        show(getattr(table, f"to_{style}")())
+        print_text_of(table, style)
     for note in notes:
         say(marked("[yellow]note:[/] {}", note))
 
@@ -165,12 +164,12 @@ def _print_sections(table: "RetentionTable", style: "TableFormat", details: Sequ
     sections = "all" if "all" in details else cast("tuple[Section, ...]", details)
     if style == "table":
         out.print(table.to_rich(sections))
-    elif style == "latex":
-        print_text(table.to_latex(sections))
+    elif style in ("json", "csv", "markdown"):  # Markdown has every table
+        _print(table, style, table.notes)
+    else:
+        print_text(table.to_latex(sections) if style == "latex" else table.to_text(style, sections))
         for note in table.notes:
             say(marked("[yellow]note:[/] {}", note))
-    else:
-        _print(table, style, table.notes)
 
 
 def _show_steps(

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.counting import counted
 from probe_kit._terminal.console import err, out, print_json_text, print_text, say
@@ -36,8 +36,16 @@ def show_label_retention(
     if style == "table":
         out.print(table.to_rich())
     else:
-        show = print_json_text if style == "json" else print_text
-        show(getattr(table, f"to_{style}")())
+        print_text_of(table, style)
+
+
+def print_text_of(table: Any, style: str) -> None:
+    """Print a table as JSON, as CSV or in a format of text."""
+    if style == "json":
+        print_json_text(table.to_json())
+    else:
+        own = {"csv": table.to_csv, "markdown": table.to_markdown, "latex": table.to_latex}
+        print_text(own[style]() if style in own else table.to_text(style))
 
 
 def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = False) -> None:

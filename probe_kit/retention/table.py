@@ -4,7 +4,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
-from probe_kit._system.escaping import csv_of_frame, markdown_safe
+from probe_kit._system.escaping import csv_of_frame
+from probe_kit._tables.formats import render
 from probe_kit._tables.table import Table
 from probe_kit._terminal.plain_text import without_places
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
@@ -175,31 +176,28 @@ class RetentionTable:
         """
         return csv_of_frame(self.to_frame())
 
+    def to_text(self, style: str, details: Collection[Section] | Literal["all"] = ()) -> str:
+        """Return the summary, a sentence per category and the tables of some sections in a format of text.
+
+        details: as of `to_rich`.
+        """
+        sentences = [f"{one.name}  {one.finding}" for run in self.summary for one in run.categories]
+        return render(style, [self._summary_table(), *self._details(details)], sentences, self.notes)
+
     def to_markdown(self) -> str:
-        """Success rates, retention, controls and differences as Markdown tables."""
-        tables = [*self._tables().values(), *self.wording_tables, *self.further_tables]
+        """Success rates, retention, controls and differences as Markdown tables, with all columns."""
         rows = [one for run in self.summary for one in run.categories]
-        sentences = [f"* **{markdown_safe(one.name)}** {markdown_safe(one.finding)}" for one in rows]
-        long = [f"* {markdown_safe(one.details)}" for one in rows]
-        parts = [
-            self._summary_table().to_markdown(),
-            *sentences,
-            "",
-            *long,
-            "",
-            *(table.to_markdown() for table in tables),
-        ]
-        return "\n".join([*parts, *(f"> {markdown_safe(note)}\n" for note in self.notes)])
+        sentences = [*(f"{one.name}  {one.finding}" for one in rows), *(one.details for one in rows)]
+        tables = [self._summary_table(), *self._tables().values(), *self.wording_tables, *self.further_tables]
+        return render("markdown", tables, sentences, self.notes)
 
     def to_latex(self, details: Collection[Section] | Literal["all"] = ()) -> str:
         """Return the summary in LaTeX with booktabs rules, each table with a caption, a label and a line's width.
 
         details: sections whose tables stand below it, as of `to_rich`; all of them by "all".
         """
-        from probe_kit._tables.latex import latex_page
-
-        text = latex_page([self._summary_table(), *self._details(details)])
-        return "\n".join([text, *(f"% {note}" for note in (*self.unpaired, *self.notes))])
+        tables = [self._summary_table(), *self._details(details)]
+        return render("latex", tables, notes=(*self.unpaired, *self.notes))
 
     def _tables(self, sections: Collection[Section] | None = None) -> dict[str, Table]:
         return retention_tables(self.all_rows, self.differences, self.unpaired, sections)

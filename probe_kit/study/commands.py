@@ -2,13 +2,23 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from probe_kit._system.counting import counted
+from probe_kit._tables import formats
 from probe_kit._terminal.console import counter, err, marked, out, print_json, print_text, progress, say
-from probe_kit._terminal.options import AsJson, EnvWorkers, Partial, RayAddress, check_no_others, speed_option
+from probe_kit._terminal.options import (
+    AsJson,
+    EnvWorkers,
+    Partial,
+    RayAddress,
+    check_no_others,
+    choices,
+    one_of,
+    speed_option,
+)
 from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.study.planning.plan_lines import print_plan
 from probe_kit.train.command_options import Jobs
@@ -31,7 +41,6 @@ probe-kit study table embedded success
 app = typer.Typer(help=HELP, no_args_is_help=True)
 UNFINISHED = 1
 DATA_SET = "Data set"
-Style = Literal["table", "csv", "markdown", "latex", "json"]
 File = Annotated[
     str,
     typer.Argument(metavar="FILE", help="Study file, or the name of a study of the package: embedded or paper."),
@@ -39,6 +48,7 @@ File = Annotated[
 Only = Annotated[
     str | None, typer.Option("--only", metavar="NAME", help="Take the runs of this block or this model only.")
 ]
+STYLES = ("table", "json", "csv", *formats.names())
 
 
 @app.command("run")
@@ -204,7 +214,10 @@ def table(
     name: Annotated[
         str | None, typer.Argument(metavar="[NAME]", help="Table of the file; all of them by default.")
     ] = None,
-    style: Annotated[Style, typer.Option("--format", help="Output format.")] = "table",
+    style: Annotated[
+        str,
+        typer.Option("--format", parser=one_of(STYLES), metavar=choices(STYLES), help="Output format."),
+    ] = "table",
     html: Annotated[
         Path | None,
         typer.Option("--html", metavar="FILE", help="Write state, all tables and all figures as one HTML file."),
@@ -246,7 +259,7 @@ def table(
         for own in made.values():
             out.print(own)
     else:
-        texts = (own.to_latex() if style == "latex" else own.to_markdown() for own in made.values())
+        texts = (own.to_text(style) for own in made.values())
         print_text("\n\n".join(text.rstrip("\n") for text in texts))
     if not name and style not in ("json", "csv"):
         tests = sum(own.n_tests for own in made.values())

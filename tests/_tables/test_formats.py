@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 from rich.console import Console
 
-from probe_kit._tables.latex import _SPECIAL, MOST_COLUMNS, latex_page
+from probe_kit._tables.formats import names, render
+from probe_kit._tables.formats.latex import _SPECIAL, MOST_COLUMNS
 from probe_kit._tables.table import Cell, Heading, Row, Table, grouped
 
 HOSTILE = [
@@ -240,10 +241,10 @@ def test_every_table_of_a_page_has_a_label_of_its_own_and_colours_are_asked_for_
         Table.of("Rates", ("a", "b"), [("x", "1")]),
         Table.of("Rates", ("a", "b"), [("x", Cell("1", heat=0.5))]),
     )
-    assert re.findall(r"\\label\{(.*)\}", latex_page([bare, bare])) == ["tab:rates", "tab:rates-2"]
-    assert "xcolor" not in latex_page([bare])
-    assert r"\usepackage[table]{xcolor}" in latex_page([coloured])
-    assert r"\definecolor{pkheat3}" in latex_page([coloured])
+    assert re.findall(r"\\label\{(.*)\}", render("latex", [bare, bare])) == ["tab:rates", "tab:rates-2"]
+    assert "xcolor" not in render("latex", [bare])
+    assert r"\usepackage[table]{xcolor}" in render("latex", [coloured])
+    assert r"\definecolor{pkheat3}" in render("latex", [coloured])
 
 
 def test_columns_without_content_and_those_that_need_room_are_left_out() -> None:
@@ -259,3 +260,7 @@ def test_equal_headings_are_told_apart_by_the_name_over_them_where_a_page_has_on
         "t", grouped(("", ["n"]), ("left", ["rate"]), ("right", ["rate", "p"])), [("x", "1", "2", "3")]
     )
     assert table.full_headings == ("n", "left rate", "right rate", "p")
+
+
+def test_formats_are_the_files_of_their_folder() -> None:
+    assert names() == ("latex", "markdown")

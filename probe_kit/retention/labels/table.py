@@ -7,7 +7,8 @@ from math import nan
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.counting import counted
-from probe_kit._system.escaping import csv_of_frame, markdown_safe
+from probe_kit._system.escaping import csv_of_frame
+from probe_kit._tables.formats import render
 from probe_kit._tables.numbers import number, with_limits
 from probe_kit._tables.table import Heading, Table, grouped
 from probe_kit._terminal.plain_text import without_places
@@ -172,14 +173,17 @@ class LabelRetentionTable:
         """`to_frame` as comma-separated values with a header."""
         return csv_of_frame(self.to_frame())
 
+    def to_text(self, style: str) -> str:
+        """The table and its sentences in a format of `probe_kit._tables.formats`."""
+        return render(style, [self.text], self.sentences)
+
     def to_markdown(self) -> str:
         """The table and its sentences in Markdown."""
-        said = "\n".join(f"* {markdown_safe(sentence)}" for sentence in self.sentences)
-        return f"{self.text.to_markdown()}\n{said}"
+        return self.to_text("markdown")
 
     def to_latex(self) -> str:
         """The table in LaTeX; needs the package booktabs."""
-        return "\n".join([self.text.to_latex(), *(f"% {sentence}" for sentence in self.sentences)])
+        return self.to_text("latex")
 
     def to_rich(self) -> "Group":
         """The table for a rich console, and a sentence per row."""

@@ -1,12 +1,19 @@
 """Tables in Markdown."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from probe_kit._system.escaping import markdown_safe
 from probe_kit._tables.content import Cell, Content
 
 
-def markdown(table: Content) -> str:
+def render(tables: Sequence[Content], sentences: Sequence[str] = (), notes: Sequence[str] = ()) -> str:
+    """Return the first table, the sentences as a list, the other tables, and the notes as quotations."""
+    first, *others = map(_table, tables)
+    items = [*(f"* {markdown_safe(sentence)}" for sentence in sentences), *[""] * bool(sentences)]
+    return "\n".join([first, *items, *others, *(f"> {markdown_safe(note)}\n" for note in notes)])
+
+
+def _table(table: Content) -> str:
     """Return a bold title, the table, and its notes as quotations."""
     lines = [
         f"**{markdown_safe(table.title)}**",

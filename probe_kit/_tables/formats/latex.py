@@ -39,7 +39,7 @@ _FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
 """Before a tabular: one that is wider than its line becomes as wide as it."""
 
 
-def preamble(tables: Sequence[Content]) -> str:
+def _preamble(tables: Sequence[Content]) -> str:
     """Return the packages that the tables need as a comment, and their colours."""
     coloured = any(_css(cell) for table in tables for row in table.rows for cell in row.cells)
     needs = r"% needs: \usepackage{booktabs} \usepackage{graphicx}" + r" \usepackage[table]{xcolor}" * coloured
@@ -47,20 +47,21 @@ def preamble(tables: Sequence[Content]) -> str:
     return "\n".join([needs, *colours])
 
 
-def latex_page(tables: Sequence[Content]) -> str:
-    """Return several tables behind their preamble, each with a label of its own."""
+def render(tables: Sequence[Content], sentences: Sequence[str] = (), notes: Sequence[str] = ()) -> str:
+    """Return the tables behind their preamble, each with a label of its own; sentences and notes as comments."""
     texts: list[str] = []
     labels: dict[str, int] = {}
     for table in tables:
-        text = latex(table)
+        text = _environment(table)
         label = _label(table)
         labels[label] = labels.get(label, 0) + 1
         again = f"{label}-{labels[label]}" if labels[label] > 1 else label
         texts.append(text.replace(rf"\label{{{label}}}", rf"\label{{{again}}}"))
-    return "\n".join([preamble(tables), *texts])
+    comments = [f"% {' '.join(line.split())}" for line in (*sentences, *notes)]
+    return "\n".join([_preamble(tables), *texts, *comments])
 
 
-def latex(table: Content) -> str:
+def _environment(table: Content) -> str:
     """Return a `table` environment with a caption and a label; it needs the packages booktabs and graphicx."""
     pieces = [piece for part in _parts(table) for piece in (r"\par\medskip", *_tabular(part))][1:]
     caption = " ".join([f"{table.title}.", *table.sentences])

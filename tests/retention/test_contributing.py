@@ -1,0 +1,105 @@
+"""The diffs and calls of CONTRIBUTING do what they say: each is applied to a copy of the package and used."""
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+
+from probe_kit.train import ArrayRun
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+USE = """
+from pathlib import Path
+import pandas as pd
+from probe_kit.retention import retention_table
+from probe_kit.train import ArrayRun
+
+episodes = pd.read_json({episodes!r})
+table = retention_table([ArrayRun(Path("run"), "pi0", "suite@1#0123456789ab", episodes, {{}})])
+"""
+
+
+def block(heading: str, language: str) -> str:
+    """The first block of a section in a language."""
+    found = re.search(rf"```{language}\n(.*?)```", PAGE.partition(f"## {heading}")[2], re.DOTALL)
+    assert found, heading
+    return found[1]
+
+
+def apply(diff: str, package: Path) -> None:
+    """Apply hunks that name no lines: each begins at the only place where its own lines stand."""
+    for part in re.split(r"^--- .*\n", diff, flags=re.MULTILINE)[1:]:
+        name, _, hunks = part.partition("\n")
+        file = package / name.removeprefix("+++ b/")
+        text = file.read_text(encoding="utf-8") if file.exists() else ""
+        for hunk in filter(str.strip, re.split(r"^@@.*\n", hunks, flags=re.MULTILINE)):
+            lines = hunk.splitlines()
+            old = "".join(f"{line[1:]}\n" for line in lines if line[0] in " -")
+            new = "".join(f"{line[1:]}\n" for line in lines if line[0] in " +")
+            assert text.count(old) == 1 or not old, (file, old)
+            text = text.replace(old, new) if old else new
+        file.write_text(text, encoding="utf-8")
+
+
+@pytest.fixture
+def use(tmp_path: Path, outcome_table: Callable[..., pd.DataFrame]) -> Callable[[str, str], str]:
+    """Runs Python with a table of a run, in a copy of the package to which a section's diff was applied."""
+    ignored = shutil.ignore_patterns("__pycache__", "*.safetensors")
+    shutil.copytree(ROOT / "probe_kit", tmp_path / "probe_kit", ignore=ignored)
+    data = tmp_path / "episodes.json"
+    outcome_table(6, 4, 2).assign(distance_correct=0.125).to_json(data)
+
+    def run(heading: str, code: str) -> str:
+        apply(block(heading, "diff"), tmp_path)
+        script = USE.format(episodes=str(data)) + code
+        done = subprocess.run(
+            [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, encoding="utf-8", check=False
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
+
+
+def test_a_column_is_two_files_and_stands_in_every_format(use: Callable[[str, str], str]) -> None:
+    diff = block("To add a column to the tables", "diff")
+    assert diff.count("\n+++ ") == 2
+    code = "print(table.to_markdown(), table.to_latex('all'), table.to_json(), table.to_frame().columns.tolist())"
+    printed = use("To add a column to the tables", code)
+    assert printed.count("distance m") == 2
+    assert "| 0.12 |" in printed
+    assert '"median_distance": 0.125' in printed
+    assert "success.median_distance" in printed
+
+
+def test_a_format_is_one_file(use: Callable[[str, str], str]) -> None:
+    assert block("To add a format of tables", "diff").count("+++ ") == 1
+    code = """
+from probe_kit._tables import formats
+print(formats.names(), table.to_text("dokuwiki", "all"))
+from probe_kit.retention.command_options import Style
+"""
+    printed = use("To add a format of tables", code)
+    assert "('dokuwiki', 'latex', 'markdown')" in printed
+    assert "^ %%category%% ^ %%success %%% ^" in printed
+    assert "| %%Color%% |" in printed
+
+
+def test_a_comparison_is_one_call(tmp_path: Path, outcome_table: Callable[..., pd.DataFrame]) -> None:
+    runs: dict[str, Any] = {
+        name: ArrayRun(tmp_path / name, name, "suite@1#0123456789ab", outcome_table(right, 24 - right, 0), {})
+        for name, right in (("before", 12), ("after", 18))
+    }
+    code = block("To add a comparison", "python")
+    assert code.count("compare(") == 1
+    exec(code, runs)
+    color, mean = runs["found"]
+    assert (color.group, color.minus, color.sr, mean.category) == ("after", "before", 0.25, "mean")
+    assert 0 < color.p == color.p_holm <= 1
