@@ -16,7 +16,7 @@ from probe_kit.version import __version__ as __version__
 if TYPE_CHECKING:
     from probe_kit.env import Act2AnswerEnv, SceneSpec
     from probe_kit.errors import ProbeKitError
-    from probe_kit.extract import EnvSource, ExtractSettings, LeRobotSource, extract_run
+    from probe_kit.extract import EnvSource, ExtractSettings, LeRobotSource, PictureFolder, extract_run
     from probe_kit.hooks import Site, capture, load_policy
     from probe_kit.intervene import (
         AttentionReadout,
@@ -63,6 +63,7 @@ __all__ = [
     "LayerCurveDisplay",
     "LeRobotSource",
     "ModelDepthDisplay",
+    "PictureFolder",
     "ProbeKitError",
     "ReplaySource",
     "Run",
@@ -109,6 +110,7 @@ __getattr__, __dir__ = lazy_names(
         "KnowledgeActionDisplay": "retention.displays",
         "LayerCurveDisplay": "retention.displays",
         "LeRobotSource": "extract",
+        "PictureFolder": "extract",
         "ModelDepthDisplay": "retention.displays",
         "ProbeKitError": "errors",
         "Run": "runs",

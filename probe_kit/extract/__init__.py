@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from probe_kit.extract.sources.environment import EnvSource
     from probe_kit.extract.sources.environment_check import check_environment
     from probe_kit.extract.sources.environment_contract import EnvEpisode, OwnEnvironment, Step
+    from probe_kit.extract.sources.pictures import PictureFolder
     from probe_kit.extract.sources.recording import LeRobotSource
     from probe_kit.extract.vqa.templates import TEMPLATES
 
@@ -22,6 +23,7 @@ __all__ = [
     "Extraction",
     "LeRobotSource",
     "OwnEnvironment",
+    "PictureFolder",
     "Step",
     "ask_run",
     "check_environment",
@@ -43,6 +45,7 @@ __getattr__, __dir__ = lazy_names(
         "Step": "sources.environment_contract",
         "check_environment": "sources.environment_check",
         "LeRobotSource": "sources.recording",
+        "PictureFolder": "sources.pictures",
         "ask_run": "extraction",
         "extract_run": "extraction",
         "prepare": "extraction",

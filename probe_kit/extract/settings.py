@@ -21,6 +21,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.parts import ActMachine, ActTask, AskCapture, AskMachine, AskTask, Capture, ModelSettings
 from probe_kit.extract.protocols import has_network, protocol_identity, protocol_row, scene_of
 from probe_kit.extract.sources.environment import EnvSource
+from probe_kit.extract.sources.pictures import PictureFolder
 from probe_kit.extract.sources.recording import LeRobotSource
 from probe_kit.extract.sources.scene import SceneOptions, SceneSettings
 from probe_kit.extract.sources.source import SourceSettings
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
     from probe_kit.suite.wording import Wording
 
-SOURCES: tuple[type[SourceSettings], ...] = (SceneSettings, LeRobotSource, EnvSource)
+SOURCES: tuple[type[SourceSettings], ...] = (SceneSettings, LeRobotSource, EnvSource, PictureFolder)
 """The kinds of sources, that of no option first."""
 _PARTS = ("model", "capture", "task", "machine")
 
@@ -150,8 +151,8 @@ class Settings(Part):
         if kind is SceneSettings:
             values |= fields
         else:
-            if "captured_calls" in values and kind is LeRobotSource:
-                _refuse(["captured_calls"], kind)
+            if refused := [name for name in values if name in kind.decides]:
+                _refuse(refused, kind)
             known = dict(before.source) if before is not None and isinstance(before.source, kind) else {}
             values["source"] = kind(**{**known, **fields})
         return cls(values.pop("family", None), **values) if before is None else before.changed(**values)

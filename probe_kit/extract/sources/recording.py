@@ -170,6 +170,7 @@ class LeRobotSource(SourceSettings):
     opens: ClassVar[str] = "probe_kit.extract.sources.recording_source:RecordingSource"
     subject: ClassVar[str] = "recordings"
     loads: ClassVar[str] = "recordings"
+    decides: ClassVar[tuple[str, ...]] = ("captured_calls",)
     refuses: ClassVar[tuple[str, ...]] = (
         "protocol", "rotation", "video", "batch=auto", "execute", "later_views", "edits",
     )  # fmt: skip

@@ -28,7 +28,8 @@ class SourceSettings(Part):
     kind: the name of the source in files. opens: MODULE:CLASS of the `Source`, which is imported when it is
     opened. command: the option that a command names it with; empty for the scene. shows: the reason why options of
     other sources do not apply. subject, loads: what its options are about, and what is loaded of it, in words.
-    refuses: fields of other parts that do not apply, some with the only value that does not.
+    decides: fields of other parts that are the source's
+    own. refuses: fields of other parts that do not apply, some with the only value that does not.
     """
 
     kind: str
@@ -38,6 +39,7 @@ class SourceSettings(Part):
     opens: ClassVar[str] = ""
     subject: ClassVar[str] = ""
     loads: ClassVar[str] = ""
+    decides: ClassVar[tuple[str, ...]] = ()
     refuses: ClassVar[tuple[str, ...]] = ()
 
     @property

@@ -1,0 +1,309 @@
+"""A folder of pictures with a table of instructions as a source: one inference about each line of the table."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from hashlib import blake2b
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from pydantic import BeforeValidator
+
+from probe_kit._system.bounded_files import read_regular, read_regular_text
+from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
+from probe_kit.errors import RecordingError, UsageError
+from probe_kit.extract.plan import Row
+from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
+from probe_kit.extract.sources.recording import Pixels
+from probe_kit.extract.sources.source import Played, Source, SourceSettings
+from probe_kit.extract.sources.units import check_predictions
+from probe_kit.hashing import derive_seed, sha256_text
+from probe_kit.hooks.checkpoints.containment import copied
+from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
+from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES
+from probe_kit.suite.pictures import decode_bytes
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+PICTURE, INSTRUCTION, ID, GROUP = "picture", "instruction", "id", "group"
+"""Columns of the table; the first two are required, and all others hold numbers that become labels."""
+_DIGITS = 16
+_option = partial(typer.Option, rich_help_panel="Pictures")
+
+
+class PictureFolder(SourceSettings):
+    """Pictures in place of a scene: the model predicts once about each, and nothing moves.
+
+    folder: of the pictures. table: a CSV file with the columns `picture` (a file in the folder) and `instruction`;
+    `id` and `group` name a line and what folds keep together; every other column holds numbers. pixels: whether
+    pictures at 32 × 32 are stored for controls.
+    """
+
+    kind: Literal["pictures"] = "pictures"
+    folder: Annotated[
+        str,
+        BeforeValidator(str),
+        _option(
+            "--pictures", metavar="FOLDER", help="Show pictures of a folder in place of a suite; with --table."
+        ),
+    ]
+    table: Annotated[
+        str,
+        BeforeValidator(str),
+        _option(
+            "--table", metavar="FILE", help="CSV of the pictures: columns picture and instruction, and labels."
+        ),
+    ]
+    pixels: Pixels = True
+
+    command: ClassVar[str] = "--pictures FOLDER --table FILE"
+    shows: ClassVar[str] = "--pictures, of which each is shown once and no action is executed"
+    opens: ClassVar[str] = "probe_kit.extract.sources.pictures:PictureSource"
+    subject: ClassVar[str] = "pictures"
+    loads: ClassVar[str] = "pictures"
+    decides: ClassVar[tuple[str, ...]] = ("captured_calls",)
+    refuses: ClassVar[tuple[str, ...]] = (
+        "protocol", "rotation", "video", "batch=auto", "execute", "later_views", "edits",
+    )  # fmt: skip
+
+    def __init__(self, folder: str | Path, table: str | Path | None = None, **choices: Any) -> None:
+        if table is None:
+            raise UsageError("--pictures needs --table FILE, a CSV file with the columns picture and instruction")
+        super().__init__(**{"folder": folder, "table": table, **choices})
+
+    @property
+    def name(self) -> str:
+        """The name of the folder; where it lies is no part of a run."""
+        return Path(self.folder).expanduser().resolve().name
+
+    def marks(self) -> list[str]:
+        """The part of a run's label that names the source."""
+        return [f"on {self.name}"]
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of the table: file, text and numbers. content: hash of the picture's bytes."""
+
+    picture: Path
+    content: str
+    numbers: tuple[float, ...]
+
+
+class PictureSource(Source[PictureFolder]):
+    """The lines of a table, whose pictures were all read once. prediction: (chunk, D) of the checked policy."""
+
+    executes = False
+    groups = "groups of pictures"
+
+    def __init__(
+        self, settings: PictureFolder, names: Sequence[str], lines: Sequence[tuple[dict[str, str], Line]]
+    ) -> None:
+        self.settings, self.columns, self.lines = settings, tuple(names), list(lines)
+        self.cameras: list[str] = []
+        self.prediction: tuple[int, int] = (0, 0)
+        first = self.lines[0][1]
+        self._shape = read_picture(first).shape
+
+    @classmethod
+    def open(cls, settings: PictureFolder, selects_only: bool) -> Self:
+        """Read the table and all its pictures. Raises RecordingError for a line that cannot be shown."""
+        del selects_only
+        table, folder = Path(settings.table).expanduser(), Path(settings.folder).expanduser()
+        try:
+            texts = list(csv.DictReader(io.StringIO(read_regular_text(table)), strict=True))
+        except (OSError, UnicodeDecodeError, csv.Error) as error:
+            raise UsageError(f"--table {table} cannot be read: {error}. Give a CSV file of UTF-8 text") from error
+        if not texts or not {PICTURE, INSTRUCTION} <= set(texts[0]):
+            seen = ", ".join(map(str, texts[0])) if texts else "no line"
+            raise UsageError(f"--table {table} has {seen}; expected the columns {PICTURE} and {INSTRUCTION}")
+        names = [name for name in texts[0] if name not in (PICTURE, INSTRUCTION, ID, GROUP)]
+        lines = [
+            (text, _line(text, names, folder, f"{table.name}, line {n}")) for n, text in enumerate(texts, start=2)
+        ]
+        ids = [_id(text, number) for number, (text, _) in enumerate(lines)]
+        if twice := [name for name in ids if ids.count(name) > 1]:
+            raise RecordingError(f"{table.name} has the id {twice[0]!r} twice; give each line its own")
+        return cls(settings, names, lines)
+
+    @classmethod
+    def decided(cls, settings: PictureFolder) -> Mapping[str, Any]:
+        """Return that the only inference of a picture is captured and nothing acts."""
+        del settings
+        return {"captured_calls": 1, "capture_only": True, "frames": "none"}
+
+    @property
+    def name(self) -> str:
+        """The name of the folder."""
+        return self.settings.name
+
+    @cached_property
+    def instructions(self) -> tuple[str, ...]:
+        """Every instruction once, in the order of their letters."""
+        return tuple(sorted({text[INSTRUCTION] for text, _ in self.lines}))
+
+    def rows(self, seed: int) -> tuple[Row, ...]:
+        """A row per line, with the columns of a recorded episode of one frame."""
+        rows = []
+        for number, (text, line) in enumerate(self.lines):
+            name = _id(text, number)
+            columns = {
+                "episode_id": name,
+                "item_id": name,
+                "category": "all",
+                "group_id": text.get(GROUP) or name,
+                "instruction": text[INSTRUCTION],
+                "source_episode": number,
+                "first_frame": 0,
+                "frame_step": 1,
+                "frames": 1,
+                "recorded_frames": 1,
+                "policy_seed": derive_seed(seed, "policy", name),
+                "content_blake2b": line.content,
+            }
+            rows.append(Row(number, columns, line, (0,)))
+        return tuple(rows)
+
+    def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
+        """Show the policy its first camera, and let it predict once about nothing.
+
+        Raises RecordingError for a policy that reads a state of another width than zeros can stand for.
+        """
+        del accept_units
+        if policy.state_numbers not in (None, ARM_NUMBERS):
+            raise RecordingError(
+                f"{self.name} has pictures and no state; {policy.card.checkpoint} reads {policy.state_numbers} "
+                "numbers. Take recordings with a state (--dataset), or a model that reads none"
+            )
+        self.cameras = list(policy.card.cameras[:1])
+        policy = policy.with_cameras(self.cameras)
+        with while_acting(policy.card.family, policy.card.checkpoint):
+            chunks = policy.predict(copied([self.example(self.instructions[0])]), [0])
+            check_predictions(chunks, 1)
+        self.prediction = chunks.shape[1], chunks.shape[2]
+        return self, policy
+
+    def example(self, instruction: str) -> Observation:
+        """A blank picture of the first one's shape."""
+        return Observation(np.zeros(self._shape, np.uint8), np.zeros(ARM_NUMBERS, np.float32), instruction)
+
+    def play(self, played: Played) -> Opens:
+        """Open a player of the pictures."""
+        del played
+        return partial(PicturePlayer, self.settings.pixels)
+
+    def identity(self, execute: int) -> dict[str, Any]:
+        """The table by its content; rows hold the hashes of pictures."""
+        del execute
+        shapes = {"columns": [len(self.columns)], "prediction": list(self.prediction)}
+        shapes |= {"pixels": [1, SIDE, SIDE, 3]} if self.settings.pixels else {}
+        table = read_regular_text(Path(self.settings.table).expanduser())
+        data_set = {
+            "kind": "pictures",
+            "meta_blake2b": sha256_text(table)[: 2 * _DIGITS],
+            "fps": 1.0,
+            "frames": "every:1",
+            "cameras": [[camera, PICTURE, "image"] for camera in self.cameras],
+            "rotations": [],
+            "instruction": None,
+            "inputs": shapes,
+            "columns": list(self.columns),
+            "names": {},
+        }
+        return {DATASET: data_set}
+
+    def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
+        """All lines of the table."""
+        chosen = {"name": self.name, "episodes": list(range(len(rows))), RECORDED_EPISODES: len(rows)}
+        return {"recording": {**chosen, OTHER_ACTIONS: "pictures have no actions"}}
+
+    def targets(self) -> tuple[str, ...]:
+        """The numbers of the table."""
+        return tuple(f"dataset.{name}" for name in self.columns)
+
+    def describe(self, rows: Sequence[Row]) -> dict[str, str]:
+        """Folder, columns and pictures."""
+        return {
+            "pictures": f"{len(rows)} of {terminal_safe(self.name)}",
+            "camera": terminal_safe(", ".join(self.cameras)) or "the first of the model",
+            "numbers": terminal_safe(", ".join(self.columns)) or "none",
+        }
+
+
+class PicturePlayer(InputsPlayer):
+    """Shows a picture, and keeps what is predicted about it. pixels: whether a small copy is stored."""
+
+    def __init__(self, pixels: bool) -> None:
+        self._pixels = pixels
+
+    def begin(self, row: Row, film: bool) -> Answer:
+        """Show the picture of a line. Raises RecordingError if it is another one than when the run was planned."""
+        del film
+        self.row = row
+        self._clear()
+        picture = read_picture(row.content)
+        self._keep("columns", row.content.numbers)
+        self._keep_pictures([picture], self._pixels)
+        return Observation(picture, np.zeros(ARM_NUMBERS, np.float32), row.instruction)
+
+    def advance(self, actions: NDArray[np.float32]) -> Answer:
+        """Keep the chunk that was predicted, and end."""
+        self._keep("prediction", actions)
+        return self._ending({"outcome": CAPTURE_ONLY})
+
+
+def read_picture(line: Line) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8. Raises RecordingError for a file that changed after it was hashed, or is no picture."""
+    content, where = _read(line.picture), line.picture.name
+    if _digest(content) != line.content:
+        raise RecordingError(f"{where} was changed after the run was planned; leave the pictures as they are")
+    return np.asarray(decode_bytes(content, f"{where}:", RecordingError, "Write it again as PNG.")).copy()
+
+
+def _line(text: Mapping[str, Any], names: Sequence[str], folder: Path, where: str) -> Line:
+    """A line of the table. Raises RecordingError naming what is wrong with it."""
+    for name in (PICTURE, INSTRUCTION):
+        if not (text[name] or "").strip() or UNSAFE.search(text[name]):
+            raise RecordingError(f"{where} has the {name} {text[name]!r}; expected plain text")
+    path = Path(text[PICTURE])
+    if path.is_absolute() or ".." in path.parts:
+        raise RecordingError(f"{where} names {path}; expected a file in the folder of --pictures")
+    try:
+        numbers = tuple(float(text[name]) for name in names)
+    except (TypeError, ValueError):
+        wrong = next(name for name in names if not _is_number(text[name]))
+        raise RecordingError(f"{where} has {text[wrong]!r} as {wrong}; expected a number") from None
+    return Line(folder / path, _digest(_read(folder / path)), numbers)
+
+
+def _is_number(text: Any) -> bool:
+    try:
+        float(text)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _id(text: Mapping[str, str], number: int) -> str:
+    return text.get(ID) or f"picture-{number:06d}"
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return read_regular(path)
+    except OSError as error:
+        raise RecordingError(
+            f"{path.name} cannot be read: {error.strerror}. Correct the table or --pictures"
+        ) from error
+
+
+def _digest(content: bytes) -> str:
+    return blake2b(content, digest_size=_DIGITS).hexdigest()

@@ -1,0 +1,124 @@
+"""A folder of pictures with a table: one inference about each line, its numbers as labels."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import probe_kit as pk
+from probe_kit.errors import ProbeKitError, RecordingError, UsageError
+from probe_kit.extract import ExtractSettings, PictureFolder, extract_run, prepare
+from probe_kit.extract.rollout.worker import torch_threads
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks import Observation, Policy
+from probe_kit.runs import verify_run
+
+COUNT = 12
+TEXTS = ("Put the cube on the red shape", "Put the cube on the gray shape")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twelve pictures; `red` says on which side the red square is."""
+    home = tmp_path_factory.mktemp("pictures")
+    lines: list[dict[str, Any]] = []
+    for number in range(COUNT):
+        picture = np.random.default_rng(number).integers(150, 256, (48, 64, 3), dtype=np.uint8)
+        picture[10:30, slice(4, 24) if number % 2 else slice(40, 60)] = (200, 20, 20)
+        Image.fromarray(picture).save(home / f"{number}.png")
+        text = TEXTS[number // 2 % 2]
+        lines.append({"picture": f"{number}.png", "instruction": text, "red": number % 2, "group": f"g{number}"})
+    with (home / "table.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(lines[0]))
+        writer.writeheader()
+        writer.writerows(lines)
+    return home
+
+
+def source(folder: Path) -> PictureFolder:
+    return PictureFolder(folder, folder / "table.csv")
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path, pi0_tiny: Policy, tmp_path_factory: pytest.TempPathFactory) -> pk.Run:
+    settings = ExtractSettings("pi0-tiny", source=source(folder), env_workers=0)
+    return prepare(settings, policy=pi0_tiny).run(tmp_path_factory.mktemp("shown") / "run")
+
+
+def test_every_line_is_a_row_with_the_models_own_prediction_bit_for_bit(
+    run: pk.Run, folder: Path, pi0_tiny: Policy
+) -> None:
+    assert verify_run(run.path, deep=True).ok
+    assert run.episodes["instruction"].tolist() == [TEXTS[number // 2 % 2] for number in range(COUNT)]
+    assert run.episodes["group_id"].tolist() == [f"g{number}" for number in range(COUNT)]
+    assert run.inputs is not None
+    assert run.inputs.read("columns")[:, 0, 0].tolist() == [number % 2 for number in range(COUNT)]
+    policy = pi0_tiny.with_cameras(pi0_tiny.card.cameras[:1])
+    picture = np.asarray(Image.open(folder / "3.png"))
+    seed = derive_seed(int(run.episodes["policy_seed"][3]), "inference", 0)
+    with torch_threads(1):  # as a small network has in a run
+        expected = policy.predict([Observation(picture, np.zeros(8, np.float32), TEXTS[1])], [seed])[0]
+    np.testing.assert_array_equal(run.inputs.read("prediction")[3, 0], expected)
+    assert np.isfinite(run.column(pk.Site("backbone", 3), "mean")).all()
+
+
+def test_another_picture_is_another_row(folder: Path, tmp_path: Path) -> None:
+    Image.new("RGB", (64, 48)).save(tmp_path / "0.png")
+    (tmp_path / "table.csv").write_text(f"picture,instruction\n0.png,{TEXTS[0]}\n", encoding="utf-8")
+    rows = [source(home).open().rows(0)[0].columns["content_blake2b"] for home in (folder, tmp_path)]
+    assert rows[0] != rows[1]
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("picture\n0.png\n", "expected the columns picture and instruction"),
+        ("", "no line"),
+        ("picture,instruction\nnone.png,go\n", "none.png cannot be read"),
+        ("picture,instruction\n../0.png,go\n", "expected a file in the folder"),
+        ("picture,instruction\n0.png,\n", "line 2 has the instruction ''"),
+        ("picture,instruction,red\n0.png,go,left\n", "has 'left' as red; expected a number"),
+        ("picture,instruction,id\n0.png,go,a\n0.png,go,a\n", "the id 'a' twice"),
+        ("picture,instruction\ntable.csv,go\n", "table.csv"),
+    ],
+)
+def test_a_line_that_cannot_be_shown_is_named(folder: Path, tmp_path: Path, table: str, message: str) -> None:
+    (tmp_path / "0.png").write_bytes((folder / "0.png").read_bytes())
+    (tmp_path / "table.csv").write_text(table, encoding="utf-8")
+    with pytest.raises(ProbeKitError, match=message) as refused:
+        source(tmp_path).open()
+    assert isinstance(refused.value, RecordingError | UsageError)
+
+
+def test_a_picture_that_changes_after_the_plan_is_not_shown(
+    folder: Path, pi0_tiny: Policy, tmp_path: Path
+) -> None:
+    for file in folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    planned = prepare(ExtractSettings("pi0-tiny", source=source(tmp_path), env_workers=0), policy=pi0_tiny)
+    for number in range(COUNT):
+        Image.new("RGB", (64, 48)).save(tmp_path / f"{number}.png")
+    with pytest.raises(ProbeKitError) as failed:
+        planned.run(tmp_path / "run")
+    assert "was changed after the run was planned" in failed.value.__notes__[0]
+
+
+def test_what_pictures_do_not_have_is_refused_by_its_option(folder: Path) -> None:
+    refused: list[dict[str, Any]] = [{"execute": 2}, {"video": "all"}, {"batch": "auto"}]
+    for values in refused:
+        with pytest.raises(UsageError, match="does not apply with --pictures"):
+            prepare(ExtractSettings("pi0-tiny", source=source(folder), **values))
+    with pytest.raises(UsageError, match="--items does not apply with --pictures"):
+        ExtractSettings.of_command({"model": "x", "pictures": "a", "table": "b", "items": 2})
+    with pytest.raises(UsageError, match="--table"):
+        ExtractSettings.of_command({"model": "x", "pictures": "a"})
+
+
+@pytest.mark.slow
+def test_workers_show_the_same_pictures(run: pk.Run, folder: Path, tmp_path: Path) -> None:
+    again = extract_run(ExtractSettings("pi0-tiny", source=source(folder), workers=2), tmp_path / "run")
+    site = pk.Site("expert", 3, iteration=9)
+    np.testing.assert_array_equal(again.column(site, "mean"), run.column(site, "mean"))
