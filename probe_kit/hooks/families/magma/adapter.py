@@ -23,7 +23,7 @@ from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Policy, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.magma.answer import Answer
@@ -37,6 +37,7 @@ from probe_kit.hooks.families.magma.text import ChatText, TokenPrompt
 from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import MAPS
+from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
 from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, kv_tap
 from probe_kit.hooks.families.shared.sampling import CHECKPOINT, TOP, chooser, top_of
 from probe_kit.models.magma import (
@@ -341,21 +342,8 @@ class Magma(Policy, AnswerModel):
             if site.layer == len(blocks):
                 return Tap(blocks[-1], 1, "output", view=_as_tokens)
             return Tap(blocks[site.layer], 1, view=_as_tokens)
-        return self._language_tap(site, _PROMPT if site.stream == "backbone" else _LAST)
-
-    def _language_tap(self, site: Site, tokens: slice) -> Tap:
-        if site.quantity == "final_norm":
-            return Tap(self.decoder.norm, self.steps, "output", tokens)
-        if site.layer == len(self.decoder.layers):
-            return Tap(self.decoder.norm, self.steps, tokens=tokens)
-        block = self.decoder.layers[site.layer]
-        if site.quantity == "mlp":
-            return Tap(block.mlp, self.steps, "output", tokens)
-        if site.quantity == "attention":
-            return Tap(block.self_attn.o_proj, self.steps, "output", tokens)
-        if site.quantity == HEADS:
-            return Tap(block.self_attn.o_proj, self.steps, tokens=tokens)
-        return Tap(block.input_layernorm, self.steps, tokens=tokens)
+        tokens = _PROMPT if site.stream == "backbone" else _LAST
+        return decoder_tap(self.decoder.layers, self.decoder.norm, site, self.steps, tokens)
 
     @property
     def _stages(self) -> dict[str, Any]:

@@ -24,12 +24,13 @@ from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Model, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
 from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
+from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
 from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kv_tap
 from probe_kit.hooks.families.shared.sampling import Choose, greedy
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill
@@ -184,7 +185,8 @@ class PrismaticModel(Model):
             return kv_tap(self.network.prompt_kv, site, ALL_BUT_LAST)
         if stream.part == "vision":
             return Tap(self._towers[site.stream].blocks[site.layer].norm1, 1)
-        return self._language_tap(site)
+        tokens = _PROMPT if site.stream == "backbone" else _LAST
+        return decoder_tap(self.decoder.layers, self._final_norm, site, self.steps, tokens)
 
     @property
     def unembedding(self) -> Unembedding:
@@ -195,20 +197,6 @@ class PrismaticModel(Model):
     def _final_norm(self) -> nn.Module:
         norm: nn.Module = getattr(self.decoder, "norm", None) or self.decoder.final_layernorm
         return norm
-
-    def _language_tap(self, site: Site) -> Tap:
-        tokens, norm = _PROMPT if site.stream == "backbone" else _LAST, self._final_norm
-        if site.quantity == "final_norm":
-            return Tap(norm, self.steps, "output", tokens)
-        if site.layer == len(self.decoder.layers):
-            return Tap(norm, self.steps, tokens=tokens)
-        block = self.decoder.layers[site.layer]
-        if site.quantity == "mlp":
-            return Tap(block.mlp, self.steps, "output", tokens)
-        if site.quantity in ("attention", HEADS):
-            projection = getattr(block.self_attn, "o_proj", None) or block.self_attn.dense
-            return Tap(projection, self.steps, "output" if site.quantity == "attention" else "input", tokens)
-        return Tap(block.input_layernorm, self.steps, tokens=tokens)
 
     @property
     def _towers(self) -> dict[str, Any]:

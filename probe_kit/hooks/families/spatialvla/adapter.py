@@ -32,6 +32,7 @@ from probe_kit.hooks.families.openvla.actions import ActionStatistics
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import TOKENS
+from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
 from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, kv_tap
 from probe_kit.hooks.families.spatialvla.checkpoint import (
     PROCESSOR_FILE,
@@ -61,6 +62,7 @@ SCENE = "scene"
 ENSEMBLE = 0.8
 """With this exponent the client for SimplerEnv averages the plans of overlapping chunks."""
 _GRIPPER_OPEN = 0.5
+_ADDED = {"attention": "post_attention_layernorm", "mlp": "post_feedforward_layernorm"}
 _PROMPT, _LAST = slice(None, -1), slice(-1, None)
 
 
@@ -293,19 +295,7 @@ class SpatialVLA(Policy):
         if stream.part == "vision":
             return _vision_tap(self.tower, site)
         tokens = _PROMPT if stream.part == "backbone" else _LAST
-        if site.quantity == "final_norm":
-            return Tap(self.decoder.norm, self.steps, "output", tokens)
-        if site.layer == len(self.decoder.layers):
-            return Tap(self.decoder.norm, self.steps, tokens=tokens)
-        block = self.decoder.layers[site.layer]
-        if site.quantity == "residual":
-            return Tap(block.input_layernorm, self.steps, tokens=tokens)
-        if site.quantity == HEADS:
-            return Tap(block.self_attn.o_proj, self.steps, tokens=tokens)
-        added = (
-            block.post_attention_layernorm if site.quantity == "attention" else block.post_feedforward_layernorm
-        )
-        return Tap(added, self.steps, "output", tokens)
+        return decoder_tap(self.decoder.layers, self.decoder.norm, site, self.steps, tokens, added=_ADDED)
 
 
 def _say_unknown() -> None:

@@ -7,7 +7,8 @@ from typing import Any
 from torch import nn
 
 from probe_kit.hooks.contract.model import EVERY, Tap
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.families.shared.decoder_tap import decoder_tap, output_projection
 
 
 @dataclass(frozen=True)
@@ -22,22 +23,12 @@ class Stack:
 
     def tap(self, site: Site) -> Tap:
         """Where a site of this stack is read."""
-        fires = self.iterations or 1
-        if site.quantity == "final_norm":
-            return Tap(self.norm, fires, "output")
-        if site.layer == len(self.layers):
-            return Tap(self.norm, fires)
-        block: Any = self.layers[site.layer]
-        if site.quantity == "mlp":
-            return Tap(block.mlp, fires, "output")
-        if site.quantity in ("attention", HEADS):
-            return Tap(_projection(block.self_attn), fires, "output" if site.quantity == "attention" else "input")
-        return Tap(getattr(block, self.entry), fires)
+        return decoder_tap(self.layers, self.norm, site, self.iterations or 1, entry=self.entry)
 
     def stream(self, name: str) -> Stream:
         """What is stored of it: the input of every block, and of the final norm."""
         attention: Any = self.layers[0].self_attn
-        heads = int(_projection(attention).in_features) // int(attention.head_dim)
+        heads = int(output_projection(attention).in_features) // int(attention.head_dim)
         return Stream(name, len(self.layers) + 1, self.width, self.iterations, heads=heads)
 
 
@@ -55,12 +46,6 @@ class TokenStack(Stack):
     def tap(self, site: Site) -> Tap:
         """Calls behind those of the captured passes belong to no site."""
         return replace(super().tap(site), tokens=self.tokens, first=self.first, more=True)
-
-
-def _projection(attention: Any) -> Any:
-    """The output projection of an attention of a language model or a vision tower."""
-    names = ("o_proj", "out_proj", "attn_out")
-    return next(getattr(attention, name) for name in names if hasattr(attention, name))
 
 
 def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int) -> dict[str, Stack]:

@@ -13,8 +13,9 @@ from probe_kit.errors import InstructionError
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.qwen.text import QwenTokenizer
 from probe_kit.hooks.families.shared.qwen.tower import by_picture, tower_tap
@@ -150,16 +151,7 @@ class QwenVLA(Policy):
 
     def backbone_tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the final norm, or a block's output."""
-        if site.quantity == "final_norm":
-            return Tap(self.language.norm, 1, "output")
-        if site.layer == len(self.language.layers):
-            return Tap(self.language.norm, 1)
-        block = self.language.layers[site.layer]
-        if site.quantity == "mlp":
-            return Tap(block.mlp, 1, "output")
-        if site.quantity in ("attention", HEADS):
-            return Tap(block.self_attn.o_proj, 1, "output" if site.quantity == "attention" else "input")
-        return Tap(block.input_layernorm, 1)
+        return decoder_tap(self.language.layers, self.language.norm, site)
 
     def vision_tap(self, site: Site) -> Tap:
         """The first norm of the block, or what reads the last one; patches in the tower's own order."""

@@ -8,12 +8,12 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
@@ -21,9 +21,10 @@ from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill
 from probe_kit.hooks.families.shared.vlm.loading import Loaded, Recipe, load_vlm
 from probe_kit.hooks.families.shared.vlm.text import Frame, FramedText, TokenPrompt
@@ -256,18 +257,7 @@ class VisionLanguageModel(AnswerModel):
         if self.stream_of(site).part == "vision":
             return self.vision_tap(site.layer)
         tokens = self._backbone_tokens if site.stream == "backbone" else _LAST
-        norm: nn.Module = self.language.norm
-        if site.quantity == "final_norm":
-            return Tap(norm, 1, "output", tokens)
-        if site.layer == len(self.language.layers):
-            return Tap(norm, 1, tokens=tokens)
-        block = self.language.layers[site.layer]
-        if site.quantity == "mlp":
-            return Tap(block.mlp, 1, "output", tokens)
-        if site.quantity in ("attention", HEADS):
-            end: Literal["input", "output"] = "output" if site.quantity == "attention" else "input"
-            return Tap(block.self_attn.o_proj, 1, end, tokens)
-        return Tap(block.input_layernorm, 1, tokens=tokens)
+        return decoder_tap(self.language.layers, self.language.norm, site, tokens=tokens)
 
     # -- verification ------------------------------------------------------------------------------------
 
