@@ -19,7 +19,6 @@ from probe_kit.suite.converters.benchmarks import act2answer, compbench, iconqa,
 from probe_kit.suite.converters.benchmarks.act2answer import SOURCE as ACT2ANSWER
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
 from probe_kit.suite.converters.curation import apply_curation, read_curation, write_curation
-from probe_kit.suite.converters.emission import emit, sample
 from probe_kit.suite.converters.filters import picture_problem, text_problem
 from probe_kit.suite.converters.llm import propose_wording
 from probe_kit.suite.converters.options import (
@@ -31,7 +30,7 @@ from probe_kit.suite.converters.options import (
     VlThinkOptions,
     options_from,
 )
-from probe_kit.suite.converters.pairing import Bundle, Proposal, pair_candidates
+from probe_kit.suite.converters.pairing import Bundle, Proposal, emit, pair_candidates, sample
 from probe_kit.suite.converters.rewriting import rewrite
 from probe_kit.suite.grouping import with_groups
 from probe_kit.suite.items import Item
