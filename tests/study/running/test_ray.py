@@ -40,7 +40,10 @@ def test_two_nodes_of_which_one_is_lost_give_the_numbers_of_this_process(
 
     with two_nodes() as nodes, ThreadPoolExecutor(1) as thread:
         kept = thread.submit(lose, nodes)
-        with pytest.warns(WorkerLostWarning, match=r"of the Ray cluster is lost: .*; the model it held"):
+        # The lost worker may still wait for its first model, while the one on the other node plays.
+        with pytest.warns(
+            WorkerLostWarning, match=r"of the Ray cluster.* is lost: .*; (the model it held|it held no)"
+        ):
             assert conduct_study(plan_study(load_study(there)), ray=nodes.address) == []
     assert 0 < kept.result() < 4 * 24
     assert bytes_of(there) == bytes_of(here)
