@@ -26,7 +26,8 @@ from probe_kit.hooks.contract.protocol import ROTATIONS, ProtocolName
 from probe_kit.hooks.family import Dtype
 from probe_kit.intervene.kinds import kind_names
 from probe_kit.retention.behaviour.vlm_answers import SCORES
-from probe_kit.retention.choices import AnswerScore, Family, Section, TableFormat
+from probe_kit.retention.choices import AnswerScore, Family, Section
+from probe_kit.retention.command_options import STYLES
 from probe_kit.runs.export.export import FORMATS
 from probe_kit.runs.layout import (
     AskTokens,
@@ -75,7 +76,7 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("intervene", "--format"): get_args(get_args(Format)[0]),
     ("run export", "--dtype"): get_args(SaeDtype),
     ("run export", "--format"): FORMATS,
-    ("retention", "--format"): get_args(TableFormat),
+    ("retention", "--format"): STYLES,
     ("retention", "--details"): (*get_args(Section), "all"),
     ("retention", "--family"): get_args(Family),
     ("retention", "--rule"): RULES,
