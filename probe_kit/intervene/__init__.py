@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from probe_kit.intervene.direction_files import write_directions
     from probe_kit.intervene.kinds.attention import (
         AttentionReadout,
         AttentionRow,
@@ -67,6 +68,7 @@ __all__ = [
     "stored_interventions",
     "stored_joint_places",
     "stored_site_effects",
+    "write_directions",
 ]
 
 # `probe-kit --help` and tables that only read must load neither torch nor a simulator.
@@ -109,5 +111,6 @@ __getattr__, __dir__ = lazy_names(
         "load_effects": "results.results",
         "stored_image_swaps": "kinds.image_swap",
         "stored_interventions": "outcomes",
+        "write_directions": "direction_files",
     },
 )

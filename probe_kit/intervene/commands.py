@@ -235,7 +235,7 @@ def intervene(
     print_result(result, style, details)
     if style == "table":
         following = "retention {}[/]  use beside probes and success"
-        following = following if result.outcomes.has_sides else "view {}[/]  what the run shows"
+        following = following if result.outcomes.has_sides else "run show {}[/]  what the run stores"
         say(marked(f"next: [bold]probe-kit {following}", run))
     say(marked("stored as {}", result.key))
 
