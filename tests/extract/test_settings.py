@@ -13,12 +13,12 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.env.spec import PRESETS
 from probe_kit.errors import UsageError
-from probe_kit.extract import AskSettings, EnvSource, ExtractSettings, LeRobotSource
+from probe_kit.extract import AskSettings, EnvSource, ExtractSettings, LeRobotSource, extract_run, prepare
 from probe_kit.extract.config_files import read_config
 from probe_kit.extract.preparation import open_checked
 from probe_kit.extract.settings import SOURCES, run_label
 from probe_kit.hooks import Edit, Site
-from probe_kit.suite import load_suite
+from probe_kit.suite import Suite, load_suite
 
 ZERO = Edit("zero", (Site("backbone", 1),))
 EVERY = {
@@ -228,3 +228,15 @@ def test_a_policy_on_a_gpu_chooses_its_batch_unless_one_is_chosen() -> None:
     assert ExtractSettings("pi0", device="cuda:1", batch=1).machine.batch == 1
     assert ExtractSettings("pi0", device="cuda", env_workers=4).machine.batch == 1
     assert ExtractSettings("pi0").machine.batch == ExtractSettings("expert", device="cuda").machine.batch == 1
+
+
+def test_the_settings_of_a_run_repeat_it_wherever_it_lies(small_suite: Suite, tmp_path: Path) -> None:
+    asked = ExtractSettings(
+        "expert", suite=small_suite.folder, categories=("color",), items=2, max_steps=2, env_workers=0
+    )
+    run = extract_run(asked, tmp_path / "run")
+    for where in (tmp_path / "run", tmp_path / "run" / "run.json"):
+        again = ExtractSettings.of_command({"env_workers": 0}, read_config(where))
+        assert again == asked
+    assert str(tmp_path) not in json.dumps(run.settings)
+    assert prepare(again).identity() == prepare(asked).identity()
