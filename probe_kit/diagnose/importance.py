@@ -1,0 +1,170 @@
+"""How much of the action an input decides: total-effect indices, their intervals and the verdict. Loads no model.
+
+The index of an input is the share of the action's variance that is due to it, alone and together with others:
+S = Σ (a(x) − a(x with another value of the input))² / 2 V, by Jansen's estimator (M. Jansen, Computer Physics
+Communications 117, 1999; Saltelli et al., Computer Physics Communications 181, 2010). V is the variance of the
+actions over frames and seeds. Both inferences of a pair have one seed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.hashing import derive_seed
+from probe_kit.statistics.sign_flips import max_t
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.student import unbounded_student_interval
+
+Matter = Literal["decides", "moves", "no effect", "open", "does not arrive", "not varied", "not an input"]
+MATTERS: tuple[Matter, ...] = ("decides", "moves")
+DECIDES = 0.5
+"""Of what all inputs change together: from here on an input decides."""
+INPUTS_DECIDE = 0.25
+"""Of the variance of the actions: where all inputs together change less, the seed decides and no input does."""
+TRACE = 0.01
+"""Of the variance: a tenth of the actions' spread. An effect below it does not matter."""
+LEAST_SPREAD = 1e-3
+"""Of the largest spread of a number of the action: numbers with less are constant but for rounding."""
+
+
+@dataclass(frozen=True)
+class ActionScale:
+    """The spread of every number of the action, over frames, seeds and the steps of a chunk.
+
+    spread: (D,) in the action's own units. varies: (D,) the numbers that are compared.
+    """
+
+    spread: NDArray[np.float64]
+    varies: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, actions: NDArray[np.float32]) -> "ActionScale":
+        """The scale of clean actions (frames, chunk, D). A number's mean over frames may differ by step."""
+        spread = np.sqrt(actions.astype(np.float64).var(axis=0).mean(axis=0))
+        return cls(spread, spread > LEAST_SPREAD * spread.max(initial=0.0))
+
+    def changes(self, first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(pairs, chunk · varying) differences of actions (pairs, chunk, D), in units of their spread."""
+        difference = first.astype(np.float64) - second
+        return (difference[..., self.varies] / self.spread[self.varies]).reshape(len(difference), -1)
+
+    def shares(self, first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(pairs,) half the mean squared change: the mean over pairs is the total-effect index."""
+        if not self.varies.any():
+            return np.zeros(len(first))
+        shares: NDArray[np.float64] = (self.changes(first, second) ** 2).mean(axis=1) / 2
+        return shares
+
+
+@dataclass(frozen=True)
+class Exchanges:
+    """What exchanges of one input changed, pair by pair.
+
+    exchanged, control, every: (P,) shares of the variance, see `ActionScale.shares`: with the donor's input, with
+    the control of the input, and with all inputs of the donor. groups: (P,). largest: (P,) the largest change of
+    any number of the action under the donor's input. blanked: (F,) the same of every frame under the blank.
+    """
+
+    exchanged: NDArray[np.float64]
+    control: NDArray[np.float64]
+    every: NDArray[np.float64]
+    groups: NDArray[np.str_]
+    first: NDArray[np.bool_]
+    largest: NDArray[np.float64]
+    blanked: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Importance:
+    """Whether an input arrives and how much of the action it decides.
+
+    share: the total-effect index, 1 where nothing else matters, with its 95 % interval by groups (Student).
+    control: the index of a change that should not matter. every: of all inputs together. p: exact, one-sided, by
+    sign flips of whole groups: the input changes more than its control. unchanged: inferences, of `n_inferences`
+    with another value or a blank, in which no number of the action changed. reason: of the verdict.
+    """
+
+    name: str
+    verdict: Matter
+    reason: str
+    share: float = np.nan
+    share_ci: tuple[float, float] = (np.nan, np.nan)
+    control: float = np.nan
+    every: float = np.nan
+    p: float = np.nan
+    n_pairs: int = 0
+    n_groups: int = 0
+    n_inferences: int = 0
+    unchanged: int = 0
+
+    @property
+    def arrives(self) -> bool:
+        """Whether any other value of the input, or a blank, changed any action."""
+        return self.unchanged < self.n_inferences
+
+    @property
+    def matters(self) -> bool | None:
+        """Whether it decides or moves the action; None where that was not tested."""
+        return None if self.verdict in ("not varied", "not an input") else self.verdict in MATTERS
+
+
+def importance_of(name: str, exchanges: Exchanges) -> Importance:
+    """The verdict on one input that was exchanged."""
+    groups = exchanges.groups
+    above = exchanges.exchanged - exchanges.control
+    # One donor per frame, as there is one control: only then are both exchangeable, and the test exact.
+    first = exchanges.first
+    seed = derive_seed(name, "sign flips", *np.unique(groups).tolist())
+    _, p_values, _ = max_t(above[None, first], _pairs_of(groups[first]), groups[first], seed)
+    p = float(p_values[0])
+    share_ci = unbounded_student_interval(exchanges.exchanged, groups)
+    measured = {
+        "share": float(exchanges.exchanged.mean()),
+        "share_ci": (max(0.0, share_ci[0]), share_ci[1]),
+        "control": float(exchanges.control.mean()),
+        "every": float(exchanges.every.mean()),
+        "p": p,
+        "n_pairs": groups.size,
+        "n_groups": np.unique(groups).size,
+        "n_inferences": exchanges.largest.size + exchanges.blanked.size,
+        "unchanged": int((exchanges.largest == 0).sum() + (exchanges.blanked == 0).sum()),
+    }
+    verdict, reason = _verdict(exchanges, above, p)
+    return Importance(name, verdict, reason, **measured)
+
+
+def _pairs_of(groups: NDArray[np.str_]) -> NDArray[np.str_]:
+    """A name for every pair: each is a unit of its own before groups are formed."""
+    return np.array([f"{group} {index}" for index, group in enumerate(groups)])
+
+
+def _verdict(exchanges: Exchanges, above: NDArray[np.float64], p: float) -> tuple[Matter, str]:
+    groups, inferences = exchanges.groups, exchanges.largest.size + exchanges.blanked.size
+    if not exchanges.largest.any() and not exchanges.blanked.any():
+        return "does not arrive", f"no number of any action changed in {inferences} inferences"
+    if unbounded_student_interval(above, groups)[1] < TRACE:
+        return "no effect", "it changes the action no more than a change that should not matter"
+    if p >= SIGNIFICANCE:
+        return "open", f"p {p:.2g} that it changes more than its control; more frames decide"
+    over_half, _ = unbounded_student_interval(exchanges.exchanged - DECIDES * exchanges.every, groups)
+    inputs, _ = unbounded_student_interval(exchanges.every, groups)
+    if over_half >= 0 and inputs >= INPUTS_DECIDE:
+        return "decides", "it changes at least half of what all inputs change together"
+    if float(exchanges.every.mean()) < INPUTS_DECIDE:
+        return "moves", "the seed decides the action, and all inputs together hardly do"
+    return "moves", "it changes less than half of what all inputs change together, or that was not shown"
+
+
+def untested(name: str, verdict: Matter, reason: str) -> Importance:
+    """An input that was not exchanged, and why."""
+    return Importance(name, verdict, reason)
+
+
+def exit_code(inputs: Sequence[Importance], required: Sequence[str] = ()) -> int:
+    """0 if every required input arrives and matters, else 1. required: names; empty for all that were tested."""
+    tested = [one for one in inputs if one.matters is not None]
+    judged = [one for one in inputs if one.name in required] if required else tested
+    return 0 if judged and all(one.matters for one in judged) else 1

@@ -1,0 +1,126 @@
+"""The inferences of a diagnosis: clean, with every input exchanged, blanked and hardly changed."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.diagnose.donors import draw_donors
+from probe_kit.diagnose.importance import ActionScale, Exchanges, Importance, importance_of, untested
+from probe_kit.diagnose.inputs import (
+    STATE,
+    Frame,
+    blank,
+    differing,
+    hardly_changed,
+    inputs_of,
+    read_input,
+    spread_of_states,
+    write_input,
+)
+from probe_kit.errors import UsageError
+from probe_kit.hashing import derive_seed
+
+if TYPE_CHECKING:
+    from probe_kit.hooks.contract.observation import Observation
+
+Actions = NDArray[np.float32]
+Infer = Callable[[Sequence["Observation"], Sequence[int]], Actions]
+"""From observations and seeds to actions (B, chunk, D), in any unit; deterministic for a seed."""
+SEEDS_PER_FRAME = 2
+"""Clean inferences of a frame, each with a seed of its own: the variance of the actions is over both."""
+
+
+def measure_inputs(
+    infer: Infer, frames: Sequence[Frame], names: Sequence[str] = (), seed: int = 0, reads_state: bool = True
+) -> tuple[Importance, ...]:
+    """How much of the action every input decides.
+
+    names: of the inputs; empty for all. seed: of the draw of donors. reads_state: whether the model is given a
+    state at all. Raises UsageError for an unknown name, fewer than two groups, or a policy that gives other
+    actions for the same observation and seed.
+    """
+    known = inputs_of(frames)
+    if unknown := [name for name in names if name not in known]:
+        raise UsageError(f"no input is called {unknown[0]!r}; this source has {', '.join(known)}")
+    clean = _clean(infer, frames)
+    other = infer([frame.observation for frame in frames], [derive_seed(frame.seed, "other") for frame in frames])
+    scale = ActionScale.of(np.concatenate([clean, other]))
+    if not scale.varies.any():
+        raise UsageError(f"all {2 * len(frames)} actions are equal, whatever is seen; give frames that differ")
+    return tuple(
+        untested(name, "not an input", "the model reads no state")
+        if name == STATE and not reads_state
+        else _measure(infer, frames, name, clean, scale, seed)
+        for name in names or known
+    )
+
+
+def _clean(infer: Infer, frames: Sequence[Frame]) -> Actions:
+    """Actions of all frames. Raises UsageError unless the first are the same again."""
+    observations, seeds = [frame.observation for frame in frames], [frame.seed for frame in frames]
+    actions, again = infer(observations, seeds), infer(observations, seeds)
+    if not np.array_equal(actions, again):
+        raise UsageError(
+            f"the same observations and seeds gave actions that differ by {np.abs(actions - again).max():.3g}; "
+            "expected none. Changes of inputs cannot be told from chance in this policy"
+        )
+    return actions
+
+
+def _measure(
+    infer: Infer, frames: Sequence[Frame], name: str, clean: Actions, scale: ActionScale, seed: int
+) -> Importance:
+    if not differing(frames, name):
+        return untested(name, "not varied", f"all {len(frames)} frames hold one value")
+    pairs = draw_donors(frames, name, np.random.default_rng(derive_seed(seed, "donors", name)))
+    if not pairs:
+        return untested(name, "not varied", "no two groups of frames hold different values")
+    rows = np.array([index for index, _ in pairs])
+    seeds = [frames[index].seed for index in rows]
+    donors = [frames[donor].observation for _, donor in pairs]
+    varied = [
+        write_input(frames[index].observation, name, read_input(donor, name))
+        for index, donor in zip(rows, donors, strict=True)
+    ]
+    spread, empty, frame_seeds = spread_of_states(frames), blank(frames, name), [frame.seed for frame in frames]
+    exchanged = infer(varied, seeds)
+    every = infer(donors, seeds)
+    control = infer([hardly_changed(frame, spread, name) for frame in frames], frame_seeds)
+    blanked = infer([write_input(frame.observation, name, empty) for frame in frames], frame_seeds)
+    return importance_of(
+        name,
+        Exchanges(
+            exchanged=scale.shares(exchanged, clean[rows]),
+            control=scale.shares(control, clean)[rows],
+            every=scale.shares(every, clean[rows]),
+            groups=np.array([frames[index].group for index in rows]),
+            first=np.concatenate([[True], np.diff(rows) != 0]),
+            largest=np.abs(exchanged - clean[rows]).reshape(len(rows), -1).max(axis=1),
+            blanked=np.abs(blanked - clean).reshape(len(frames), -1).max(axis=1),
+        ),
+    )
+
+
+def in_batches(infer: Infer, size: int) -> Infer:
+    """The same function, asked for `size` observations at once; a shorter rest is filled up with its last one.
+
+    Filled up, because another size of a batch may round other sums, which would look like an effect.
+    """
+
+    def batched(observations: Sequence["Observation"], seeds: Sequence[int]) -> Actions:
+        chunks = []
+        for start in range(0, len(observations), size):
+            given = list(zip(observations[start : start + size], seeds[start : start + size], strict=True))
+            full = given + [given[-1]] * (size - len(given))
+            chunks.append(infer([one for one, _ in full], [one for _, one in full])[: len(given)])
+        return np.concatenate(chunks)
+
+    return batched
+
+
+def reseeded(frames: Sequence[Frame], seed: int) -> list[Frame]:
+    """The same frames with other seeds of their inferences."""
+    return [replace(frame, seed=derive_seed(seed, frame.name)) for frame in frames]

@@ -1,0 +1,177 @@
+"""How much an input decides, against policies whose shares of the variance are known by construction."""
+
+from collections.abc import Sequence
+from hashlib import sha256
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from probe_kit.diagnose.importance import exit_code
+from probe_kit.diagnose.inputs import PICTURE, STATE, Frame
+from probe_kit.diagnose.measure import in_batches, measure_inputs
+from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.observation import Observation
+
+WORDS = ["lift the cube", "open the drawer", "push the plate", "turn the knob"]
+Actions = NDArray[np.float32]
+
+
+def frames(count: int = 48, groups: int = 24, seed: int = 0) -> list[Frame]:
+    """Frames whose words, colour and state are drawn independently of each other."""
+    rng = np.random.default_rng(seed)
+    return [
+        Frame(
+            name=f"frame {index}",
+            observation=Observation(
+                (rng.integers(40, 216) + rng.integers(-4, 5, (8, 8, 3))).astype(np.uint8),
+                rng.standard_normal(8).astype(np.float32),
+                str(rng.choice(WORDS)),
+            ),
+            group=f"group {index % groups}",
+            seed=int(rng.integers(2**31)),
+        )
+        for index in range(count)
+    ]
+
+
+def numbers_of(observation: Observation) -> NDArray[np.float64]:
+    """Words, colour and state of an observation, each about as spread as a standard normal."""
+    words = observation.instruction.lower().rstrip(".")
+    word = WORDS.index(words) if words in WORDS else 9.0
+    return np.array([(word - 1.5) / 1.12, (observation.image.mean() - 128) / 50, observation.state[0]])
+
+
+def linear_policy(weights: Sequence[float], noise: float = 0.0, wandering: float = 0.0):  # type: ignore[no-untyped-def]
+    """Two numbers that are a weighted sum of words, colour and state, and of noise of the seed.
+
+    wandering: a part that changes at every change of any input, however small, as an untrained network's.
+    """
+
+    def infer(observations: Sequence[Observation], seeds: Sequence[int]) -> Actions:
+        chunks = np.zeros((len(seeds), 3, 2), np.float32)
+        for row, (observation, seed) in enumerate(zip(observations, seeds, strict=True)):
+            value = numbers_of(observation) @ np.asarray(weights)
+            value += noise * np.random.default_rng(seed).standard_normal()
+            content = observation.image.tobytes() + observation.state.tobytes() + observation.instruction.encode()
+            drawn = np.random.default_rng(list(sha256(content).digest())).standard_normal()
+            chunks[row] = value + wandering * drawn
+        return chunks
+
+    return infer
+
+
+def verdicts(infer, **settings: object) -> dict[str, str]:  # type: ignore[no-untyped-def]
+    return {one.name: one.verdict for one in measure_inputs(infer, frames(), **settings)}
+
+
+def test_the_shares_are_the_total_indices_of_sobol_for_a_policy_that_adds_its_inputs() -> None:
+    weights, noise = np.array([1.0, 0.7, 0.4]), 0.5
+    measured = measure_inputs(linear_policy(weights, noise), frames(600, 150))
+    spread = np.var([numbers_of(frame.observation) for frame in frames(600, 150)], axis=0)
+    parts = weights**2 * spread
+    # Donors hold another value: words that are exchanged never happen to be the same again.
+    parts[0] *= len(WORDS) / (len(WORDS) - 1)
+    expected = parts / (weights**2 @ spread + noise**2)
+    shares = {one.name: one.share for one in measured}
+    assert [shares["instruction"], shares[PICTURE], shares[STATE]] == pytest.approx(expected, abs=0.08)
+
+
+def test_one_input_decides_another_moves_and_one_has_no_effect() -> None:
+    assert verdicts(linear_policy([1.0, 0.3, 0.0])) == {
+        "instruction": "decides",
+        "picture": "moves",
+        "state": "does not arrive",
+    }
+
+
+def test_an_effect_below_a_tenth_of_the_spread_is_none() -> None:
+    assert verdicts(linear_policy([1.0, 0.5, 0.01]))["state"] == "no effect"
+
+
+def test_a_policy_that_its_seed_decides_is_moved_by_its_inputs_at_most() -> None:
+    found = verdicts(linear_policy([0.5, 0.0, 0.0], noise=2.0))
+    assert found["instruction"] in ("moves", "open")
+
+
+def test_nothing_matters_where_every_change_moves_as_much() -> None:
+    found = verdicts(linear_policy([0.0, 0.0, 0.0], wandering=1.0))
+    assert set(found.values()) <= {"open", "no effect"}
+
+
+def test_words_that_mean_the_same_move_as_much_as_others_in_five_of_a_hundred_draws() -> None:
+    policy = linear_policy([0.0, 1.0, 1.0], wandering=0.3)
+    alarms = 0
+    for seed in range(100):
+        (words,) = measure_inputs(policy, frames(16, 8, seed), ["instruction"], seed)
+        alarms += words.verdict in ("moves", "decides")
+    assert alarms <= 10, "5 % of 100, and three standard deviations"
+
+
+def test_an_input_that_all_frames_share_is_not_varied_and_the_others_are_tested() -> None:
+    same = [
+        Frame(frame.name, Observation(frame.observation.image, frame.observation.state, "lift"), frame.group, 1)
+        for frame in frames()
+    ]
+    words, picture, _ = measure_inputs(linear_policy([1.0, 1.0, 0.0]), same)
+    assert (words.verdict, words.matters) == ("not varied", None)
+    assert picture.verdict == "decides"
+    assert exit_code([words, picture]) == 0
+    assert exit_code([words, picture], ["instruction"]) == 1, "what is required must be shown"
+
+
+def test_a_policy_that_differs_from_itself_is_refused() -> None:
+    rng = np.random.default_rng(0)
+
+    def infer(observations: Sequence[Observation], seeds: Sequence[int]) -> Actions:
+        return rng.standard_normal((len(seeds), 2, 2)).astype(np.float32)
+
+    with pytest.raises(UsageError, match="expected none"):
+        measure_inputs(infer, frames())
+
+
+def test_a_policy_that_always_does_the_same_is_refused() -> None:
+    with pytest.raises(UsageError, match="all 96 actions are equal"):
+        measure_inputs(linear_policy([0.0, 0.0, 0.0]), frames())
+
+
+def test_an_unknown_input_is_refused_by_name() -> None:
+    with pytest.raises(UsageError, match=r"picture\.wrist.*instruction, picture, state"):
+        measure_inputs(linear_policy([1.0, 0.0, 0.0]), frames(), ["picture.wrist"])
+
+
+def test_a_second_camera_that_is_not_read_does_not_arrive() -> None:
+    rng = np.random.default_rng(1)
+    two = [
+        Frame(
+            frame.name,
+            Observation(
+                frame.observation.image,
+                frame.observation.state,
+                frame.observation.instruction,
+                cameras={"wrist": rng.integers(0, 255, (8, 8, 3), np.uint8)},
+            ),
+            frame.group,
+            frame.seed,
+        )
+        for frame in frames()
+    ]
+    found = {one.name: one for one in measure_inputs(linear_policy([1.0, 1.0, 0.0]), two)}
+    wrist = found["picture.wrist"]
+    assert (wrist.verdict, wrist.unchanged) == ("does not arrive", wrist.n_inferences)
+    assert exit_code(list(found.values()), ["instruction", "picture"]) == 0
+    assert exit_code(list(found.values())) == 1
+
+
+def test_every_batch_has_the_same_size() -> None:
+    sizes = []
+
+    def infer(observations: Sequence[Observation], seeds: Sequence[int]) -> Actions:
+        sizes.append(len(seeds))
+        return linear_policy([1.0, 0.0, 0.0])(observations, seeds)
+
+    some = frames(19)
+    observations, seeds = [frame.observation for frame in some], [frame.seed for frame in some]
+    together = in_batches(infer, 8)(observations, seeds)
+    assert sizes == [8, 8, 8]
+    np.testing.assert_array_equal(together, linear_policy([1.0, 0.0, 0.0])(observations, seeds))
