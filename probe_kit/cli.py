@@ -20,6 +20,7 @@ from probe_kit._terminal.panelled_help import PanelledHelp
 from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.check_adapter.command import check_adapter
 from probe_kit.demo.commands import demo
+from probe_kit.diagnose.commands import diagnose
 from probe_kit.doctor_command import doctor
 from probe_kit.extract.ask_commands import ask
 from probe_kit.extract.commands import extract
@@ -45,7 +46,7 @@ PANELS = {
     "Start": ("demo", "doctor", "models"),
     "Make runs": ("suite", "extract", "ask", "dataset", "run"),
     "Probe": ("power", "targets", "train", "labels"),
-    "Is it used?": ("intervene",),
+    "Is it used?": ("diagnose", "intervene"),
     "Read results": ("retention", "view"),
     "A whole study from one file": ("study",),
     "Your own model or environment": ("new-adapter", "check-adapter", "check-environment", "verify"),
@@ -170,7 +171,7 @@ for name, commands in (("suite", suite_app), ("run", run_app), ("study", study_a
 run_app.command()(show)
 run_app.command("list")(list_runs)
 for command in (
-    *(demo, doctor, models, extract, ask, power, targets, train, labels, retention, view),
+    *(demo, doctor, models, extract, ask, power, targets, train, labels, diagnose, retention, view),
     *(new_adapter, check_adapter, check_environment, verify),
 ):
     app.command(rich_help_panel=_PANEL_OF[command.__name__.replace("_", "-")])(command)

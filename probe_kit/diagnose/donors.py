@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from probe_kit.diagnose.inputs import PICTURE, STATE, Frame, read_input, same_value
 
@@ -34,13 +33,13 @@ def draw_donors(frames: Sequence[Frame], name: str, rng: np.random.Generator) ->
 
 def _nearest(frames: Sequence[Frame], index: int, candidates: Sequence[int]) -> list[int]:
     """The candidates whose state is nearest to that of a frame; all that are equally near."""
-    distances = [float(_distance(frames[index], frames[other])) for other in candidates]
+    distances = [_distance(frames[index], frames[other]) for other in candidates]
     if len(candidates) <= NEAREST:
         return list(candidates)
     limit = sorted(distances)[NEAREST - 1]
     return [other for other, distance in zip(candidates, distances, strict=True) if distance <= limit]
 
 
-def _distance(first: Frame, second: Frame) -> NDArray[np.floating]:
+def _distance(first: Frame, second: Frame) -> float:
     states = [np.asarray(read_input(frame.observation, STATE), np.float64) for frame in (first, second)]
-    return np.linalg.norm(states[0] - states[1])
+    return float(np.linalg.norm(states[0] - states[1]))

@@ -8,7 +8,7 @@ actions over frames and seeds. Both inferences of a pair have one seed.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,8 +102,8 @@ class Importance:
 
     @property
     def arrives(self) -> bool:
-        """Whether any other value of the input, or a blank, changed any action."""
-        return self.unchanged < self.n_inferences
+        """Whether any other value of the input changed any action."""
+        return self.verdict != "does not arrive"
 
     @property
     def matters(self) -> bool | None:
@@ -121,7 +121,7 @@ def importance_of(name: str, exchanges: Exchanges) -> Importance:
     _, p_values, _ = max_t(above[None, first], _pairs_of(groups[first]), groups[first], seed)
     p = float(p_values[0])
     share_ci = unbounded_student_interval(exchanges.exchanged, groups)
-    measured = {
+    measured: dict[str, Any] = {
         "share": float(exchanges.exchanged.mean()),
         "share_ci": (max(0.0, share_ci[0]), share_ci[1]),
         "control": float(exchanges.control.mean()),
@@ -142,9 +142,12 @@ def _pairs_of(groups: NDArray[np.str_]) -> NDArray[np.str_]:
 
 
 def _verdict(exchanges: Exchanges, above: NDArray[np.float64], p: float) -> tuple[Matter, str]:
-    groups, inferences = exchanges.groups, exchanges.largest.size + exchanges.blanked.size
-    if not exchanges.largest.any() and not exchanges.blanked.any():
-        return "does not arrive", f"no number of any action changed in {inferences} inferences"
+    groups = exchanges.groups
+    if not exchanges.largest.any():
+        changed = int((exchanges.blanked != 0).sum())
+        words = f"no number of any action changed in {exchanges.largest.size} exchanges"
+        # A blank text has fewer tokens: its length arrives where no word does.
+        return "does not arrive", words + f"; a blank changes {changed} of {exchanges.blanked.size}" * bool(changed)
     if unbounded_student_interval(above, groups)[1] < TRACE:
         return "no effect", "it changes the action no more than a change that should not matter"
     if p >= SIGNIFICANCE:

@@ -120,7 +120,8 @@ def hardly_changed(frame: Frame, spread: NDArray[np.float32], name: str) -> Obse
 
 def spread_of_states(frames: Sequence[Frame]) -> NDArray[np.float32]:
     """Standard deviation of every number of the state over frames."""
-    return np.std([frame.observation.state for frame in frames], axis=0, dtype=np.float64).astype(np.float32)
+    states = np.stack([frame.observation.state for frame in frames]).astype(np.float64)
+    return np.asarray(states.std(axis=0), np.float32)
 
 
 def _retyped(words: str) -> str:

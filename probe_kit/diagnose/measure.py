@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 Actions = NDArray[np.float32]
 Infer = Callable[[Sequence["Observation"], Sequence[int]], Actions]
 """From observations and seeds to actions (B, chunk, D), in any unit; deterministic for a seed."""
-SEEDS_PER_FRAME = 2
-"""Clean inferences of a frame, each with a seed of its own: the variance of the actions is over both."""
 
 
 def measure_inputs(
@@ -50,12 +48,15 @@ def measure_inputs(
     scale = ActionScale.of(np.concatenate([clean, other]))
     if not scale.varies.any():
         raise UsageError(f"all {2 * len(frames)} actions are equal, whatever is seen; give frames that differ")
-    return tuple(
-        untested(name, "not an input", "the model reads no state")
-        if name == STATE and not reads_state
-        else _measure(infer, frames, name, clean, scale, seed)
-        for name in names or known
-    )
+    measured = (_measure(infer, frames, name, clean, scale, seed) for name in names or known)
+    return tuple(one if reads_state else _without_state(one) for one in measured)
+
+
+def _without_state(measured: Importance) -> Importance:
+    """The state of a model that declares none is no input; measured all the same, because it could be wrong."""
+    if measured.name != STATE or measured.verdict not in ("does not arrive", "not varied"):
+        return measured
+    return replace(measured, verdict="not an input", reason="the model reads no state")
 
 
 def _clean(infer: Infer, frames: Sequence[Frame]) -> Actions:
@@ -75,7 +76,7 @@ def _measure(
 ) -> Importance:
     if not differing(frames, name):
         return untested(name, "not varied", f"all {len(frames)} frames hold one value")
-    pairs = draw_donors(frames, name, np.random.default_rng(derive_seed(seed, "donors", name)))
+    pairs = draw_of(frames, name, seed)
     if not pairs:
         return untested(name, "not varied", "no two groups of frames hold different values")
     rows = np.array([index for index, _ in pairs])
@@ -104,6 +105,11 @@ def _measure(
     )
 
 
+def draw_of(frames: Sequence[Frame], name: str, seed: int) -> list[tuple[int, int]]:
+    """The same pairs (frame, donor) of an input for one seed, see `draw_donors`."""
+    return draw_donors(frames, name, np.random.default_rng(derive_seed(seed, "donors", name)))
+
+
 def in_batches(infer: Infer, size: int) -> Infer:
     """The same function, asked for `size` observations at once; a shorter rest is filled up with its last one.
 
@@ -119,8 +125,3 @@ def in_batches(infer: Infer, size: int) -> Infer:
         return np.concatenate(chunks)
 
     return batched
-
-
-def reseeded(frames: Sequence[Frame], seed: int) -> list[Frame]:
-    """The same frames with other seeds of their inferences."""
-    return [replace(frame, seed=derive_seed(seed, frame.name)) for frame in frames]

@@ -15,6 +15,7 @@ RUN/
   sealed/<stamp>.json  hashes of the columns, and of which commits they were made
   probes/            results of `probe-kit train`
   interventions/     results of `probe-kit intervene`
+  diagnoses/         results of `probe-kit diagnose`
   videos/            GIFs, if asked for
   frames/<n>.webp    first and last frame of an episode, or all of them, see `thumbnails`
 
@@ -38,7 +39,7 @@ COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "colu
 FRAMES, CERTIFICATES, SEALED, PROBES, PROVENANCE = "frames", "certificates", "sealed", "probes", "provenance"
 PROBE_DIRECTIONS = "directions.npz"
 """Of the files of a probe result, the weights: nine tenths of its bytes."""
-INTERVENTIONS = "interventions"
+INTERVENTIONS, DIAGNOSES = "interventions", "diagnoses"
 TRAJECTORY, TRAJECTORY_AXES = "trajectory", 3
 """The array of what happened in episodes, beside those of streams; an episode that did not act has no object."""
 TRUTHS = "truth"

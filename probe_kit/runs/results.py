@@ -19,14 +19,14 @@ from pydantic import BeforeValidator, ConfigDict, PlainSerializer
 
 from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import RunDamagedError, UsageError
-from probe_kit.runs.layout import INTERVENTIONS, PROBES
+from probe_kit.runs.layout import DIAGNOSES, INTERVENTIONS, PROBES
 from probe_kit.runs.records import Record, Sum, digest_of, parse_sum
 from probe_kit.runs.root import find_root
 from probe_kit.runs.store import Location
 
-BUNDLES = (PROBES, INTERVENTIONS)
+BUNDLES = (PROBES, INTERVENTIONS, DIAGNOSES)
 """Where bundles may lie in a run."""
-_MAKERS = {PROBES: "train", INTERVENTIONS: "intervene"}
+_MAKERS = {PROBES: "train", INTERVENTIONS: "intervene", DIAGNOSES: "diagnose"}
 HEAD, TIMES, PARTIAL = "settings.json", "times.json", ".partial"
 _KEY = re.compile(r"[0-9a-f]{12}")
 _SHORT = 8

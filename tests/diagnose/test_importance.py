@@ -124,7 +124,7 @@ def test_a_policy_that_differs_from_itself_is_refused() -> None:
     rng = np.random.default_rng(0)
 
     def infer(observations: Sequence[Observation], seeds: Sequence[int]) -> Actions:
-        return rng.standard_normal((len(seeds), 2, 2)).astype(np.float32)
+        return rng.standard_normal((len(observations), len(seeds), 2)).astype(np.float32)
 
     with pytest.raises(UsageError, match="expected none"):
         measure_inputs(infer, frames())

@@ -1,0 +1,61 @@
+"""The page of a diagnosis: its table, its sentences, and a figure from the layers to the action."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from probe_kit.diagnose.sentences import diagnosis_table, sentence
+from probe_kit.retention.displays.base.style import footer, legend_above, panels, plain, series
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from probe_kit.diagnose.diagnosis import Diagnosis
+
+_HEAD = (
+    "<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title><style>"
+    "body{{font:16px/1.5 system-ui,sans-serif;max-width:60rem;margin:2rem auto;padding:0 1rem}}"
+    "table{{border-collapse:collapse}}td,th{{padding:.2rem .6rem;text-align:left}}img{{max-width:100%}}"
+    "</style><h1>{title}</h1>"
+)
+
+
+def draw_passage(diagnosis: "Diagnosis") -> "Figure":
+    """A curve per input over the sites in the network's order: the difference, and the share carried on."""
+    curves = [one for one in diagnosis.inputs if one.passage]
+    places = list(dict.fromkeys(site.place for one in curves for site in one.passage))
+    figure, axes = panels(2, width=max(4.2, 0.28 * len(places)), height=2.6, columns=1, share=False)
+    for at, one in enumerate(curves):
+        x = [places.index(site.place) for site in one.passage]
+        axes[0].plot(x, [site.difference for site in one.passage], label=one.name, **_look(at))
+        axes[1].plot(x, [site.carried for site in one.passage], label=one.name, **_look(at))
+    for panel, label in zip(axes, ("relative difference", "share carried"), strict=True):
+        plain(panel)
+        panel.set_xticks(range(len(places)), places, rotation=90, fontsize=7)
+        panel.set_ylabel(label, fontsize=8.5)
+    axes[1].axhline(1.0, color="0.45", lw=0.8, ls="--", zorder=0)
+    legend_above(figure, axes[0].get_legend_handles_labels()[0])
+    footer(figure, f"{diagnosis.label}, {diagnosis.n_frames} frames of {diagnosis.n_groups} groups")
+    return figure
+
+
+def _look(position: int) -> dict[str, Any]:
+    line = series(position)
+    return {"color": line.colour, "marker": line.marker, "linestyle": line.dash}
+
+
+def write_page(diagnosis: "Diagnosis", file: Path) -> None:
+    """Write one HTML file without links to outside."""
+    from base64 import b64encode
+
+    from markupsafe import Markup, escape
+
+    from probe_kit.retention.displays.base.display import picture_of
+
+    items = Markup("").join(Markup("<li>{}</li>").format(sentence(one)) for one in diagnosis.inputs)
+    parts = [_HEAD.format(title=escape(f"Inputs of {diagnosis.label}")), diagnosis_table(diagnosis)._repr_html_()]
+    parts.append(Markup("<ul>{}</ul>").format(items))
+    if any(one.passage for one in diagnosis.inputs):
+        content, size = picture_of(draw_passage(diagnosis))
+        image = '<img alt="sites on the way to the action" width={} src="data:image/png;base64,{}">'
+        parts.append(Markup(image).format(size["width"], b64encode(content).decode()))
+    file.write_text("".join(map(str, parts)), encoding="utf-8")

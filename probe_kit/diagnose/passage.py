@@ -1,0 +1,138 @@
+"""Where an input passes on its way to the action: at which sites two inferences differ, and which carry it on.
+
+The clean and the donor inference have the same seed and differ in one input. At every site of the streams that are
+stored, and of `kv`, two numbers are measured: how much the activations differ, and how much of the change of the
+action follows when only this site is patched from the donor into the clean inference.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.diagnose.importance import ActionScale
+from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.patching.inference import infer, run_with_cache
+from probe_kit.intervene.patching.patch import Cell, patched
+from probe_kit.intervene.places import ALL, SiteGroup, resolve_sites
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import ActivationCache, Model
+
+LIKE_NONE = 1e-6
+"""Relative difference of activations that rounding can make."""
+CARRIES = 0.5
+"""Share of the change of the action from which a site is said to carry an input."""
+
+
+@dataclass(frozen=True)
+class SitePassage:
+    """One site of the network. Means over pairs.
+
+    place: as `--sites` names it. difference: norm of the difference of the activations, relative to the clean
+    ones. carried: the change of the action under the patch of this site, projected on the change under the donor's
+    input, 1 for all of it; NaN where the donor changes no action.
+    """
+
+    place: str
+    difference: float
+    carried: float
+
+    @property
+    def stream(self) -> str:
+        """The stream of the site."""
+        return self.place.partition(".")[0]
+
+    @property
+    def differs(self) -> bool:
+        """Whether the input reaches the site at all."""
+        return self.difference > LIKE_NONE
+
+
+def places_of(model: "Model") -> list[SiteGroup]:
+    """Every layer of every stored stream, and what the backbone hands over, in the order of the network."""
+    streams = list(model.streams)
+    if model.prompt_kv is not None:
+        streams.insert(1, KV_STREAM)
+    return [place for stream in streams for place in resolve_sites(f"{stream}.*", model)]
+
+
+def measure_passage(
+    model: "Model", pairs: Sequence[Pair], scale: ActionScale, progress: Callable[[], None] = lambda: None
+) -> tuple[SitePassage, ...]:
+    """Both numbers at every site, over pairs of equally many tokens; two inferences per pair, and one per site.
+
+    progress: called after every pair. Raises what `run_with_cache` and `patched` raise.
+    """
+    places = places_of(model)
+    names = [place.name for place in places]
+    differences = np.zeros((len(pairs), len(places)))
+    moved, whole = np.zeros((len(pairs), len(places))), np.zeros(len(pairs))
+    for row, pair in enumerate(pairs):
+        clean, before = run_with_cache(model, pair.clean, pair.seed, names)
+        donated, donor = run_with_cache(model, pair.source, pair.seed, names)
+        change = scale.changes(_as_chunk(donated), _as_chunk(clean))[0]
+        whole[row] = change @ change
+        memo: dict[object, object] = {}
+        for column, place in enumerate(places):
+            differences[row, column] = _relative_difference(place, before, donor)
+            if whole[row] and differences[row, column] > LIKE_NONE:
+                with patched(model, pair, [Cell(place, ALL)], donor, memo=memo):
+                    edited = infer(model, pair.clean, pair.seed)
+                moved[row, column] = scale.changes(_as_chunk(edited), _as_chunk(clean))[0] @ change
+        progress()
+    shares = moved.sum(axis=0) / whole.sum() if whole.any() else np.full(len(places), np.nan)
+    return tuple(
+        SitePassage(name, float(difference), float(share))
+        for name, difference, share in zip(names, differences.mean(axis=0), shares, strict=True)
+    )
+
+
+def _as_chunk(output: object) -> NDArray[np.float32]:
+    """(1, chunk, D) of the actions of one inference."""
+    return np.asarray(output, np.float32)[None]
+
+
+def _relative_difference(place: SiteGroup, before: "ActivationCache", after: "ActivationCache") -> float:
+    """Norm of the difference over all tokens and iterations of a place, relative to the norm before."""
+    difference = norm = 0.0
+    for site in place.sites:
+        here, there = before[site].float(), after[site].float()
+        difference += float((there - here).square().sum())
+        norm += float(here.square().sum())
+    return float(np.sqrt(difference / norm)) if norm else 0.0
+
+
+def describe_passage(passage: Sequence[SitePassage], matters: bool | None) -> str:
+    """Where the input is lost, or which sites carry it, as a sentence without its stop; empty if unknown."""
+    if not passage:
+        return ""
+    reached = [site for site in passage if site.differs]
+    if not reached:
+        return "no site inside the network differs: it ends before the first layer"
+    if passage[-1] is not reached[-1]:
+        following = passage[passage.index(reached[-1]) + 1]
+        return f"the difference ends behind {reached[-1].place}; {following.place} is bit-equal"
+    if matters:
+        carriers = [site for site in passage if site.carried >= CARRIES]
+        spans = [_span([site for site in carriers if site.stream == stream]) for stream in _streams(carriers)]
+        return f"carried by {', '.join(spans)}" if spans else "no site alone carries half of it"
+    strongest = max(passage, key=lambda site: site.difference)
+    last = passage[-1]
+    return (
+        f"it is strongest at {strongest.place} (relative difference {strongest.difference:.2g}) and reaches "
+        f"{last.place} ({last.difference:.2g}): the loss is in the action part itself"
+    )
+
+
+def _streams(sites: Sequence[SitePassage]) -> list[str]:
+    return list(dict.fromkeys(site.stream for site in sites))
+
+
+def _span(sites: Sequence[SitePassage]) -> str:
+    """The first and the last of some sites of one stream, such as `backbone.00–02`."""
+    first, last = sites[0].place, sites[-1].place
+    return first if first == last else f"{first}–{last.partition('.')[2]}"
