@@ -11,12 +11,13 @@ import numpy as np
 from probe_kit.diagnose.choices import FRAMES
 from probe_kit.diagnose.frames import frames_of
 from probe_kit.diagnose.importance import ActionScale, Importance, exit_code
-from probe_kit.diagnose.inputs import Frame, read_input, write_input
+from probe_kit.diagnose.inputs import Frame
 from probe_kit.diagnose.measure import Actions, draw_of, measure_inputs
 from probe_kit.diagnose.passage import SitePassage, describe_passage, measure_passage
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.sessions.observed import with_input
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.records import as_json
 from probe_kit.runs.results import HEAD, read_bundle, write_bundle
@@ -136,7 +137,7 @@ def diagnose_run(
 
     frames: how many. inputs: their names, such as `instruction`; empty for all. inside: whether sites are patched.
     paraphrases: by instruction, other words of the same meaning; they are the control of the instruction. seed: of
-    the draw of donors. source, load: as for `run_intervention`. progress: called with a text as work goes on.
+    the draw of donors. source, load: as for `run_intervention`. progress: called with the name of every step.
     Raises UsageError for a model that does not act, a run with too few groups, or an unknown input.
     """
     from probe_kit.intervene.sessions.opening import open_session
@@ -186,7 +187,9 @@ def _diagnose(
         return np.stack([session.act(*given) for given in zip(observations, seeds, strict=True)])
 
     progress("inputs")
-    measured = measure_inputs(infer, frames, names, seed, session.policy.state_numbers is not None)
+    policy = session.policy
+    reads_state, camera = policy.state_numbers is not None, policy.card.cameras[0] if policy.card.cameras else ""
+    measured = measure_inputs(infer, frames, names, seed, reads_state=reads_state, camera=camera)
     scale = ActionScale.of(infer([frame.observation for frame in frames], [frame.seed for frame in frames]))
     inputs = []
     for one in measured:
@@ -205,9 +208,7 @@ def _look_inside(
     pairs = [
         Pair(
             frames[index].observation,
-            write_input(
-                frames[index].observation, importance.name, read_input(frames[donor].observation, importance.name)
-            ),
+            with_input(frames[index].observation, importance.name, frames[donor].observation),
             frames[index].seed,
             group=frames[index].group,
         )

@@ -1,10 +1,11 @@
-"""Donors: which frame lends an input to which."""
+"""Donors: whose input a frame gets."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from probe_kit.diagnose.inputs import PICTURE, STATE, Frame, read_input, same_value
+from probe_kit.diagnose.inputs import Frame, same_value
+from probe_kit.intervene.sessions.observed import PICTURE
 
 DONORS = 3
 """For each frame: one donor alone often asks for the same action by chance."""
@@ -41,5 +42,5 @@ def _nearest(frames: Sequence[Frame], index: int, candidates: Sequence[int]) -> 
 
 
 def _distance(first: Frame, second: Frame) -> float:
-    states = [np.asarray(read_input(frame.observation, STATE), np.float64) for frame in (first, second)]
+    states = [frame.observation.state.astype(np.float64) for frame in (first, second)]
     return float(np.linalg.norm(states[0] - states[1]))

@@ -1,16 +1,20 @@
 """The frames of a run that are diagnosed: first inferences, of as many groups as there are."""
 
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import zip_longest
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pandas as pd
 
 from probe_kit.diagnose.inputs import Frame
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.intervene.sessions.frames import Frame as RunFrame
+from probe_kit.intervene.sessions.observed import ObservedSession
 
 if TYPE_CHECKING:
-    from probe_kit.intervene.pairs import Pair
     from probe_kit.intervene.sessions.session import ReplaySession
 
 LEAST_GROUPS = 6
@@ -23,12 +27,8 @@ def frames_of(session: "ReplaySession", count: int, paraphrases: dict[str, str] 
     paraphrases: by instruction, other words of the same meaning. Raises UsageError for a run with too few groups.
     """
     words = paraphrases or {}
-    frames = []
-    for pair in _pairs(session, count):
-        observation = pair.clean
-        assert isinstance(observation, Observation), "runs of policies hold observations"
-        other = words.get(observation.instruction, "")
-        frames.append(Frame(pair.episode, observation, pair.group or pair.episode, pair.seed, other))
+    listed = _observed(session, count) if isinstance(session, ObservedSession) else _drawn(session, count)
+    frames = [replace(frame, other_words=words.get(frame.observation.instruction, "")) for frame in listed]
     groups = len({frame.group for frame in frames})
     if groups < LEAST_GROUPS:
         raise UsageError(
@@ -38,8 +38,23 @@ def frames_of(session: "ReplaySession", count: int, paraphrases: dict[str, str] 
     return frames
 
 
-def _pairs(session: "ReplaySession", count: int) -> "Iterator[Pair]":
-    """One episode of one item of every group, then of another item, until there are `count`."""
+def _observed(session: ObservedSession, count: int) -> Iterator[Frame]:
+    """Frames of recordings or of an environment: one of every group in turn, spread over its frames."""
+    groups: dict[str, list[RunFrame]] = {}
+    for frame in session.frames.index:
+        groups.setdefault(frame.group, []).append(frame)
+    turns = -(-count // len(groups))
+    chosen = [
+        [frames[int(at)] for at in np.unique(np.linspace(0, len(frames) - 1, min(turns, len(frames))).round())]
+        for frames in groups.values()
+    ]
+    in_turn = [frame for turn in zip_longest(*chosen) for frame in turn if frame is not None]
+    for frame in in_turn[:count]:
+        yield Frame(frame.name, session.frames.observe(frame), frame.group, frame.seed)
+
+
+def _drawn(session: "ReplaySession", count: int) -> Iterator[Frame]:
+    """First frames of the scene: one episode of one item of every group, then of another item."""
     episodes = session.run.episodes
     turn = episodes.groupby("group_id", sort=False).cumcount()
     # Of every group another episode in its turn, so that not all are the first layout of their item.
@@ -47,5 +62,7 @@ def _pairs(session: "ReplaySession", count: int) -> "Iterator[Pair]":
     order["mixed"] = (order["turn"] + order["group"]) % order.groupby("group")["turn"].transform("size")
     rows = order.sort_values(["mixed", "group"], kind="stable").index[:count]
     for row in rows:
-        item = str(episodes.loc[row, "item_id"])
-        yield from (pair for pair in session.pairs(item) if pair.row == episodes.index.get_loc(row))
+        for pair in session.pairs(str(episodes.loc[row, "item_id"])):
+            if pair.row == episodes.index.get_loc(row):
+                assert isinstance(pair.clean, Observation), "runs of policies hold observations"
+                yield Frame(pair.episode, pair.clean, pair.group or pair.episode, pair.seed)

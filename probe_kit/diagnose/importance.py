@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.sign_flips import max_t
+from probe_kit.statistics.paired_tests import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.student import unbounded_student_interval
 
@@ -147,7 +147,9 @@ def _verdict(exchanges: Exchanges, above: NDArray[np.float64], p: float) -> tupl
         changed = int((exchanges.blanked != 0).sum())
         words = f"no number of any action changed in {exchanges.largest.size} exchanges"
         # A blank text has fewer tokens: its length arrives where no word does.
-        return "does not arrive", words + f"; a blank changes {changed} of {exchanges.blanked.size}" * bool(changed)
+        return "does not arrive", words + f"; a blank changes {changed} of {exchanges.blanked.size}" * bool(
+            changed
+        )
     if unbounded_student_interval(above, groups)[1] < TRACE:
         return "no effect", "it changes the action no more than a change that should not matter"
     if p >= SIGNIFICANCE:

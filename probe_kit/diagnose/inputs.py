@@ -1,25 +1,27 @@
-"""The inputs of a policy: which of them a source varies, and how one is exchanged, blanked or hardly changed.
+"""The inputs of a policy: which of them frames hold, and observations that differ in one of them.
 
-An input is named `instruction`, `state`, `picture` for the first camera, or `picture.<camera>`. Everything else of
-an observation stays as it is. Loads no model.
+An input is named `instruction`, `state`, `picture`, or `picture.<camera>` where there are several cameras.
+Everything else of an observation stays as it is. Loads no model.
 """
 
-import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.intervene.sessions.observed import (
+    INSTRUCTION,
+    PICTURE,
+    STATE,
+    STATE_SHARE,
+    compressed,
+    is_equal,
+    with_input,
+)
 
-INSTRUCTION, STATE, PICTURE = "instruction", "state", "picture"
-JPEG_QUALITY = 95
-"""Of the round trip that is the control of a picture: it changes pixels and nothing that they show."""
-STATE_STEP = 0.01
-"""Of the spread of the states: the control of the state."""
 Picture = NDArray[np.uint8]
 
 
@@ -38,54 +40,21 @@ class Frame:
     other_words: str = ""
 
 
-def inputs_of(frames: Sequence[Frame]) -> tuple[str, ...]:
-    """The inputs that every frame holds: words, pictures and state. Raises UsageError without frames."""
+def inputs_of(frames: Sequence[Frame], camera: str = "") -> tuple[str, ...]:
+    """The inputs that every frame holds: words, pictures and state. Raises UsageError without frames.
+
+    camera: the name of the first one, needed where there are several.
+    """
     if not frames:
         raise UsageError("the source has no frame; diagnose needs at least two that differ")
-    cameras = [camera for camera in frames[0].observation.cameras if _have(frames, camera)]
-    return (INSTRUCTION, PICTURE, *(f"{PICTURE}.{camera}" for camera in cameras), STATE)
-
-
-def _have(frames: Sequence[Frame], camera: str) -> bool:
-    return all(camera in frame.observation.cameras for frame in frames)
-
-
-def read_input(observation: Observation, name: str) -> object:
-    """The value of one input. Raises UsageError for a camera that the observation does not have."""
-    if name == INSTRUCTION:
-        return observation.instruction
-    if name == STATE:
-        return observation.state
-    if name == PICTURE:
-        return observation.image
-    return observation.cameras[_camera_of(observation, name)]
-
-
-def write_input(observation: Observation, name: str, value: object) -> Observation:
-    """The observation with another value of one input. Raises UsageError as `read_input`."""
-    if name == INSTRUCTION:
-        return replace(observation, instruction=str(value))
-    if name == STATE:
-        return replace(observation, state=np.asarray(value, np.float32))
-    if name == PICTURE:
-        return replace(observation, image=np.asarray(value, np.uint8))
-    cameras = {**observation.cameras, _camera_of(observation, name): np.asarray(value, np.uint8)}
-    return replace(observation, cameras=MappingProxyType(cameras))
-
-
-def _camera_of(observation: Observation, name: str) -> str:
-    kind, _, camera = name.partition(".")
-    if kind != PICTURE or camera not in observation.cameras:
-        further = [f"{PICTURE}.{other}" for other in observation.cameras]
-        raise UsageError(
-            f"no input is called {name!r}; this source has {', '.join((INSTRUCTION, PICTURE, *further, STATE))}"
-        )
-    return camera
+    further = list(frames[0].observation.cameras)
+    pictures = [f"{PICTURE}.{name}" for name in (camera or "first", *further)] if further else [PICTURE]
+    return (INSTRUCTION, *pictures, STATE)
 
 
 def same_value(first: Observation, second: Observation, name: str) -> bool:
     """Whether two observations hold the same of one input."""
-    return bool(np.array_equal(np.asarray(read_input(first, name)), np.asarray(read_input(second, name))))
+    return is_equal(with_input(first, name, second), first)
 
 
 def differing(frames: Sequence[Frame], name: str) -> bool:
@@ -94,45 +63,47 @@ def differing(frames: Sequence[Frame], name: str) -> bool:
     return any(not same_value(first, frame.observation, name) for frame in frames[1:])
 
 
-def blank(frames: Sequence[Frame], name: str) -> object:
-    """No words; a picture of the mean colour of all frames; the mean state."""
-    if name == INSTRUCTION:
-        return ""
-    values = [np.asarray(read_input(frame.observation, name)) for frame in frames]
-    if name == STATE:
-        return np.mean(values, axis=0, dtype=np.float64).astype(np.float32)
-    colour = np.mean([value.mean(axis=(0, 1)) for value in values], axis=0)
-    return np.broadcast_to(np.rint(colour).astype(np.uint8), values[0].shape).copy()
+def blank_of(frames: Sequence[Frame]) -> Observation:
+    """An observation without content: no words, pictures of the mean colour of all frames, the mean state."""
+    observations = [frame.observation for frame in frames]
+    first = observations[0]
+    states = np.stack([observation.state for observation in observations]).astype(np.float64)
+    cameras: Mapping[str, Picture] = {
+        name: _mean_colour([observation.cameras[name] for observation in observations]) for name in first.cameras
+    }
+    return replace(
+        first,
+        image=_mean_colour([observation.image for observation in observations]),
+        state=states.mean(axis=0).astype(np.float32),
+        instruction="",
+        cameras=cameras,
+    )
 
 
-def hardly_changed(frame: Frame, spread: NDArray[np.float32], name: str) -> Observation:
-    """The control of an input: other words of one meaning, a JPEG round trip, a state moved by 1 % of its spread.
+def _mean_colour(pictures: Sequence[Picture]) -> Picture:
+    colour = np.mean([picture.mean(axis=(0, 1)) for picture in pictures], axis=0)
+    return np.broadcast_to(np.rint(colour).astype(np.uint8), pictures[0].shape).copy()
 
-    spread: of the states over frames. Without other words, the first letter's case and the full stop change.
+
+def hardly_changed(frame: Frame, spread: NDArray[np.float64]) -> Observation:
+    """An observation whose every input is the control of the frame's: a change without meaning.
+
+    Other words of one meaning, a JPEG round trip of pictures, a state moved by 1 % of its spread (D,) over frames.
+    Without other words, the first letter's case and the full stop change.
     """
-    value = read_input(frame.observation, name)
-    if name == INSTRUCTION:
-        return write_input(frame.observation, name, frame.other_words or _retyped(str(value)))
-    if name == STATE:
-        return write_input(frame.observation, name, np.asarray(value) + STATE_STEP * spread)
-    return write_input(frame.observation, name, _jpeg_round_trip(np.asarray(value)))
+    clean = frame.observation
+    words = frame.other_words or _retyped(clean.instruction)
+    moved = clean.state + STATE_SHARE * spread
+    return replace(compressed(clean), instruction=words, state=moved.astype(np.float32))
 
 
-def spread_of_states(frames: Sequence[Frame]) -> NDArray[np.float32]:
+def spread_of_states(frames: Sequence[Frame]) -> NDArray[np.float64]:
     """Standard deviation of every number of the state over frames."""
     states = np.stack([frame.observation.state for frame in frames]).astype(np.float64)
-    return np.asarray(states.std(axis=0), np.float32)
+    return np.asarray(states.std(axis=0), np.float64)
 
 
 def _retyped(words: str) -> str:
     """Without its full stop if it has one, else with one; the first letter in the other case."""
     stopped = words.removesuffix(".") if words.endswith(".") else f"{words}."
     return stopped[:1].swapcase() + stopped[1:]
-
-
-def _jpeg_round_trip(picture: Picture) -> Picture:
-    from PIL import Image
-
-    stream = io.BytesIO()
-    Image.fromarray(picture).save(stream, "JPEG", quality=JPEG_QUALITY)
-    return np.asarray(Image.open(stream).convert("RGB"), np.uint8)

@@ -10,18 +10,16 @@ from numpy.typing import NDArray
 from probe_kit.diagnose.donors import draw_donors
 from probe_kit.diagnose.importance import ActionScale, Exchanges, Importance, importance_of, untested
 from probe_kit.diagnose.inputs import (
-    STATE,
     Frame,
-    blank,
+    blank_of,
     differing,
     hardly_changed,
     inputs_of,
-    read_input,
     spread_of_states,
-    write_input,
 )
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
+from probe_kit.intervene.sessions.observed import STATE, with_input
 
 if TYPE_CHECKING:
     from probe_kit.hooks.contract.observation import Observation
@@ -32,15 +30,21 @@ Infer = Callable[[Sequence["Observation"], Sequence[int]], Actions]
 
 
 def measure_inputs(
-    infer: Infer, frames: Sequence[Frame], names: Sequence[str] = (), seed: int = 0, reads_state: bool = True
+    infer: Infer,
+    frames: Sequence[Frame],
+    names: Sequence[str] = (),
+    seed: int = 0,
+    *,
+    reads_state: bool = True,
+    camera: str = "",
 ) -> tuple[Importance, ...]:
     """How much of the action every input decides.
 
     names: of the inputs; empty for all. seed: of the draw of donors. reads_state: whether the model is given a
-    state at all. Raises UsageError for an unknown name, fewer than two groups, or a policy that gives other
-    actions for the same observation and seed.
+    state at all. camera: the name of the first one. Raises UsageError for an unknown name, fewer than two groups,
+    or a policy that gives other actions for the same observation and seed.
     """
-    known = inputs_of(frames)
+    known = inputs_of(frames, camera)
     if unknown := [name for name in names if name not in known]:
         raise UsageError(f"no input is called {unknown[0]!r}; this source has {', '.join(known)}")
     clean = _clean(infer, frames)
@@ -53,7 +57,7 @@ def measure_inputs(
 
 
 def _without_state(measured: Importance) -> Importance:
-    """The state of a model that declares none is no input; measured all the same, because it could be wrong."""
+    """The state of a model that declares none is no input, where the measurement agrees."""
     if measured.name != STATE or measured.verdict not in ("does not arrive", "not varied"):
         return measured
     return replace(measured, verdict="not an input", reason="the model reads no state")
@@ -83,14 +87,15 @@ def _measure(
     seeds = [frames[index].seed for index in rows]
     donors = [frames[donor].observation for _, donor in pairs]
     varied = [
-        write_input(frames[index].observation, name, read_input(donor, name))
-        for index, donor in zip(rows, donors, strict=True)
+        with_input(frames[index].observation, name, donor) for index, donor in zip(rows, donors, strict=True)
     ]
-    spread, empty, frame_seeds = spread_of_states(frames), blank(frames, name), [frame.seed for frame in frames]
+    spread, empty, frame_seeds = spread_of_states(frames), blank_of(frames), [frame.seed for frame in frames]
     exchanged = infer(varied, seeds)
     every = infer(donors, seeds)
-    control = infer([hardly_changed(frame, spread, name) for frame in frames], frame_seeds)
-    blanked = infer([write_input(frame.observation, name, empty) for frame in frames], frame_seeds)
+    control = infer(
+        [with_input(frame.observation, name, hardly_changed(frame, spread)) for frame in frames], frame_seeds
+    )
+    blanked = infer([with_input(frame.observation, name, empty) for frame in frames], frame_seeds)
     return importance_of(
         name,
         Exchanges(

@@ -124,7 +124,7 @@ class ObservedSession(ReplaySession):
         clean = self.frames.observe(frame)
         for at in np.argsort(apart, kind="stable"):
             donor = self.frames.observe(others[int(at)])
-            if not _is_equal(with_input(clean, self.vary, donor), clean):
+            if not is_equal(with_input(clean, self.vary, donor), clean):
                 return others[int(at)]
         return None
 
@@ -136,7 +136,7 @@ class ObservedSession(ReplaySession):
         if self.vary == STATE:
             moved = clean.state + STATE_SHARE * self._spread[: clean.state.size]
             return replace(clean, state=moved.astype(np.float32))
-        return with_input(clean, self.vary, _compressed(clean))
+        return with_input(clean, self.vary, compressed(clean))
 
     def check_vary(self) -> None:
         """Raise UsageError for an input that the frames do not have, or that no frame of another group varies."""
@@ -216,13 +216,14 @@ def with_input(clean: Observation, vary: str, donor: Observation) -> Observation
     return replace(clean, image=donor.image)
 
 
-def _is_equal(one: Observation, other: Observation) -> bool:
+def is_equal(one: Observation, other: Observation) -> bool:
+    """Return whether two observations have the same pictures, words and state."""
     pictures = [(one.image, other.image), *((one.cameras[name], other.cameras[name]) for name in one.cameras)]
     same = all(np.array_equal(first, second) for first, second in pictures)
     return same and one.instruction == other.instruction and np.array_equal(one.state, other.state)
 
 
-def _compressed(clean: Observation) -> Observation:
+def compressed(clean: Observation) -> Observation:
     """Return the observation after a JPEG round trip of every picture."""
     cameras: Mapping[str, Any] = {name: _jpeg(picture) for name, picture in clean.cameras.items()}
     return replace(clean, image=_jpeg(clean.image), cameras=cameras)
