@@ -1,0 +1,177 @@
+"""`probe-kit diagnose` on the embedded policy, and on organisms made of it whose answer is known by construction.
+
+The policy decides Color by what block 2 hands over (`kv.02`), and nothing reads its last backbone layer.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+import probe_kit as pk
+from probe_kit.cli import app
+from probe_kit.diagnose.diagnosis import Diagnosis, diagnose_run, load_diagnosis
+from probe_kit.errors import UsageError
+from probe_kit.intervene.sessions.session import ReplaySource, load_policy_of
+from probe_kit.runs import Run, verify_run
+from tests.support.made_once import made_once
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+
+FRAMES = ("--frames", "12")
+
+
+def run_command(*arguments: object) -> Any:
+    return CliRunner().invoke(app, ["diagnose", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    def make(made: Path) -> None:
+        new = ("--categories", "color", "--items", 24, "--env-workers", 0, "--out", made / "run")
+        answer = run_command("pi0-tiny", *new, *FRAMES, "--html", made / "why.html", "--format", "json")
+        assert answer.exit_code == 0, answer.output
+        (made / "first.json").write_text(answer.stdout, encoding="utf-8")
+
+    return made_once(tmp_path_factory, "diagnosed", make)
+
+
+@pytest.fixture(scope="module")
+def run(folder: Path) -> Run:
+    return pk.open_run(folder / "run")
+
+
+@pytest.fixture(scope="module")
+def diagnosis(folder: Path) -> dict[str, Any]:
+    answer: dict[str, Any] = json.loads((folder / "first.json").read_text(encoding="utf-8"))
+    return answer
+
+
+def test_words_and_pictures_decide_color_and_pass_by_one_block(diagnosis: dict[str, Any]) -> None:
+    inputs = {one["name"]: one for one in diagnosis["inputs"]}
+    assert {name: one["verdict"] for name, one in inputs.items()} == {
+        "instruction": "decides",
+        "picture": "decides",
+        "state": "not varied",
+    }
+    carried = {site["place"]: site["carried"] for site in inputs["instruction"]["passage"]}
+    assert carried["kv.02"] > 0.9
+    assert abs(carried["kv.01"]) < 0.1
+    assert carried["backbone.03"] == 0, "nothing reads it"
+    assert "kv.02" in inputs["picture"]["where"]
+
+
+def test_the_same_command_reads_what_is_stored_and_the_run_stays_sound(folder: Path, run: Run) -> None:
+    answer = run_command(folder / "run", *FRAMES, "--format", "json")
+    assert answer.exit_code == 0
+    assert json.loads(answer.stdout) == json.loads((folder / "first.json").read_text(encoding="utf-8"))
+    key = json.loads(answer.stdout)["key"]
+    assert load_diagnosis(run, key).to_json() == json.loads(answer.stdout)
+    assert not verify_run(run, deep=True).problems
+
+
+def test_the_page_has_the_table_the_sentences_and_the_figure(folder: Path) -> None:
+    page = (folder / "why.html").read_text(encoding="utf-8")
+    assert "instruction decides the action; carried by backbone.00" in page
+    assert "data:image/png;base64," in page
+    assert "http" not in page
+
+
+def test_what_is_required_decides_the_exit_code(folder: Path) -> None:
+    assert run_command(folder / "run", *FRAMES, "--require", "instruction,picture").exit_code == 0
+    assert run_command(folder / "run", *FRAMES, "--require", "state").exit_code == 1, "it was not varied"
+    answer = run_command(folder / "run", *FRAMES, "--require", "wrist")
+    assert answer.exit_code == 2
+    assert "instruction, picture, state" in answer.output
+
+
+def test_settings_of_a_new_run_are_refused_for_a_stored_one(folder: Path) -> None:
+    answer = run_command(folder / "run", "--categories", "color")
+    assert answer.exit_code == 2
+    assert "--categories is a setting of a new run" in answer.output
+
+
+def test_a_plan_says_how_many_inferences_it_takes_and_plays_nothing(tmp_path: Path) -> None:
+    new = ("--categories", "color", "--out", tmp_path / "run", "--dry-run")
+    answer = run_command("pi0-tiny", *new)
+    assert answer.exit_code == 0
+    assert "inferences" in answer.output
+    assert not (tmp_path / "run").exists()
+
+
+def test_too_few_groups_are_refused_with_their_number(run: Run) -> None:
+    with pytest.raises(UsageError, match="frames of 3 groups"):
+        diagnose_run(run, frames=3)
+
+
+def test_paraphrases_must_differ(tmp_path: Path, folder: Path) -> None:
+    file = tmp_path / "other.csv"
+    file.write_text("instruction,other\nlift it,lift it\n", encoding="utf-8")
+    answer = run_command(folder / "run", "--paraphrases", file)
+    assert answer.exit_code == 2
+    assert "line 2" in answer.output
+
+
+# -- organisms ----------------------------------------------------------------------------------------------
+
+
+def changed(edit: "Callable[[Any], None]") -> "Callable[[Run, ReplaySource], Policy]":
+    """The run's policy with edited weights."""
+
+    def load(run: Run, source: ReplaySource) -> "Policy":
+        policy: Any = load_policy_of(run, source)
+        with torch.no_grad():
+            edit(policy.network.model.paligemma_with_expert.paligemma.model)
+        return policy  # type: ignore[no-any-return]
+
+    return load
+
+
+def make_blind(model: Any) -> None:
+    projector = model.multi_modal_projector.linear
+    projector.weight.zero_()
+    projector.bias.zero_()
+
+
+def make_deaf(model: Any) -> None:
+    rows = model.language_model.embed_tokens.weight
+    rows[:] = rows[100].clone()
+
+
+def verdicts(diagnosis: Diagnosis) -> dict[str, str]:
+    return {one.name: one.importance.verdict for one in diagnosis.inputs}
+
+
+def test_pictures_do_not_arrive_in_a_blind_policy(run: Run) -> None:
+    diagnosis = diagnose_run(run, frames=12, inputs=["picture"], load=changed(make_blind), seed=1)
+    assert verdicts(diagnosis) == {"picture": "does not arrive"}
+    assert diagnosis.inputs[0].where == "no site inside the network differs: it ends before the first layer"
+    assert diagnosis.exit_code() == 1
+
+
+def test_words_do_not_arrive_in_a_deaf_policy(run: Run) -> None:
+    diagnosis = diagnose_run(run, frames=12, inputs=["instruction"], load=changed(make_deaf), seed=2)
+    assert verdicts(diagnosis) == {"instruction": "does not arrive"}
+    assert diagnosis.inputs[0].where == "no site inside the network differs: it ends before the first layer"
+
+
+@pytest.mark.slow
+def test_an_untrained_policy_uses_nothing(tmp_path: Path) -> None:
+    new = ("--categories", "color", "--random-weights", "--no-inside", "--out", tmp_path / "run")
+    answer = run_command("pi0-tiny", *new, "--format", "json")
+    assert answer.exit_code == 1
+    assert {one["verdict"] for one in json.loads(answer.stdout)["inputs"]} <= {"no effect", "open", "not varied"}
+
+
+@pytest.mark.slow
+def test_words_move_what_the_policy_does_not_decide_by_them(tmp_path: Path) -> None:
+    new = ("--categories", "state", "--no-inside", "--out", tmp_path / "run")
+    answer = run_command("pi0-tiny", *new, "--format", "json")
+    inputs = {one["name"]: one["verdict"] for one in json.loads(answer.stdout)["inputs"]}
+    assert inputs["instruction"] == "moves"
+    assert inputs["picture"] in ("moves", "no effect")
