@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 _ACTING = frozenset(
     {"model", "execute", "rotation", "no_act", "captured_calls", "later_views", "tokens", "frames", "video"}
-    | {"inference_limit", "early_stop", "max_steps", "epsilon"}
+    | {"inference_limit", "early_stop", "max_steps", "epsilon", "label"}
 )
 """Options of runs that act, or store more than a diagnosis reads."""
 ModelOrRun = Annotated[str, typer.Argument(metavar="MODEL|RUN", help="Model to diagnose, or folder of a run.")]
 Frames = Annotated[
-    int, typer.Option("--frames", min=6, max=1000, help="Number of frames, from as many groups as there are.")
+    int, typer.Option("--frames", min=6, max=1000, help="Number of frames.")
 ]
 Require = Annotated[
     common.Names | None,
@@ -33,8 +33,7 @@ Require = Annotated[
         "--require",
         parser=common.Names.parse,
         metavar="A,B,…",
-        help="Inputs that must arrive and matter, comma-separated: instruction, picture, picture.CAMERA, state. "
-        "Default: all that the frames vary.",
+        help="Inputs that must matter, comma-separated, such as instruction,state. Default: all that vary.",
     ),
 ]
 Paraphrases = Annotated[
@@ -49,7 +48,65 @@ Inside = Annotated[
 Format = Annotated[
     Literal["table", "markdown", "json", "csv"], typer.Option("--format", help="Format of the output.")
 ]
-Html = Annotated[Path | None, typer.Option("--html", help="Also write a page with a figure to this file.")]
+Html = Annotated[Path | None, typer.Option("--html", help="Also write a page with a figure.")]
+
+
+@command_with(*ExtractSettings.option_models(), offers=lambda name: name not in _ACTING)
+def diagnose(
+    typed: Mapping[str, Any],
+    model_or_run: ModelOrRun,
+    frames: Frames = FRAMES,
+    require: Require = None,
+    paraphrases: Paraphrases = None,
+    inside: Inside = True,
+    out_folder: start.OutFolder = None,
+    html: Html = None,
+    output_format: Format = "table",
+    dry_run: common.DryRun = False,
+) -> None:
+    """Does each input reach the action, does it matter, and where is it lost?
+
+    Varies the instruction, a picture or the state, and holds the rest. The exit code is 1 if one does not matter.
+
+    \b
+    probe-kit diagnose pi0-tiny --categories color
+    probe-kit diagnose pi0 --checkpoint DIR --dataset FOLDER --require instruction
+    probe-kit diagnose runs/mine
+    """
+    from probe_kit.diagnose.diagnosis import Diagnosis
+    from probe_kit.runs import Run
+
+_ACTING = frozenset(
+    {"model", "execute", "rotation", "no_act", "captured_calls", "later_views", "tokens", "frames", "video"}
+    | {"inference_limit", "early_stop", "max_steps", "epsilon", "label"}
+)
+"""Options of runs that act, or store more than a diagnosis reads."""
+ModelOrRun = Annotated[str, typer.Argument(metavar="MODEL|RUN", help="Model to diagnose, or folder of a run.")]
+Frames = Annotated[
+    int, typer.Option("--frames", min=6, max=1000, help="Number of frames.")
+]
+Require = Annotated[
+    common.Names | None,
+    typer.Option(
+        "--require",
+        parser=common.Names.parse,
+        metavar="A,B,…",
+        help="Inputs that must matter, comma-separated, such as instruction,state. Default: all that vary.",
+    ),
+]
+Paraphrases = Annotated[
+    Path | None,
+    further_option(
+        "--paraphrases", help="CSV file with columns instruction, other: the same meaning in other words."
+    ),
+]
+Inside = Annotated[
+    bool, further_option("--inside/--no-inside", help="Patch every site, to find where an input is lost.")
+]
+Format = Annotated[
+    Literal["table", "markdown", "json", "csv"], typer.Option("--format", help="Format of the output.")
+]
+Html = Annotated[Path | None, typer.Option("--html", help="Also write a page with a figure.")]
 
 
 @command_with(*ExtractSettings.option_models(), offers=lambda name: name not in _ACTING)
