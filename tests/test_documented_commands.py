@@ -147,6 +147,8 @@ LOOKED_FOR = {
     "ask": "accepted so far",
     "view": "Make one with",
     "labels": "Make one with",
+    "targets": "Make one with",
+    "diagnose": "accepted so far|Make one with|kitchen is no LeRobotDataset|holds no|Not a model",
     "train": "Make one with|AWS_ACCESS_KEY_ID",
     "intervene": "Make one with",
     "retention": "Make one with",

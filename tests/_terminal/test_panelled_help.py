@@ -47,7 +47,9 @@ def test_help_fits_a_screen_of_80_columns(command: str) -> None:
 @pytest.mark.parametrize("command", LONG)
 def test_help_names_the_panels_that_only_help_all_shows_and_these_have_every_option(command: str) -> None:
     short, whole = shown(command, "--help", 300), shown(command, HELP_ALL, 300)
-    declared = {one.opts[0] for one in LEAVES[command].params if one.param_type_name == "option"}
+    declared = {
+        (*one.opts, *one.secondary_opts)[0] for one in LEAVES[command].params if one.param_type_name == "option"
+    }
     assert {option for option in declared if option.startswith("--")} <= options_in(whole)
     panels = {one.rich_help_panel for one in LEAVES[command].params if getattr(one, "rich_help_panel", None)}
     assert panels
@@ -60,7 +62,9 @@ def test_help_names_the_panels_that_only_help_all_shows_and_these_have_every_opt
 
 @pytest.mark.parametrize("command", sorted(set(LEAVES) - set(LONG)))
 def test_a_command_with_few_options_shows_all_of_them(command: str) -> None:
-    declared = {one.opts[0] for one in LEAVES[command].params if one.param_type_name == "option"}
+    declared = {
+        (*one.opts, *one.secondary_opts)[0] for one in LEAVES[command].params if one.param_type_name == "option"
+    }
     assert declared <= options_in(shown(command, "--help", 300))
 
 
