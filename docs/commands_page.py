@@ -80,7 +80,9 @@ def _row(parameter: Any) -> str:
 def _names(parameter: Any) -> list[str]:
     if parameter.param_type_name == "argument":
         return [parameter.name.upper()]
-    return [option if parameter.is_flag else f"{option} …" for option in parameter.opts]
+    return [
+        option if parameter.is_flag else f"{option} …" for option in (*parameter.opts, *parameter.secondary_opts)
+    ]
 
 
 def _default(parameter: Any) -> str:

@@ -76,7 +76,11 @@ def test_every_command_and_option_stands_on_the_page_of_commands(site: Path) -> 
         until_next = rf"^{name}\W*$(.*?)(?=^probe-kit [a-z -]+¶$|\Z)"
         (section,) = re.findall(until_next, shown, re.MULTILINE | re.DOTALL)
         for parameter in command.params:
-            option = parameter.opts[-1] if parameter.param_type_name == "option" else parameter.name.upper()
+            option = (
+                (*parameter.secondary_opts, *parameter.opts)[-1]
+                if parameter.param_type_name == "option"
+                else parameter.name.upper()
+            )
             assert option == "--help" or re.search(rf"(?<![\w-]){option}(?![\w-])", section), f"{name} {option}"
             options += 1
     assert options > 80

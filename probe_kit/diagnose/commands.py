@@ -24,16 +24,14 @@ _ACTING = frozenset(
 )
 """Options of runs that act, or store more than a diagnosis reads."""
 ModelOrRun = Annotated[str, typer.Argument(metavar="MODEL|RUN", help="Model to diagnose, or folder of a run.")]
-Frames = Annotated[
-    int, typer.Option("--frames", min=6, max=1000, help="Number of frames.")
-]
+Frames = Annotated[int, typer.Option("--frames", min=6, max=1000, help="Number of frames.")]
 Require = Annotated[
     common.Names | None,
     typer.Option(
         "--require",
         parser=common.Names.parse,
         metavar="A,B,…",
-        help="Inputs that must matter, comma-separated, such as instruction,state. Default: all that vary.",
+        help="Inputs that must matter, such as instruction,state. Default: all that vary.",
     ),
 ]
 Paraphrases = Annotated[
@@ -46,9 +44,10 @@ Inside = Annotated[
     bool, further_option("--inside/--no-inside", help="Patch every site, to find where an input is lost.")
 ]
 Format = Annotated[
-    Literal["table", "markdown", "json", "csv"], typer.Option("--format", help="Format of the output.")
+    Literal["table", "markdown", "json", "csv"], further_option("--format", help="Format of the output.")
 ]
 Html = Annotated[Path | None, typer.Option("--html", help="Also write a page with a figure.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.")]
 
 
 @command_with(*ExtractSettings.option_models(), offers=lambda name: name not in _ACTING)
@@ -62,74 +61,15 @@ def diagnose(
     out_folder: start.OutFolder = None,
     html: Html = None,
     output_format: Format = "table",
-    dry_run: common.DryRun = False,
+    dry_run: DryRun = False,
 ) -> None:
     """Does each input reach the action, does it matter, and where is it lost?
 
-    Varies the instruction, a picture or the state, and holds the rest. The exit code is 1 if one does not matter.
+    Varies one input and holds the others. The exit code is 1 if one does not matter.
 
     \b
     probe-kit diagnose pi0-tiny --categories color
     probe-kit diagnose pi0 --checkpoint DIR --dataset FOLDER --require instruction
-    probe-kit diagnose runs/mine
-    """
-    from probe_kit.diagnose.diagnosis import Diagnosis
-    from probe_kit.runs import Run
-
-_ACTING = frozenset(
-    {"model", "execute", "rotation", "no_act", "captured_calls", "later_views", "tokens", "frames", "video"}
-    | {"inference_limit", "early_stop", "max_steps", "epsilon", "label"}
-)
-"""Options of runs that act, or store more than a diagnosis reads."""
-ModelOrRun = Annotated[str, typer.Argument(metavar="MODEL|RUN", help="Model to diagnose, or folder of a run.")]
-Frames = Annotated[
-    int, typer.Option("--frames", min=6, max=1000, help="Number of frames.")
-]
-Require = Annotated[
-    common.Names | None,
-    typer.Option(
-        "--require",
-        parser=common.Names.parse,
-        metavar="A,B,…",
-        help="Inputs that must matter, comma-separated, such as instruction,state. Default: all that vary.",
-    ),
-]
-Paraphrases = Annotated[
-    Path | None,
-    further_option(
-        "--paraphrases", help="CSV file with columns instruction, other: the same meaning in other words."
-    ),
-]
-Inside = Annotated[
-    bool, further_option("--inside/--no-inside", help="Patch every site, to find where an input is lost.")
-]
-Format = Annotated[
-    Literal["table", "markdown", "json", "csv"], typer.Option("--format", help="Format of the output.")
-]
-Html = Annotated[Path | None, typer.Option("--html", help="Also write a page with a figure.")]
-
-
-@command_with(*ExtractSettings.option_models(), offers=lambda name: name not in _ACTING)
-def diagnose(
-    typed: Mapping[str, Any],
-    model_or_run: ModelOrRun,
-    frames: Frames = FRAMES,
-    require: Require = None,
-    paraphrases: Paraphrases = None,
-    inside: Inside = True,
-    out_folder: start.OutFolder = None,
-    html: Html = None,
-    output_format: Format = "table",
-    dry_run: common.DryRun = False,
-) -> None:
-    """Does each input reach the action, does it matter, and where is it lost?
-
-    Varies one input and holds the others: the instruction, each picture, the state. Needs no labels. The exit code
-    is 0 if every input that the frames vary arrives and matters, and 1 if one does not.
-
-    \b
-    probe-kit diagnose pi0-tiny --categories color
-    probe-kit diagnose pi0 --checkpoint outputs/train/080000 --dataset FOLDER --require instruction
     probe-kit diagnose runs/mine
     """
     from probe_kit.diagnose.diagnosis import diagnose_run
@@ -160,7 +100,7 @@ def _run_of(
     from probe_kit.errors import UsageError
     from probe_kit.runs import open_run
 
-    if (Path(name) / "run.json").exists() or "://" in name:
+    if "/" in name or (Path(name) / "run.json").exists():
         if typed:
             option = next(iter(typed)).replace("_", "-")
             raise UsageError(f"--{option} is a setting of a new run, and {name} is a stored one; leave it out")
@@ -169,9 +109,10 @@ def _run_of(
     from probe_kit.extract.commands import print_plan
     from probe_kit.runs.store import locate
 
-    in_scene = not {"dataset", "env"} & set(typed)
+    in_scene = not {"dataset", "env", "pictures"} & set(typed)
+    captured = {"no_act": True} if in_scene else {}
     items = {"items": ITEMS_PER_FRAME * frames} if in_scene and "items" not in typed else {}
-    settings = ExtractSettings.of_command({**typed, **items, "model": name, "no_act": True}, None)
+    settings = ExtractSettings.of_command({**typed, **items, "model": name, **captured}, None)
     with err.status(f"loading {settings.source.loads} and model"):
         extraction = prepare(settings, out_folder, fetch=not dry_run)
     location = locate(out_folder or Path("runs") / f"diagnose-{extraction.default_name()}")

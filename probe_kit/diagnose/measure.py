@@ -70,7 +70,7 @@ def _clean(infer: Infer, frames: Sequence[Frame]) -> Actions:
     if not np.array_equal(actions, again):
         raise UsageError(
             f"the same observations and seeds gave actions that differ by {np.abs(actions - again).max():.3g}; "
-            "expected none. Changes of inputs cannot be told from chance in this policy"
+            "expected none. An effect of an input would not differ from chance in this policy"
         )
     return actions
 

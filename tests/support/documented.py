@@ -19,6 +19,7 @@ NOT_COMMANDS = {
     ("docs/capture.md", "passed   Every stream declares"): "output of check-adapter",
     ("docs/causal.md", "RUN/interventions/<key>/"): "a tree of files",
     ("docs/concepts.md", "suite ──► env ──► extract"): "a diagram",
+    ("docs/diagnose.md", "Inputs of pi0-tiny"): "output of diagnose",
     ("docs/storage.md", "RUN/"): "a tree of files",
     ("docs/storage.md", "run.json ── zarr.json"): "a diagram",
     (
