@@ -27,18 +27,6 @@ def options_in(text: str) -> set[str]:
     return set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", text))
 
 
-def test_an_option_of_one_value_that_is_given_twice_is_refused_with_both() -> None:
-    for given in (
-        ["--target", "chosen", "--target=correct"],
-        ["--target=chosen", "--seed", "1", "--target", "correct"],
-    ):
-        ended = CliRunner().invoke(app, ["train", "RUN", *given])
-        assert ended.exit_code == 2
-        assert "--target is given twice, 'chosen' and 'correct'; this command takes one" in ended.stderr
-    several = CliRunner().invoke(app, ["retention", "no-run", "--target", "a", "--target", "b"])
-    assert "given twice" not in several.stderr, "this one takes several"
-
-
 @pytest.mark.parametrize("command", sorted(LEAVES))
 def test_help_fits_a_screen_of_80_columns(command: str) -> None:
     assert len(shown(command, "--help").splitlines()) <= SCREEN
