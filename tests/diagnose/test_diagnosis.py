@@ -15,9 +15,13 @@ from typer.testing import CliRunner
 import probe_kit as pk
 from probe_kit.cli import app
 from probe_kit.diagnose.diagnosis import Diagnosis, diagnose_run, load_diagnosis
+from probe_kit.diagnose.frames import frames_of
 from probe_kit.errors import UsageError
+from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
+from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.intervene.sessions.session import ReplaySource, load_policy_of
 from probe_kit.runs import Run, verify_run
+from tests.support.lerobot_recordings import CAMERA, write_recording
 from tests.support.made_once import made_once
 
 if TYPE_CHECKING:
@@ -115,6 +119,21 @@ def test_paraphrases_must_differ(tmp_path: Path, folder: Path) -> None:
     answer = run_command(folder / "run", "--paraphrases", file)
     assert answer.exit_code == 2
     assert "line 2" in answer.output
+
+
+def test_recordings_of_the_same_frames_have_the_same_diagnosis(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="the extra `datasets` is not installed")
+    with open_session(run, ReplaySource()) as session, session.ready():
+        frames = frames_of(session, 12)
+    write_recording(tmp_path / "frames", [[frame.observation] for frame in frames])
+    source = LeRobotSource(str(tmp_path / "frames"), cameras={"base": CAMERA})
+    recorded = extract_run(ExtractSettings("pi0-tiny", source=source), tmp_path / "run")
+    diagnosis = diagnose_run(recorded, frames=12, inside=False)
+    assert (diagnosis.n_frames, diagnosis.n_groups) == (12, 12)
+    shares = {one.name: one.importance.share for one in diagnosis.inputs}
+    assert shares["instruction"] > 0.5
+    assert shares["picture"] > 0.5
+    assert verdicts(diagnosis)["state"] == "not varied"
 
 
 # -- organisms ----------------------------------------------------------------------------------------------
