@@ -1,6 +1,6 @@
 """A process that extracts synthetic episodes through the real writer, to be killed.
 
-Usage: python killing.py RUN SUITE [POINT].
+Usage: python -m tests.runs.killing RUN SUITE [POINT], in the root of the repository.
 
 It loads no model, so that sixty kills take seconds. POINT is where it kills itself: before-put, after-put,
 before-commit or after-commit of the third episode it writes.

@@ -1,9 +1,9 @@
 """A process that has imported everything and forks others, which it kills: hundreds of kills take minutes.
 
-Usage: python nursery.py. A line of JSON on standard input is a job: what to do with which run, by how many
-processes, and after how many seconds each of them is killed (null: not at all). The answer says how each ended:
-true if it was done, false if it was killed. Nothing here may use Zarr or obstore before it forks, because both
-have threads.
+Usage: python -m tests.runs.nursery, in the root of the repository. A line of JSON on standard input is a job: what
+to do with which run, by how many processes, and after how many seconds each of them is killed (null: not at all).
+The answer says how each ended: true if it was done, false if it was killed. Nothing here may use Zarr or obstore
+before it forks, because both have threads.
 """
 
 import json
@@ -15,15 +15,12 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
-
-from little_run import certify, episode, little_plan, little_settings
-
 from probe_kit.runs import open_run, seal
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import load_suite
 from probe_kit.train import train_probes
+from tests.support.little_run import certify, episode, little_plan, little_settings
 
 
 def extract(run: str, suite: str) -> None:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.runs import ActionErrors, Run, compare_actions, open_run
+from probe_kit.runs.layout import DATASET, OTHER_ACTIONS
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 from probe_kit.train.columns.builtin import label_frame
@@ -82,8 +83,13 @@ def test_actions_that_are_not_the_same_numbers_are_not_compared(
     tmp_path: Path, inputs: dict[str, list[int] | None], reason: str | None, message: str
 ) -> None:
     plan = recorded_plan(3)
-    shapes = {name: shape for name, shape in {**plan.dataset["inputs"], **inputs}.items() if shape is not None}
-    plan = replace(plan, dataset={**plan.dataset, "inputs": shapes}, other_actions=reason)
+    data_set, chosen = plan.identity[DATASET], plan.selection["recording"]
+    shapes = {name: shape for name, shape in {**data_set["inputs"], **inputs}.items() if shape is not None}
+    plan = replace(
+        plan,
+        identity={DATASET: {**data_set, "inputs": shapes}},
+        selection={"recording": {**chosen, OTHER_ACTIONS: reason}},
+    )
     settings = {
         "model": "shown", "weights_sha256": "0" * 64, "random_weights": False, "captured_calls": CALLS,
         "tokens": "pooled", "codec": "zstd", "seed": 0, "capture_only": True, **plan.identity,

@@ -18,7 +18,8 @@ from probe_kit.runs import open_run, verify_run
 from probe_kit.runs.store import locate
 from probe_kit.suite import Suite, build_suite
 
-KILLING = Path(__file__).with_name("killing.py")
+ROOT = Path(__file__).parents[2]
+KILLING = ("-m", "tests.runs.killing")
 KILLS = 60
 
 
@@ -31,7 +32,7 @@ def tree(folder: Path) -> dict[str, str]:
 
 
 def start(run: Path, suite: Suite, *point: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, str(KILLING), str(run), str(suite.folder), *point])
+    return subprocess.Popen([sys.executable, *KILLING, str(run), str(suite.folder), *point], cwd=ROOT)
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +141,8 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk_is_named_and_leaves_a_store_that_resumes(suite: Suite, whole: Path, small_disk: Path) -> None:
     run = small_disk / "run"
     process = subprocess.run(
-        [sys.executable, str(KILLING), str(run), str(suite.folder)],
+        [sys.executable, *KILLING, str(run), str(suite.folder)],
+        cwd=ROOT,
         capture_output=True,
         encoding="utf-8",
         check=False,

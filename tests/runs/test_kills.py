@@ -19,7 +19,7 @@ from probe_kit.runs.layout import COLUMNS
 from probe_kit.runs.store import locate
 from probe_kit.suite import Suite, build_suite
 
-NURSERY = Path(__file__).with_name("nursery.py")
+ROOT = Path(__file__).parents[2]
 KILLS = 50
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:.*is not sealed")]
 
@@ -30,7 +30,8 @@ class Nursery:
     def __init__(self, suite: Suite) -> None:
         self._suite = str(suite.folder)
         self._process = subprocess.Popen(
-            [sys.executable, "-W", "ignore::DeprecationWarning", str(NURSERY)],
+            [sys.executable, "-W", "ignore::DeprecationWarning", "-m", "tests.runs.nursery"],
+            cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             encoding="utf-8",

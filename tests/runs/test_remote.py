@@ -19,13 +19,14 @@ from probe_kit.suite import Suite, build_suite
 from probe_kit.train import load_results, train_probes
 from tests.runs.contents import objects
 
-KILLING = Path(__file__).with_name("killing.py")
+ROOT = Path(__file__).parents[2]
+KILLING = ("-m", "tests.runs.killing")
 SHORT = SceneSpec(max_steps=2)
 SITE = Site("expert", 1, iteration=3)
 
 
 def start(run: str | Path, suite: Suite, *point: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, str(KILLING), str(run), str(suite.folder), *point])
+    return subprocess.Popen([sys.executable, *KILLING, str(run), str(suite.folder), *point], cwd=ROOT)
 
 
 @pytest.fixture(scope="module")
