@@ -29,6 +29,7 @@ from probe_kit.extract.vqa.templates import find_template
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.checkpoints.checkpoint import is_on_hub
 from probe_kit.hooks.contract.protocol import PLAIN
+from probe_kit.runs.layout import MOST_FRAMES
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
@@ -84,6 +85,15 @@ class Settings(Part):
     ] = None
 
     sources: ClassVar[tuple[type[SourceSettings], ...]] = SOURCES[:1]
+
+    def model_post_init(self, _: Any) -> None:
+        """Raise UsageError for more frames of an episode than one picture holds."""
+        steps = self.source.steps()
+        if self.machine.frames == "all" and steps >= MOST_FRAMES:
+            raise UsageError(
+                f"--frames all keeps at most {MOST_FRAMES} frames, and episodes of {steps} actions have one more "
+                f"than actions; use --max-steps {MOST_FRAMES - 1} or --frames ends"
+            )
 
     def __init__(self, model: Any = None, **values: Any) -> None:
         """Take parts, or fields of any part by their names. model: a family, or the part.

@@ -391,11 +391,15 @@ class Family:
 
         return embedded_checkpoint(self.name)
 
+    def check_purpose(self, purpose: Literal["outputs", "full_size"]) -> None:
+        """Raise UsageError if the family has no function for `purpose`; nothing is imported."""
+        if getattr(self, purpose) is None:
+            raise UsageError(f"{self.name} has no {purpose.replace('_', '-')}; it cannot be verified this way")
+
     def function(self, purpose: Literal["outputs", "full_size"]) -> Callable[..., Any]:
         """The family's function for `purpose`. Raises UsageError if it has none."""
+        self.check_purpose(purpose)
         path = getattr(self, purpose)
-        if path is None:
-            raise UsageError(f"{self.name} has no {purpose.replace('_', '-')}; it cannot be verified this way")
         with while_loading(self.name, path):
             found: Callable[..., Any] = imported(path)
         return found

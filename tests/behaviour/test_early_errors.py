@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from probe_kit.suite import Suite
@@ -77,7 +78,7 @@ def folder(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path
     shards = {"weight_map": {"one": "a.safetensors", "two": "b.safetensors"}}
     place = made("with-a-shard-missing", config__json='{"type": "pi0"}', a__safetensors="")
     (place / "model.safetensors.index.json").write_text(json.dumps(shards), encoding="utf-8")
-    made("reference", reference__npz="")
+    np.savez(made("reference") / "reference.npz", out_actions=np.zeros(2, np.float32))
     made("reference/checkpoint", config__json='{"type": "smolvla"}')
     (folder / "file").touch()
     from probe_kit.env import SceneSpec

@@ -1,7 +1,6 @@
 """Runs of models that are captured and do not act: the same activations, and no success rate anywhere."""
 
 import json
-from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.success_rate import success_rate
-from probe_kit.retention.compare.compare import ComparedSides, Side, pair_differences
+from probe_kit.retention.compare.compare import Side, compare
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.report import write_report
@@ -34,7 +33,7 @@ ACTING = ExtractSettings(
 @pytest.fixture(scope="module")
 def capture_run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The untrained network again, as in `recorded_run`, but only captured, of one category; then probed."""
-    settings = replace(ACTING, suite=small_suite.folder, capture_only=True)
+    settings = ACTING.changed(suite=small_suite.folder, capture_only=True)
     run = extract_run(settings, tmp_path_factory.mktemp("capture_only") / "run")
     train_probes(run, views=["mean"], permutations=5, controls=())
     return open_run(run.path)
@@ -103,7 +102,7 @@ def test_groups_of_which_one_did_not_act_are_compared_in_what_both_have(
     both = retention_table({"capture_run": [capture_run], "acting": [recorded_run]})
     assert both.differences == []  # the acting run was not probed, and the other has no success rate
     rows = run_rows(capture_run, load_results(capture_run), RowSettings(None, "all", ()))
-    same = pair_differences([ComparedSides(Side("one", rows), Side("other", rows))])
+    same = compare(Side("one", (capture_run,), rows), Side("other", (capture_run,), rows))
     assert {row.category for row in same} == {"color", "mean"}
     assert all(row.sr is None and row.paired and row.backbone == 0 for row in same)
 
@@ -135,10 +134,10 @@ def test_a_checkpoint_of_another_arm_is_captured(base: Path, small_suite: Suite,
 
 
 def test_a_run_that_acts_is_another_run(capture_run: Run, small_suite: Suite) -> None:
-    acting = prepare(replace(ACTING, suite=small_suite.folder)).identity()
-    assert "capture_only" not in acting
+    acting = prepare(ACTING.changed(suite=small_suite.folder)).identity()
+    assert acting["capture_only"] is False
     own = capture_run.root.own_settings
-    assert {key: value for key, value in own.items() if key != "capture_only"} == json.loads(json.dumps(acting))
+    assert own == json.loads(json.dumps(acting)) | {"capture_only": True}
 
 
 @pytest.mark.parametrize(

@@ -159,7 +159,7 @@ def test_two_workers_store_the_same_and_their_own_seconds(small_suite: Suite, tm
 def test_all_seconds_may_be_deleted_and_one_alone_is_damage(acted: Run, tmp_path: Path) -> None:
     place = Path(shutil.copytree(acted.path, tmp_path / "run"))
     (place / "times/00000002.json").unlink()
-    with pytest.raises(RunDamagedError, match=r"times/00000002\.json is missing.*delete the whole folder times"):
+    with pytest.raises(RunDamagedError, match=r"times/00000002\.json is missing.*delete the folder times"):
         open_run(place)
     assert any("times/00000002.json is missing" in problem for problem in verify_run(place).problems)
     shutil.rmtree(place / "times")

@@ -106,6 +106,7 @@ def verify_reference(family: str, folder: Path) -> Verification:
             f"{folder} is not a golden reference: it has no {REFERENCE_FILE}. Give a folder that has one, and the "
             f"recorded model in {CHECKPOINT_FOLDER}/"
         )
+    own.check_purpose("outputs")
     recorded = _read_arrays(file)
     own.check(str(folder / CHECKPOINT_FOLDER))
     outputs = own.function("outputs")
@@ -133,8 +134,9 @@ def verify_keys(family: str, file: Path) -> Verification:
     as not compared. A name that stands for another one's tensor, such as tied output weights, may be absent. Of
     several released sizes the one that the list differs least from is meant.
     """
-    recorded = _read_key_list(file)
     known = find_family(family)
+    known.check_purpose("full_size")
+    recorded = _read_key_list(file)
     build, renames = known.function("full_size"), known.renames()
     theirs = {renamed(name, renames): (tuple(entry["shape"]), entry["dtype"]) for name, entry in recorded.items()}
     sizes: list[str | None] = [name for name, _ in known.sizes] or [None]

@@ -211,11 +211,10 @@ def test_the_command_prints_one_table_and_a_sentence(run: Run, tmp_path: Path) -
         app, ["train", str(run.location), "--labels", str(file), "--target", "y", *options], env={"COLUMNS": "100"}
     )
     assert done.exit_code == 0, done.stderr
-    groups = run.episodes["group_id"].nunique()
-    assert (
-        f"y ({groups} groups, {len(run.episodes)} samples) is not shown in the backbone beyond chance"
-        in done.stdout
+    assert done.stdout.splitlines()[-1].startswith(
+        "y  not shown in the backbone and the action expert beyond chance"
     )
+    assert f"y (continuous), {len(run.episodes)} numbers" in done.stdout
     assert "control instruction" in done.stdout
     assert done.stdout.splitlines()[0] == Target.read(file, "y").contents
     assert load_results(run, target="y").settings.target == "y"
