@@ -2,20 +2,29 @@
 
 from pathlib import Path
 
+from probe_kit._system.text_tables import open_table
 from probe_kit.errors import UsageError
+
+COLUMNS = ("instruction", "other")
 
 
 def read_paraphrases(file: Path) -> dict[str, str]:
-    """By instruction, its other words. Raises UsageError for a file without the columns, or with a blank cell."""
-    import pandas as pd
+    """By instruction, its other words.
 
-    try:
-        table = pd.read_csv(file, dtype=str, keep_default_na=False)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{file} cannot be read as CSV ({error}); give columns instruction, other") from error
-    if missing := [name for name in ("instruction", "other") if name not in table.columns]:
+    Raises UsageError for a file without the columns, a blank cell, and an instruction with two other texts.
+    """
+    table = open_table(file, COLUMNS)
+    if missing := [name for name in COLUMNS if name not in table.names]:
         raise UsageError(f"{file} has no column {missing[0]}; expected columns instruction and other")
-    for line, (instruction, other) in enumerate(zip(table["instruction"], table["other"], strict=True), 2):
-        if not instruction.strip() or not other.strip() or instruction == other:
-            raise UsageError(f"{file} line {line}: expected two different texts, found {instruction!r}, {other!r}")
-    return dict(zip(table["instruction"], table["other"], strict=True))
+    words: dict[str, str] = {}
+    for line, cells in table.rows(COLUMNS):
+        instruction, other = (cells[name] or "" for name in COLUMNS)
+        where = table.where(line)
+        if not instruction or not other or instruction == other:
+            raise UsageError(f"{where}: expected two different texts, found {instruction!r}, {other!r}")
+        if words.setdefault(instruction, other) != other:
+            raise UsageError(
+                f"{where} has {other!r} for {instruction!r}, and a line above has {words[instruction]!r}; "
+                "expected one. Leave one out"
+            )
+    return words

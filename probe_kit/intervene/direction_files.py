@@ -13,12 +13,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
+from probe_kit._system.bounded_json import parse_json, read_json_object
 from probe_kit.errors import UsageError
 
 ENTRY = "directions"
@@ -116,7 +116,7 @@ def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping
     """Return arrays by name, and what is said of each."""
     try:
         if path.suffix == ".npz":
-            with open_arrays(path.read_bytes()) as opened:
+            with open_arrays(path) as opened:
                 arrays = {name: np.asarray(opened[name]) for name in opened}
             said = str(arrays.pop(ENTRY, "{}"))
         else:
@@ -125,8 +125,11 @@ def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping
             with safe_open(path, "np") as opened:
                 arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - no mapping
                 said = (opened.metadata() or {}).get(ENTRY, "{}")
-        return arrays, json.loads(said)
-    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        entry = parse_json(said)
+        if not isinstance(entry, dict) or not all(isinstance(about, dict) for about in entry.values()):
+            raise ValueError(f"its entry {ENTRY!r} is {said[:50]!r}; expected an object of objects")
+        return arrays, entry
+    except UNREADABLE as error:
         raise UsageError(f"{path} holds no directions: {str(error)[:200]}") from error
     except Exception as error:
         if type(error).__name__ != "SafetensorError":
@@ -141,8 +144,11 @@ def _of_autoencoder(folder: Path, name: str) -> FileDirection:
         count = len(arrays.get(DECODER, ()))
         raise UsageError(f"{folder} has {count} features; expected {folder.name}#NUMBER, counted from 0")
     settings = folder / SAE_SETTINGS
-    stored = json.loads(settings.read_text(encoding="utf-8")) if settings.is_file() else {}
+    remedy = "Save the autoencoder again with SAELens"
+    stored = read_json_object(settings, UsageError, remedy) if settings.exists() else {}
     metadata = stored.get("metadata") or {}
+    if not isinstance(metadata, dict):
+        raise UsageError(f"{settings} has the metadata {str(metadata)[:50]!r}; expected an object. {remedy}")
     about = {"site": next((str(own[key]) for own in (stored, metadata) for key in _SITE_KEYS if own.get(key)), "")}
     about["weights"] = str(metadata.get("weights") or "")
     return _direction(f"feature-{name}", _rows(arrays[DECODER][int(name)], folder.name), about)

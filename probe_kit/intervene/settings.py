@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Protocol
 from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.interventions import Readout
+from probe_kit.runs.layout import DATASET
 from probe_kit.runs.run import Run
 
 FORMAT = 2  # raise when stored numbers would be others
@@ -110,6 +111,17 @@ def key_of(settings: Mapping[str, Any]) -> str:
     return sha256_json(settings)[:12]
 
 
+def why_not_replayed(run: Run) -> str | None:
+    """Return why the observations of a run are not shown again; None for recordings, environments and scenes."""
+    kind = run.settings[DATASET].get("kind", "lerobot") if run.recorded else "lerobot"
+    if kind == "lerobot":
+        return None
+    return (
+        f"it showed {kind}, which are not replayed; expected frames of recordings. Take a run of "
+        "`probe-kit extract --dataset FOLDER`"
+    )
+
+
 def check_run_fits(run: Run) -> None:
     """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
     settings = run.settings
@@ -118,6 +130,8 @@ def check_run_fits(run: Run) -> None:
         why = f"{run.model} was asked and did not act; intervene on a run of `probe-kit extract`"
     elif run.weights_sha256 is None or not run.streams:
         why = f"{run.model} is scripted: it has no network in which anything could be changed"
+    elif reason := why_not_replayed(run):
+        why = reason
     elif not has_sides(run) and run.inputs is None:
         why = "it stores no inputs, with which a repeated observation could be compared"
     elif run.capture_only and not run.recorded:

@@ -22,6 +22,8 @@ WHITE = (255, 255, 255)
 LARGEST_PICTURE = 8192
 """Pixels of the longer side: a few kilobytes can claim to be a picture that fills all memory once decoded."""
 
+JPEG_QUALITY = 95
+"""Of a round trip that controls use."""
 FORMATS = ("PNG", "JPEG", "WEBP", "GIF", "BMP")
 """Formats that are decoded, as Pillow names them."""
 
@@ -150,6 +152,13 @@ def rgb_of(image: Image.Image, name: str, remedy: str) -> Image.Image:
         return on_white(image)
     except _DECODING_ERRORS as problem:
         raise SuiteError(f"{name} not a picture that Pillow can decode ({problem}). {remedy}") from problem
+
+
+def through_jpeg(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """Return (H, W, 3) uint8 as they are after JPEG of `JPEG_QUALITY`: a change that means nothing."""
+    buffer = BytesIO()
+    Image.fromarray(pixels).save(buffer, "JPEG", quality=JPEG_QUALITY)
+    return np.asarray(decode_bytes(buffer.getvalue(), "a JPEG round trip:", largest=max(pixels.shape))).copy()
 
 
 def stored_picture(path: Path, mode: str) -> Image.Image:

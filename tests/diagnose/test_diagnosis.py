@@ -16,6 +16,7 @@ import probe_kit as pk
 from probe_kit.cli import app
 from probe_kit.diagnose.diagnosis import Diagnosis, diagnose_run, load_diagnosis
 from probe_kit.diagnose.frames import frames_of
+from probe_kit.diagnose.paraphrases import read_paraphrases
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.intervene.sessions.opening import open_session
@@ -134,6 +135,15 @@ def test_recordings_of_the_same_frames_have_the_same_diagnosis(run: Run, tmp_pat
     assert shares["instruction"] > 0.5
     assert shares["picture"] > 0.5
     assert verdicts(diagnosis)["state"] == "not varied"
+
+
+def test_paraphrases_are_read_by_the_rules_of_all_tables_and_do_not_contradict(tmp_path: Path) -> None:
+    file = tmp_path / "other.csv"
+    file.write_bytes("other;instruction\n grasp it ;lift it\n".encode("utf-16"))
+    assert read_paraphrases(file) == {"lift it": "grasp it"}
+    file.write_text("instruction,other\nlift it,grasp it\nlift it,raise it\n", encoding="utf-8")
+    with pytest.raises(UsageError, match="line 3 has 'raise it' for 'lift it', and a line above has 'grasp it'"):
+        read_paraphrases(file)
 
 
 # -- organisms ----------------------------------------------------------------------------------------------

@@ -9,11 +9,13 @@ import pytest
 from PIL import Image
 
 import probe_kit as pk
+from probe_kit.diagnose.diagnosis import diagnose_run
 from probe_kit.errors import ProbeKitError, RecordingError, UsageError
 from probe_kit.extract import ExtractSettings, PictureFolder, extract_run, prepare
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, Policy
+from probe_kit.intervene import Interchange, ReplaySource, run_intervention
 from probe_kit.runs import verify_run
 
 COUNT = 12
@@ -91,6 +93,32 @@ def test_a_line_that_cannot_be_shown_is_named(folder: Path, tmp_path: Path, tabl
     with pytest.raises(ProbeKitError, match=message) as refused:
         source(tmp_path).open()
     assert isinstance(refused.value, RecordingError | UsageError)
+
+
+def test_a_table_of_a_spreadsheet_is_read_by_the_rules_of_all_tables(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "0.png").write_bytes((folder / "0.png").read_bytes())
+    table = tmp_path / "table.csv"
+    table.write_bytes("sep=;\r\npicture;instruction;group;red\r\n0.png;gehe;7.0;−2\r\n".encode("utf-16"))
+    (row,) = source(tmp_path).open().rows(0)
+    assert (row.columns["group_id"], row.content.numbers) == ("7", (-2.0,))
+    table.write_text("picture,instruction,group\n0.png,go,Red\n0.png,go,red\n", encoding="utf-8")
+    with pytest.raises(UsageError, match="expected one spelling"):
+        source(tmp_path).open()
+    table.write_text("picture,instruction,red\n0.png,go,1e999\n", encoding="utf-8")
+    with pytest.raises(RecordingError, match="expected a number"):
+        source(tmp_path).open()
+
+
+@pytest.mark.parametrize("further", [ReplaySource(), ReplaySource(dataset=Path("photos"))])
+def test_interventions_and_diagnoses_say_that_pictures_are_not_replayed(
+    run: pk.Run, further: ReplaySource
+) -> None:
+    for ask in (
+        lambda: run_intervention(run, Interchange(), source=further),
+        lambda: diagnose_run(run, source=further),
+    ):
+        with pytest.raises(UsageError, match=r"it showed pictures, which are not replayed; .* --dataset FOLDER"):
+            ask()
 
 
 def test_a_picture_that_changes_after_the_plan_is_not_shown(

@@ -1,6 +1,7 @@
 """Directions from outside: read from safetensors, npz and sparse autoencoders, and patched or added."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,28 @@ def test_what_is_no_file_of_directions_is_refused(tmp_path: Path) -> None:
             read_direction(str(path))
     with pytest.raises(UsageError, match="there is no file"):
         read_direction(str(tmp_path / "absent.npz"))
+
+
+@pytest.mark.parametrize("entry", ["[]", '{"a": 1}', '{"a": {}, "a": {}}', "{"])
+def test_what_is_said_of_directions_must_be_an_object_by_name(tmp_path: Path, entry: str) -> None:
+    np.savez(tmp_path / "some.npz", allow_pickle=False, a=np.ones(3), directions=np.array(entry))
+    with pytest.raises(UsageError, match="holds no directions"):
+        read_direction(str(tmp_path / "some.npz"))
+
+
+@pytest.mark.parametrize("settings", ["[]", '{"metadata": "here"}', "{", "pipe"])
+def test_settings_of_an_autoencoder_that_are_none_are_refused_and_never_waited_for(
+    tmp_path: Path, settings: str
+) -> None:
+    from safetensors.numpy import save_file
+
+    save_file({"W_dec": np.ones((1, 3), np.float32)}, tmp_path / "sae_weights.safetensors")
+    if settings == "pipe":
+        os.mkfifo(tmp_path / "cfg.json")
+    else:
+        (tmp_path / "cfg.json").write_text(settings, encoding="utf-8")
+    with pytest.raises(UsageError, match="Save the autoencoder again"):
+        read_direction(f"{tmp_path}#0")
 
 
 @pytest.mark.parametrize(

@@ -1,22 +1,20 @@
 """Pairs of observations that differ in one input only: a clean one, a donor, and a control."""
 
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.plan import Row
 from probe_kit.extract.sources.player import Opens
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.suite.pictures import through_jpeg
 
 INSTRUCTION, STATE, PICTURE, MAIN = "instruction", "state", "picture.", "main"
 """Inputs that vary; `picture.main` is `Observation.image`, other cameras have their names."""
-JPEG_QUALITY = 95
 STATE_SHARE = 0.01
 """The share of its spread over frames by which a control moves a state."""
 
@@ -134,9 +132,7 @@ def _control(seen: Observation, vary: str, spread: NDArray[np.float32]) -> Obser
         return replace(seen, instruction=text[:-1] if text.endswith(".") else f"{text}.")
     if vary == STATE:
         return replace(seen, state=(seen.state + STATE_SHARE * spread).astype(np.float32))
-    stored = io.BytesIO()
-    Image.fromarray(_array(seen, vary)).save(stored, "JPEG", quality=JPEG_QUALITY)
-    return _with(seen, vary, np.asarray(Image.open(stored)).copy())
+    return _with(seen, vary, through_jpeg(_array(seen, vary)))
 
 
 def _distance(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:

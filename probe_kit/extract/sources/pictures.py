@@ -1,11 +1,10 @@
 """A folder of pictures with a table of instructions as a source: one inference about each line of the table."""
 
-import csv
-import io
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from hashlib import blake2b
+from hashlib import blake2b, sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
@@ -14,7 +13,9 @@ import typer
 from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
-from probe_kit._system.bounded_files import read_regular, read_regular_text
+from probe_kit._system.bounded_files import read_regular
+from probe_kit._system.table_cells import group_names, number_of
+from probe_kit._system.text_tables import MOST_BYTES, TextTable, open_table
 from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit.errors import RecordingError, UsageError
 from probe_kit.extract.plan import Row
@@ -22,7 +23,7 @@ from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
 from probe_kit.extract.sources.recording import Pixels
 from probe_kit.extract.sources.source import Played, Source, SourceSettings
 from probe_kit.extract.sources.units import check_predictions
-from probe_kit.hashing import derive_seed, sha256_text
+from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 
 PICTURE, INSTRUCTION, ID, GROUP = "picture", "instruction", "id", "group"
 """Columns of the table; the first two are required, and all others hold numbers that become labels."""
+Cells = dict[str, str | None]
+"""A line of the table by heading; None for a missing cell."""
 _DIGITS = 16
 _option = partial(typer.Option, rich_help_panel="Pictures")
 
@@ -104,9 +107,7 @@ class PictureSource(Source[PictureFolder]):
     executes = False
     groups = "groups of pictures"
 
-    def __init__(
-        self, settings: PictureFolder, names: Sequence[str], lines: Sequence[tuple[dict[str, str], Line]]
-    ) -> None:
+    def __init__(self, settings: PictureFolder, names: Sequence[str], lines: Sequence[tuple[Cells, Line]]) -> None:
         self.settings, self.columns, self.lines = settings, tuple(names), list(lines)
         self.cameras: list[str] = []
         self.prediction: tuple[int, int] = (0, 0)
@@ -118,17 +119,17 @@ class PictureSource(Source[PictureFolder]):
         """Read the table and all its pictures. Raises RecordingError for a line that cannot be shown."""
         del selects_only
         table, folder = Path(settings.table).expanduser(), Path(settings.folder).expanduser()
-        try:
-            texts = list(csv.DictReader(io.StringIO(read_regular_text(table)), strict=True))
-        except (OSError, UnicodeDecodeError, csv.Error) as error:
-            raise UsageError(f"--table {table} cannot be read: {error}. Give a CSV file of UTF-8 text") from error
-        if not texts or not {PICTURE, INSTRUCTION} <= set(texts[0]):
-            seen = ", ".join(map(str, texts[0])) if texts else "no line"
-            raise UsageError(f"--table {table} has {seen}; expected the columns {PICTURE} and {INSTRUCTION}")
-        names = [name for name in texts[0] if name not in (PICTURE, INSTRUCTION, ID, GROUP)]
+        read = open_table(table, (PICTURE, INSTRUCTION))
+        if not {PICTURE, INSTRUCTION} <= set(read.names):
+            columns = ", ".join(read.names) or "no line"
+            raise UsageError(f"--table {table} has {columns}; expected the columns {PICTURE} and {INSTRUCTION}")
+        names = [name for name in read.names if name and name not in (PICTURE, INSTRUCTION, ID, GROUP)]
         lines = [
-            (text, _line(text, names, folder, f"{table.name}, line {n}")) for n, text in enumerate(texts, start=2)
+            (text, _line(text, names, folder, read.where(number)))
+            for number, text in _with_groups(read, list(read.rows()))
         ]
+        if not lines:
+            raise UsageError(f"--table {table} has no line below its heading; expected one per picture")
         ids = [_id(text, number) for number, (text, _) in enumerate(lines)]
         if twice := [name for name in ids if ids.count(name) > 1]:
             raise RecordingError(f"{table.name} has the id {twice[0]!r} twice; give each line its own")
@@ -148,7 +149,7 @@ class PictureSource(Source[PictureFolder]):
     @cached_property
     def instructions(self) -> tuple[str, ...]:
         """Every instruction once, in the order of their letters."""
-        return tuple(sorted({text[INSTRUCTION] for text, _ in self.lines}))
+        return tuple(sorted({text[INSTRUCTION] or "" for text, _ in self.lines}))
 
     def rows(self, seed: int) -> tuple[Row, ...]:
         """A row per line, with the columns of a recorded episode of one frame."""
@@ -205,10 +206,10 @@ class PictureSource(Source[PictureFolder]):
         del execute
         shapes = {"columns": [len(self.columns)], "prediction": list(self.prediction)}
         shapes |= {"pixels": [1, SIDE, SIDE, 3]} if self.settings.pixels else {}
-        table = read_regular_text(Path(self.settings.table).expanduser())
+        table = read_regular(Path(self.settings.table).expanduser(), MOST_BYTES)
         data_set = {
             "kind": "pictures",
-            "meta_blake2b": sha256_text(table)[: 2 * _DIGITS],
+            "meta_blake2b": sha256(table).hexdigest()[: 2 * _DIGITS],
             "fps": 1.0,
             "frames": "every:1",
             "cameras": [[camera, PICTURE, "image"] for camera in self.cameras],
@@ -268,31 +269,37 @@ def read_picture(line: Line) -> NDArray[np.uint8]:
     return np.asarray(decode_bytes(content, f"{where}:", RecordingError, "Write it again as PNG.")).copy()
 
 
-def _line(text: Mapping[str, Any], names: Sequence[str], folder: Path, where: str) -> Line:
+def _with_groups(table: TextTable, lines: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:
+    """The lines with one spelling per group. Raises UsageError for two spellings of what is probably one."""
+    grouped = [(number, text) for number, text in lines if text.get(GROUP)]
+    spelled = group_names(
+        [text[GROUP] for _, text in grouped], lambda row: table.where(grouped[row][0], GROUP), UsageError
+    )
+    names = {number: name for (number, _), name in zip(grouped, spelled, strict=True)}
+    return [(number, text | {GROUP: names.get(number)}) for number, text in lines]
+
+
+def _line(text: Cells, names: Sequence[str], folder: Path, where: str) -> Line:
     """A line of the table. Raises RecordingError naming what is wrong with it."""
     for name in (PICTURE, INSTRUCTION):
-        if not (text[name] or "").strip() or UNSAFE.search(text[name]):
-            raise RecordingError(f"{where} has the {name} {text[name]!r}; expected plain text")
-    path = Path(text[PICTURE])
+        if not text[name] or UNSAFE.search(text[name] or ""):
+            raise RecordingError(f"{where} has the {name} {text[name] or ''!r}; expected plain text")
+    path = Path(text[PICTURE] or "")
     if path.is_absolute() or ".." in path.parts:
         raise RecordingError(f"{where} names {path}; expected a file in the folder of --pictures")
-    try:
-        numbers = tuple(float(text[name]) for name in names)
-    except (TypeError, ValueError):
-        wrong = next(name for name in names if not _is_number(text[name]))
-        raise RecordingError(f"{where} has {text[wrong]!r} as {wrong}; expected a number") from None
-    return Line(folder / path, _digest(_read(folder / path)), numbers)
+    return Line(
+        folder / path, _digest(_read(folder / path)), tuple(_number(text[name], name, where) for name in names)
+    )
 
 
-def _is_number(text: Any) -> bool:
-    try:
-        float(text)
-    except (TypeError, ValueError):
-        return False
-    return True
+def _number(cell: str | None, name: str, where: str) -> float:
+    number = number_of(cell or "")
+    if number is None or abs(number) > sys.float_info.max:
+        raise RecordingError(f"{where} has {cell or ''!r} as {name}; expected a number")
+    return float(number)
 
 
-def _id(text: Mapping[str, str], number: int) -> str:
+def _id(text: Cells, number: int) -> str:
     return text.get(ID) or f"picture-{number:06d}"
 
 

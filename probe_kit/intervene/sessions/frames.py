@@ -15,6 +15,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk
 from probe_kit.intervene.sessions.session import ReplaySource, sources_of
+from probe_kit.intervene.settings import why_not_replayed
 from probe_kit.runs import Run
 
 if TYPE_CHECKING:
@@ -185,7 +186,9 @@ class EnvironmentFrames(Frames):
 
 
 def frames_of(run: Run, source: ReplaySource) -> Frames:
-    """Return the frames of a run on recordings or in an environment."""
+    """Return the frames of a run on recordings or in an environment. Raises UsageError for another source."""
+    if reason := why_not_replayed(run):
+        raise UsageError(f"{run.location}: {reason}")
     return (RecordedFrames if run.recorded else EnvironmentFrames)(run, source)
 
 

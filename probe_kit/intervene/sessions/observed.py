@@ -3,14 +3,12 @@
 A donor is another frame of another group. The source of a pair is the clean frame with one of the donor's inputs.
 """
 
-import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
@@ -23,6 +21,7 @@ from probe_kit.intervene.sessions.session import ReplaySession
 from probe_kit.intervene.settings import PairChoice, PairRow
 from probe_kit.intervene.spread import directions_of, spread_of
 from probe_kit.runs import Run
+from probe_kit.suite.pictures import through_jpeg
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -33,7 +32,6 @@ INSTRUCTION, PICTURE, STATE = "instruction", "picture", "state"
 """Inputs that vary; `picture` is of all cameras, `picture.NAME` of one."""
 FRAMES = 4
 """Frames of an episode that are used if nothing is said."""
-JPEG_QUALITY = 95
 STATE_SHARE = 0.01
 """The share of its spread over frames by which a control moves a state."""
 
@@ -225,14 +223,8 @@ def is_equal(one: Observation, other: Observation) -> bool:
 
 def compressed(clean: Observation) -> Observation:
     """Return the observation after a JPEG round trip of every picture."""
-    cameras: Mapping[str, Any] = {name: _jpeg(picture) for name, picture in clean.cameras.items()}
-    return replace(clean, image=_jpeg(clean.image), cameras=cameras)
-
-
-def _jpeg(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    stored = io.BytesIO()
-    Image.fromarray(picture).save(stored, "JPEG", quality=JPEG_QUALITY)
-    return np.asarray(Image.open(stored)).copy()
+    cameras: Mapping[str, Any] = {name: through_jpeg(picture) for name, picture in clean.cameras.items()}
+    return replace(clean, image=through_jpeg(clean.image), cameras=cameras)
 
 
 def _state_spread(frames: Sequence[Frame]) -> NDArray[np.float64]:
