@@ -89,7 +89,8 @@ class Settings(Part):
     def model_post_init(self, _: Any) -> None:
         """Raise UsageError for more frames of an episode than one picture holds."""
         steps = self.source.steps()
-        if self.machine.frames == "all" and steps >= MOST_FRAMES:
+        stores_all = self.machine.frames == "all" and "frames=all" not in self.source.refuses
+        if stores_all and steps >= MOST_FRAMES:
             raise UsageError(
                 f"--frames all keeps at most {MOST_FRAMES} frames, and episodes of {steps} actions have one more "
                 f"than actions; use --max-steps {MOST_FRAMES - 1} or --frames ends"

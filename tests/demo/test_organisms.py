@@ -116,9 +116,7 @@ def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothin
 def test_a_random_network_of_another_seed_is_found_again(small_suite: Suite, tmp_path: Path) -> None:
     """Its pictures are exchanged before its own weights; those of another seed are refused."""
     other = replace(OTHER_TWINS[0], max_steps=1)
-    settings = replace(
-        settings_of(other, small_suite), categories=("color",), items=2, video="none", env_workers=0
-    )
+    settings = settings_of(other, small_suite).changed(categories=("color",), items=2, video="none", env_workers=0)
     run = extract_run(settings, tmp_path / "run")
     assert len(run_intervention(run, ImageSwap(), source_of(other, small_suite)).table) == 1
     with pytest.raises(SettingsMismatchError, match="weights"):

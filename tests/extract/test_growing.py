@@ -1,6 +1,5 @@
 """`extract` and `ask` with more items play what is missing and keep the rest."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run, prepare
+from probe_kit.extract.vqa.templates import find_template
 from probe_kit.runs import Run, label_run, open_run, verify_run
 from probe_kit.suite import Suite
 
@@ -74,12 +74,12 @@ def test_a_policy_gives_in_a_grown_run_what_it_gives_at_once(small_suite: Suite,
 
 @pytest.mark.parametrize("query", ["target", "absent"])
 def test_an_asked_run_grows_too(query: Any, small_suite: Suite, tmp_path: Path) -> None:
-    prompt = AskSettings.per_prompt_and_size(
-        ["seen"], [(224, 224)], model="vlm-tiny", random_weights=True, suite=small_suite.folder,
-        categories=("color",), items=2, query=query, tokens="pooled",
-    )[0]  # fmt: skip
+    prompt = AskSettings(
+        "vlm-tiny", prompt=find_template("seen"), picture_size=(224, 224), random_weights=True,
+        suite=small_suite.folder, categories=("color",), items=2, query=query, tokens="pooled",
+    )  # fmt: skip
     ask_run(prompt, tmp_path / "run")
-    before, more = bytes_of(tmp_path / "run"), replace(prompt, items=6)
+    before, more = bytes_of(tmp_path / "run"), prompt.changed(items=6)
     assert_grew(before, ask_run(more, tmp_path / "run"), ask_run(more, tmp_path / "at_once"))
 
 
@@ -92,7 +92,7 @@ def test_two_workers_let_a_run_grow(small_suite: Suite, tmp_path: Path) -> None:
 
 def test_more_items_find_the_run_without_an_out_and_other_categories_do_not(small_suite: Suite) -> None:
     named = [prepare(scripted(small_suite, items)).default_name() for items in (2, 4)]
-    other = prepare(replace(scripted(small_suite, 2), categories=("shape",))).default_name()
+    other = prepare(scripted(small_suite, 2).changed(categories=("shape",))).default_name()
     assert named[0] == named[1] != other
 
 

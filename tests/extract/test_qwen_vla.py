@@ -1,6 +1,5 @@
 """Policies with a diffusion head and a flow transformer of their own: environment, store, probes, one table."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -101,7 +100,7 @@ def test_they_stand_in_one_table_beside_another_family(
 ) -> None:
     """The half without a condition is stored, and no probe, peak or retention uses it."""
     chosen = (settings("pi0-tiny", small_suite), xiaomi_settings, internvla_settings)
-    runs = [extract_run(replace(one, items=12), tmp_path / one.model) for one in chosen]
+    runs = [extract_run(one.changed(items=12), tmp_path / one.model.family) for one in chosen]
     for run in runs:
         probed = {str(site).partition(".")[0] for site in train_probes(run, permutations=0).scores["site"]}
         assert {"backbone", "expert"} <= probed

@@ -1,6 +1,5 @@
 """A policy that sees depth, through environment, store, probes and tables, beside the other families."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,8 +33,7 @@ def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Ex
 
 @pytest.mark.slow
 def test_three_families_stand_in_one_table(settings: ExtractSettings, tmp_path: Path) -> None:
-    openvla = replace(
-        settings,
+    openvla = settings.changed(
         model="openvla",
         checkpoint=str(write_openvla(tmp_path / "openvla")),
         options={"tokenizer": "bytes"},
@@ -67,4 +65,4 @@ def test_another_camera_is_another_run(settings: ExtractSettings, tmp_path: Path
     small = settings.changed(items=2)
     extract_run(small, tmp_path / "run")
     with pytest.raises(SettingsMismatchError, match=r"policy\.camera: stored 'scene', asked 'default'"):
-        extract_run(replace(small, options={"camera": "default"}), tmp_path / "run")
+        extract_run(small.changed(options={"camera": "default"}), tmp_path / "run")
