@@ -17,7 +17,7 @@ from probe_kit.diagnose.inputs import (
     inputs_of,
     spread_of_states,
 )
-from probe_kit.errors import UsageError
+from probe_kit.errors import InstructionError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.intervene.sessions.observed import STATE, with_input
 
@@ -95,7 +95,7 @@ def _measure(
     control = infer(
         [with_input(frame.observation, name, hardly_changed(frame, spread)) for frame in frames], frame_seeds
     )
-    blanked = infer([with_input(frame.observation, name, empty) for frame in frames], frame_seeds)
+    blanked = _blanked(infer, frames, name, empty)
     return importance_of(
         name,
         Exchanges(
@@ -104,10 +104,19 @@ def _measure(
             every=scale.shares(every, clean[rows]),
             groups=np.array([frames[index].group for index in rows]),
             first=np.concatenate([[True], np.diff(rows) != 0]),
-            largest=np.abs(exchanged - clean[rows]).reshape(len(rows), -1).max(axis=1),
-            blanked=np.abs(blanked - clean).reshape(len(frames), -1).max(axis=1),
+            largest=np.abs(exchanged - clean[rows]).max(axis=(1, 2)),
+            blanked=np.abs(blanked - clean[: len(blanked)]).max(axis=(1, 2), initial=0.0),
         ),
     )
+
+
+def _blanked(infer: Infer, frames: Sequence[Frame], name: str, empty: "Observation") -> Actions:
+    """Actions of all frames without one input; of none where the family refuses an instruction without words."""
+    blank = [with_input(frame.observation, name, empty) for frame in frames]
+    try:
+        return infer(blank, [frame.seed for frame in frames])
+    except InstructionError:
+        return np.zeros((0, 1, 1), np.float32)
 
 
 def draw_of(frames: Sequence[Frame], name: str, seed: int) -> list[tuple[int, int]]:

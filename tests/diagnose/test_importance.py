@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.diagnose.importance import exit_code
 from probe_kit.diagnose.inputs import PICTURE, STATE, Frame
 from probe_kit.diagnose.measure import in_batches, measure_inputs
-from probe_kit.errors import UsageError
+from probe_kit.errors import InstructionError, UsageError
 from probe_kit.hooks.contract.observation import Observation
 
 WORDS = ["lift the cube", "open the drawer", "push the plate", "turn the knob"]
@@ -175,3 +175,16 @@ def test_every_batch_has_the_same_size() -> None:
     together = in_batches(infer, 8)(observations, seeds)
     assert sizes == [8, 8, 8]
     np.testing.assert_array_equal(together, linear_policy([1.0, 0.0, 0.0])(observations, seeds))
+
+
+def test_a_family_that_refuses_an_empty_instruction_is_diagnosed_without_that_blank() -> None:
+    policy = linear_policy([1.0, 0.3, 0.0])
+
+    def infer(observations: Sequence[Observation], seeds: Sequence[int]) -> Actions:
+        if not all(observation.instruction for observation in observations):
+            raise InstructionError("'' holds no word")
+        return policy(observations, seeds)  # type: ignore[no-any-return]
+
+    words, picture, _ = measure_inputs(infer, frames())
+    assert (words.verdict, words.n_inferences) == ("decides", words.n_pairs)
+    assert picture.n_inferences == picture.n_pairs + 48
