@@ -20,7 +20,7 @@ _HEADINGS = (
 )
 _FINDINGS = {
     "decides": "decides the action",
-    "moves": "moves the action, does not decide it",
+    "moves": "moves the action, is not shown to decide it",
     "no effect": "arrives and has no effect above that of a change without meaning",
     "open": "arrives; whether it matters is open",
     "does not arrive": "does not arrive: no action changed",

@@ -6,10 +6,12 @@ on the same episodes are pooled, whichever intervention they came with. Reads wh
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from probe_kit.intervene.outcomes import (
+    BY_CONDITION,
     CLEAN,
     IMAGE_SWAP,
     UNCHANGED,
@@ -98,13 +100,16 @@ class PooledConditions:
         unchanged = [name for name in (CLEAN, IMAGE_SWAP) if name in base.conditions]
         every = [(base, name) for name in unchanged] + [(self.sources[own].outcomes, own) for own in conditions]
         rows = [(own, own.conditions.index(name)) for own, name in every]
-        return replace(
-            base,
-            conditions=tuple(name for _, name in every),
-            displacement=np.stack([own.displacement[row] for own, row in rows]),
-            max_action_change=np.stack([own.max_action_change[row] for own, row in rows]),
-            edit_log=np.stack([own.edit_log[row] for own, row in rows]),
-        )
+        stacked = {field: _stacked(field, rows) for field in BY_CONDITION}
+        return replace(base, conditions=tuple(name for _, name in every), **stacked)
+
+
+def _stacked(field: str, rows: Sequence[tuple[ConditionOutcomes, int]]) -> Any:
+    """A field of the conditions in these rows, (K, …); None where any of them was stored without it."""
+    values = [getattr(outcomes, field) for outcomes, _ in rows]
+    if any(value is None for value in values):
+        return None
+    return np.stack([value[row] for value, (_, row) in zip(values, rows, strict=True)])
 
 
 def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()) -> list[PooledConditions]:

@@ -265,18 +265,18 @@ Shown in the backbone.
 
 knowledge | not probed | no swap | success
 The policy succeeds; whether the answer is used was not tested: run `probe-kit intervene`. The backbone was
-not probed.
+not probed: run `probe-kit train`.
 
 misses | not probed | no swap | failure
 The policy is right less often than guessing; whether the answer is used was not tested: run `probe-kit
-intervene`. The backbone was not probed.
+intervene`. The backbone was not probed: run `probe-kit train`.
 
 guessing | not probed | no swap | success not shown
 Success is not shown; whether the answer is used was not tested: run `probe-kit
-intervene`. The backbone was not probed.
+intervene`. The backbone was not probed: run `probe-kit train`.
 
 none | not probed | no swap | not shown
-The backbone was not probed.
+The backbone was not probed: run `probe-kit train`.
 
 guessing | shown | follows | used
 The answer is used in the first chunk; whether the readable copy is the one used was not tested.
@@ -285,7 +285,7 @@ knowledge | absent | follows | used
 The answer is used in the first chunk; no readable copy found.
 
 knowledge | not probed | follows | used
-The answer is used in the first chunk. The backbone was not probed.
+The answer is used in the first chunk. The backbone was not probed: run `probe-kit train`.
 
 wrong | shown | reverses | against: used
 The answer is used in the first chunk, against the correct picture; whether the readable copy is the one
@@ -295,7 +295,8 @@ wrong | at chance | reverses | against: used
 The answer is used in the first chunk, against the correct picture; no readable copy found.
 
 wrong | not probed | reverses | against: used
-The answer is used in the first chunk, against the correct picture. The backbone was not probed.
+The answer is used in the first chunk, against the correct picture. The backbone was not probed: run `probe-kit
+train`.
 
 guessing | shown | does not follow | not used
 The answer is not used in the first chunk: within 0.1 of its reach and 0.25 of the episodes (moved by 0.02
@@ -319,7 +320,7 @@ positive control: shape.
 none | not probed | does not follow | not used
 The answer is not used in the first chunk: within 0.1 of its reach and 0.25 of the episodes (moved by 0.02
 [-0.01, 0.05] of its reach, net follow rate 0.02 [-0.10, 0.12]); positive control: shape. The backbone was not
-probed.
+probed: run `probe-kit train`.
 
 guessing | shown | open | inconclusive
 Whether the answer is used in the first chunk remains open: moved by 0.10 [-0.10, 0.30] of its reach, net follow
