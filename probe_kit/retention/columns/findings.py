@@ -12,7 +12,7 @@ from probe_kit._tables.numbers import whole
 from probe_kit.intervene.results.verdict import UseVerdict
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.sentences import is_probed, knows
-from probe_kit.retention.columns.text import is_vlm
+from probe_kit.retention.columns.text import can_be_probed, is_vlm
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
@@ -194,7 +194,7 @@ def next_step(rows: Sequence[RetentionRow]) -> str:
     own = [row for row in acts if row.key == acts[0].key]
     run = shlex.quote(own[0].run.location)
     has_activations = own[0].run.action_stream is not None
-    if has_activations and not any(map(is_probed, own)):
+    if has_activations and not any(map(is_probed, own)) and any(map(can_be_probed, own)):
         return f"next: probe-kit train {run}  where inside the answer can be read"
     if has_activations and any(row.image_swap.use is None for row in own) and not own[0].run.capture_only:
         return f"next: probe-kit intervene {run}  whether the action follows the answer"

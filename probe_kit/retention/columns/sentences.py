@@ -7,10 +7,9 @@ from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import Limits, whole
 from probe_kit.intervene.results.verdict import UNTESTED, UseVerdict, describe_swap
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.text import is_vlm, model_name
+from probe_kit.retention.columns.text import can_be_probed, is_vlm, model_name
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
-from probe_kit.suite.validation.sufficiency import GROUPS_FOR_PROBES
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 
 
@@ -138,8 +137,6 @@ def describe_category(row: RetentionRow, asked: RetentionRow | None = None) -> s
 
 _MORE_ITEMS = "more items would tell"
 _UNTESTED = f"{UNTESTED}: run `probe-kit intervene`"
-ITEMS_PER_GROUP = 2
-"""Of a suite with counterparts: two items ask for either of two pictures."""
 _LATER = "Yet the policy succeeds: actions after the first inference may follow."
 """An image swap reads the actions of the first inference."""
 
@@ -152,9 +149,7 @@ def conclusion(row: RetentionRow) -> str:
     is_later = use is not None and use.is_bounded and use.is_of_first_chunk and knows(row)
     parts = [_finding(row) if use is None else _used(row, use), _LATER * is_later]
     if not is_probed(row):
-        # Items of one couple are one group of the probes' folds: with fewer the command would refuse.
-        enough = row.success.n_items >= ITEMS_PER_GROUP * GROUPS_FOR_PROBES
-        parts.append(f"The backbone was not probed{': run `probe-kit train`' * enough}.")
+        parts.append(f"The backbone was not probed{': run `probe-kit train`' * can_be_probed(row)}.")
     return " ".join(filter(None, parts))
 
 

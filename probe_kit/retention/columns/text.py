@@ -9,7 +9,10 @@ from probe_kit.retention.compare.model_test import ModelTest
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.suite.categories import category_of
+from probe_kit.suite.validation.sufficiency import GROUPS_FOR_PROBES
 
+ITEMS_PER_GROUP = 2
+"""Of a suite with counterparts: two items ask for either of two pictures."""
 NOT_ACTED = "n/a"
 """In place of a success rate, for a model that did not act."""
 ABOVE_CHANCE = "above chance"
@@ -183,3 +186,8 @@ def controlled(rows: Sequence[RetentionRow]) -> bool:
 def is_vlm(row: RetentionRow) -> bool:
     """Whether a row is of a VLM run."""
     return row.run.mode == "answers"
+
+
+def can_be_probed(row: RetentionRow) -> bool:
+    """Whether the category has items of enough groups for probes; with fewer `probe-kit train` would refuse."""
+    return row.success.n_items >= ITEMS_PER_GROUP * GROUPS_FOR_PROBES
