@@ -153,7 +153,7 @@ def _unread(row: RetentionRow) -> str:
 def _beside_guessing(row: RetentionRow) -> str:
     if knows(row):
         return ", guessing 50 %"
-    return ", less than guessing" if row.success.regime == Regime.FAILURE else ", like guessing"
+    return ", less than guessing" if row.success.regime == Regime.FAILURE else ", guessing possible"
 
 
 def _success(row: RetentionRow) -> str:
