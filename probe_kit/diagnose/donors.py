@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from probe_kit.diagnose.inputs import Frame, same_value
-from probe_kit.intervene.sessions.observed import PICTURE
+from probe_kit.diagnose.inputs import Frame
+from probe_kit.extract.sources.inputs import PICTURE, same_input
 
 DONORS = 3
 """For each frame: one donor alone often asks for the same action by chance."""
@@ -23,7 +23,7 @@ def draw_donors(frames: Sequence[Frame], name: str, rng: np.random.Generator) ->
         candidates = [
             other
             for other, donor in enumerate(frames)
-            if donor.group != frame.group and not same_value(frame.observation, donor.observation, name)
+            if donor.group != frame.group and not same_input(frame.observation, donor.observation, name)
         ]
         if name.startswith(PICTURE):
             candidates = _nearest(frames, index, candidates)

@@ -1,8 +1,4 @@
-"""The inputs of a policy: which of them frames hold, and observations that differ in one of them.
-
-An input is named `instruction`, `state`, `picture`, or `picture.<camera>` where there are several cameras.
-Everything else of an observation stays as it is. Loads no model.
-"""
+"""The inputs that frames hold, their blanks and their controls. Loads no model."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,18 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.sessions.observed import (
+from probe_kit.extract.sources.inputs import (
     INSTRUCTION,
     PICTURE,
     STATE,
-    STATE_SHARE,
-    compressed,
-    is_equal,
-    with_input,
+    Picture,
+    hardly_changed,
+    same_input,
 )
-
-Picture = NDArray[np.uint8]
+from probe_kit.hooks.contract.observation import Observation
 
 
 @dataclass(frozen=True)
@@ -52,15 +45,10 @@ def inputs_of(frames: Sequence[Frame], camera: str = "") -> tuple[str, ...]:
     return (INSTRUCTION, *pictures, STATE)
 
 
-def same_value(first: Observation, second: Observation, name: str) -> bool:
-    """Whether two observations hold the same of one input."""
-    return is_equal(with_input(first, name, second), first)
-
-
 def differing(frames: Sequence[Frame], name: str) -> bool:
     """Whether the frames hold more than one value of an input, so that it can be exchanged between them."""
     first = frames[0].observation
-    return any(not same_value(first, frame.observation, name) for frame in frames[1:])
+    return any(not same_input(first, frame.observation, name) for frame in frames[1:])
 
 
 def blank_of(frames: Sequence[Frame]) -> Observation:
@@ -85,16 +73,13 @@ def _mean_colour(pictures: Sequence[Picture]) -> Picture:
     return np.broadcast_to(np.rint(colour).astype(np.uint8), pictures[0].shape).copy()
 
 
-def hardly_changed(frame: Frame, spread: NDArray[np.float64]) -> Observation:
-    """An observation whose every input is the control of the frame's: a change without meaning.
+def control_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> Observation:
+    """The frame's observation after a change of one input that means nothing, see `hardly_changed`.
 
-    Other words of one meaning, a JPEG round trip of pictures, a state moved by 1 % of its spread (D,) over frames.
-    Without other words, the first letter's case and the full stop change.
+    Without other words of the frame, the first letter's case and the full stop change. spread: (D,) of the state.
     """
-    clean = frame.observation
-    words = frame.other_words or _retyped(clean.instruction)
-    moved = clean.state + STATE_SHARE * spread
-    return replace(compressed(clean), instruction=words, state=moved.astype(np.float32))
+    words = frame.other_words or _retyped(frame.observation.instruction)
+    return hardly_changed(frame.observation, name, spread, words)
 
 
 def spread_of_states(frames: Sequence[Frame]) -> NDArray[np.float64]:

@@ -2,21 +2,25 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.plan import Row
+from probe_kit.extract.sources.inputs import (
+    INSTRUCTION,
+    PICTURE,
+    STATE,
+    hardly_changed,
+    same_input,
+    with_input,
+)
 from probe_kit.extract.sources.player import Opens
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.suite.pictures import through_jpeg
 
-INSTRUCTION, STATE, PICTURE, MAIN = "instruction", "state", "picture.", "main"
-"""Inputs that vary; `picture.main` is `Observation.image`, other cameras have their names."""
-STATE_SHARE = 0.01
-"""The share of its spread over frames by which a control moves a state."""
+MAIN = "main"
+"""The camera of `Observation.image`; others have their names."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ def pairs_of(frames: Sequence[Frame], vary: str, rng: np.random.Generator) -> It
     count = 0
     for frame in frames:
         others = [other for other in frames if other.row.columns["group_id"] != frame.row.columns["group_id"]]
-        others = [other for other in others if not _equal(frame.seen, other.seen, vary)]
+        others = [other for other in others if not same_input(frame.seen, other.seen, vary)]
         if not others:
             continue
         count += 1
@@ -83,8 +87,8 @@ def pairs_of(frames: Sequence[Frame], vary: str, rng: np.random.Generator) -> It
         else:
             donor = others[int(rng.integers(len(others)))]
         yield Pair(
-            vary, frame.row, donor.row, frame.seen, _with_input(frame.seen, vary, donor.seen),
-            _control(frame.seen, vary, spread), frame.row.policy_seed,
+            vary, frame.row, donor.row, frame.seen, with_input(frame.seen, vary, donor.seen),
+            hardly_changed(frame.seen, vary, spread), frame.row.policy_seed,
         )  # fmt: skip
     if not count:
         raise UsageError(f"{vary} is the same in all {len(frames)} frames of different groups; choose more rows")
@@ -94,45 +98,7 @@ def inputs_of(frames: Sequence[Frame]) -> tuple[str, ...]:
     """The inputs that the frames have: the instruction, a picture per camera, the state."""
     if not frames:
         return ()
-    return (INSTRUCTION, f"{PICTURE}{MAIN}", *(PICTURE + name for name in frames[0].seen.cameras), STATE)
-
-
-def _equal(one: Observation, other: Observation, vary: str) -> bool:
-    if vary == INSTRUCTION:
-        return one.instruction == other.instruction
-    return np.array_equal(_array(one, vary), _array(other, vary))
-
-
-def _array(seen: Observation, vary: str) -> NDArray[Any]:
-    if vary == STATE:
-        return seen.state
-    name = vary.removeprefix(PICTURE)
-    return seen.image if name == MAIN else seen.cameras[name]
-
-
-def _with_input(seen: Observation, vary: str, donor: Observation) -> Observation:
-    return (
-        replace(seen, instruction=donor.instruction)
-        if vary == INSTRUCTION
-        else _with(seen, vary, _array(donor, vary))
-    )
-
-
-def _with(seen: Observation, vary: str, values: NDArray[Any]) -> Observation:
-    if vary == STATE:
-        return replace(seen, state=values)
-    name = vary.removeprefix(PICTURE)
-    return replace(seen, image=values) if name == MAIN else replace(seen, cameras={**seen.cameras, name: values})
-
-
-def _control(seen: Observation, vary: str, spread: NDArray[np.float32]) -> Observation:
-    """The same input after a change that means nothing: full stop, JPEG round trip, a hundredth of the spread."""
-    if vary == INSTRUCTION:
-        text = seen.instruction
-        return replace(seen, instruction=text[:-1] if text.endswith(".") else f"{text}.")
-    if vary == STATE:
-        return replace(seen, state=(seen.state + STATE_SHARE * spread).astype(np.float32))
-    return _with(seen, vary, through_jpeg(_array(seen, vary)))
+    return (INSTRUCTION, *(f"{PICTURE}.{name}" for name in (MAIN, *frames[0].seen.cameras)), STATE)
 
 
 def _distance(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:

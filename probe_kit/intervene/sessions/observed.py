@@ -3,14 +3,21 @@
 A donor is another frame of another group. The source of a pair is the clean frame with one of the donor's inputs.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.extract.sources.inputs import (
+    INSTRUCTION,
+    PICTURE,
+    STATE,
+    hardly_changed,
+    same_input,
+    with_input,
+)
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
@@ -21,19 +28,14 @@ from probe_kit.intervene.sessions.session import ReplaySession
 from probe_kit.intervene.settings import PairChoice, PairRow
 from probe_kit.intervene.spread import directions_of, spread_of
 from probe_kit.runs import Run
-from probe_kit.suite.pictures import through_jpeg
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from probe_kit.hooks import Policy
 
-INSTRUCTION, PICTURE, STATE = "instruction", "picture", "state"
-"""Inputs that vary; `picture` is of all cameras, `picture.NAME` of one."""
 FRAMES = 4
 """Frames of an episode that are used if nothing is said."""
-STATE_SHARE = 0.01
-"""The share of its spread over frames by which a control moves a state."""
 
 
 class ObservedSession(ReplaySession):
@@ -74,7 +76,7 @@ class ObservedSession(ReplaySession):
                     clean=clean,
                     source=with_input(clean, self.vary, other),
                     donor=other,
-                    control=self._control(clean),
+                    control=hardly_changed(clean, self.vary, self._spread),
                     seed=frame.seed,
                     group=frame.group,
                     item=item,
@@ -122,19 +124,9 @@ class ObservedSession(ReplaySession):
         clean = self.frames.observe(frame)
         for at in np.argsort(apart, kind="stable"):
             donor = self.frames.observe(others[int(at)])
-            if not is_equal(with_input(clean, self.vary, donor), clean):
+            if not same_input(clean, donor, self.vary):
                 return others[int(at)]
         return None
-
-    def _control(self, clean: Observation) -> Observation:
-        """Return the clean observation after a change of the same input that means nothing."""
-        if self.vary == INSTRUCTION:
-            text = clean.instruction
-            return replace(clean, instruction=text[:-1] if text.endswith(".") else f"{text}.")
-        if self.vary == STATE:
-            moved = clean.state + STATE_SHARE * self._spread[: clean.state.size]
-            return replace(clean, state=moved.astype(np.float32))
-        return with_input(clean, self.vary, compressed(clean))
 
     def check_vary(self) -> None:
         """Raise UsageError for an input that the frames do not have, or that no frame of another group varies."""
@@ -198,33 +190,6 @@ class ObservedSession(ReplaySession):
     def with_other_instruction(self, pair: Pair) -> Observation | None:
         """Return the source: a swap of the instruction varies just that."""
         return pair.source if isinstance(pair.source, Observation) else None
-
-
-def with_input(clean: Observation, vary: str, donor: Observation) -> Observation:
-    """Return the clean observation with one input of another."""
-    if vary == INSTRUCTION:
-        return replace(clean, instruction=donor.instruction)
-    if vary == STATE:
-        return replace(clean, state=donor.state)
-    camera = vary.partition(".")[2]
-    if not camera:
-        return replace(clean, image=donor.image, cameras=donor.cameras)
-    if camera in donor.cameras:
-        return replace(clean, cameras={**clean.cameras, camera: donor.cameras[camera]})
-    return replace(clean, image=donor.image)
-
-
-def is_equal(one: Observation, other: Observation) -> bool:
-    """Return whether two observations have the same pictures, words and state."""
-    pictures = [(one.image, other.image), *((one.cameras[name], other.cameras[name]) for name in one.cameras)]
-    same = all(np.array_equal(first, second) for first, second in pictures)
-    return same and one.instruction == other.instruction and np.array_equal(one.state, other.state)
-
-
-def compressed(clean: Observation) -> Observation:
-    """Return the observation after a JPEG round trip of every picture."""
-    cameras: Mapping[str, Any] = {name: through_jpeg(picture) for name, picture in clean.cameras.items()}
-    return replace(clean, image=through_jpeg(clean.image), cameras=cameras)
 
 
 def _state_spread(frames: Sequence[Frame]) -> NDArray[np.float64]:

@@ -1,0 +1,73 @@
+"""The inputs of an observation by name, exchanged or hardly changed one at a time. Imports no torch.
+
+An input is `instruction`, `state`, `picture` for the pictures of all cameras, or `picture.NAME` for one. A name
+that no further camera has is that of the first one, whose picture is `Observation.image`.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.suite.pictures import through_jpeg
+
+INSTRUCTION, STATE, PICTURE = "instruction", "state", "picture"
+STATE_SHARE = 0.01
+"""The share of its spread over frames by which a control moves a state."""
+FIRST = ""
+"""The first camera, among the names of cameras."""
+Picture = NDArray[np.uint8]
+
+
+def with_input(clean: Observation, vary: str, donor: Observation) -> Observation:
+    """Return the clean observation with one input of another."""
+    if vary == INSTRUCTION:
+        return replace(clean, instruction=donor.instruction)
+    if vary == STATE:
+        return replace(clean, state=donor.state)
+    return _with_pictures(clean, vary, partial(_picture, donor))
+
+
+def same_input(one: Observation, other: Observation, vary: str) -> bool:
+    """Return whether two observations hold the same of one input."""
+    if vary == INSTRUCTION:
+        return one.instruction == other.instruction
+    if vary == STATE:
+        return np.array_equal(one.state, other.state)
+    return all(np.array_equal(_picture(one, name), _picture(other, name)) for name in _cameras(one, vary))
+
+
+def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating], words: str = "") -> Observation:
+    """Return the clean observation after a change of one input that means nothing.
+
+    Other words or the full stop, a JPEG round trip, a hundredth of the state's spread. spread: (D,) of the state.
+    words: of the same meaning; empty to add or remove the full stop.
+    """
+    if vary == INSTRUCTION:
+        text = clean.instruction
+        return replace(clean, instruction=words or (text[:-1] if text.endswith(".") else f"{text}."))
+    if vary == STATE:
+        moved = clean.state + STATE_SHARE * spread[: clean.state.size]
+        return replace(clean, state=moved.astype(np.float32))
+    return _with_pictures(clean, vary, lambda name: through_jpeg(_picture(clean, name)))
+
+
+def _with_pictures(clean: Observation, vary: str, picture: Callable[[str], Picture]) -> Observation:
+    """The observation with other pictures of the cameras that an input names. picture: by the camera's name."""
+    others = {name: picture(name) for name in _cameras(clean, vary)}
+    image = others.pop(FIRST, clean.image)
+    return replace(clean, image=image, cameras={**clean.cameras, **others})
+
+
+def _cameras(seen: Observation, vary: str) -> tuple[str, ...]:
+    camera = vary.partition(".")[2]
+    if not camera:
+        return FIRST, *seen.cameras
+    return (camera,) if camera in seen.cameras else (FIRST,)
+
+
+def _picture(seen: Observation, camera: str) -> Picture:
+    return seen.cameras[camera] if camera else seen.image
