@@ -10,14 +10,14 @@ import numpy as np
 
 from probe_kit.diagnose.choices import FRAMES
 from probe_kit.diagnose.frames import frames_of
-from probe_kit.diagnose.importance import ActionScale, Importance, exit_code
+from probe_kit.diagnose.importance import Importance, exit_code
 from probe_kit.diagnose.inputs import Frame
-from probe_kit.diagnose.measure import Actions, draw_of, measure_inputs
+from probe_kit.diagnose.measure import Actions, InputExchange
 from probe_kit.diagnose.passage import SitePassage, describe_passage, measure_passage
 from probe_kit.errors import UnsupportedInterventionError, UsageError
+from probe_kit.extract.sources.inputs import with_input
 from probe_kit.hashing import sha256_json
 from probe_kit.intervene.pairs import Pair
-from probe_kit.intervene.sessions.observed import with_input
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.records import as_json
 from probe_kit.runs.results import HEAD, read_bundle, write_bundle
@@ -189,22 +189,20 @@ def _diagnose(
     progress("inputs")
     policy = session.policy
     reads_state, camera = policy.state_numbers is not None, policy.card.cameras[0] if policy.card.cameras else ""
-    measured = measure_inputs(infer, frames, names, seed, reads_state=reads_state, camera=camera)
-    scale = ActionScale.of(infer([frame.observation for frame in frames], [frame.seed for frame in frames]))
+    exchange = InputExchange(infer, frames, seed)
     inputs = []
-    for one in measured:
+    for one in exchange.measure(names, reads_state=reads_state, camera=camera):
         progress(f"sites of {one.name}")
-        inputs.append(_look_inside(session, frames, one, scale, seed) if inside else InputDiagnosis(one))
+        inputs.append(_look_inside(session, exchange, one) if inside else InputDiagnosis(one))
     groups = len({frame.group for frame in frames})
     return Diagnosis("", "", len(frames), groups, tuple(inputs))
 
 
-def _look_inside(
-    session: "ReplaySession", frames: Sequence[Frame], importance: Importance, scale: ActionScale, seed: int
-) -> InputDiagnosis:
+def _look_inside(session: "ReplaySession", exchange: InputExchange, importance: Importance) -> InputDiagnosis:
     """The sites of an input that could be exchanged, with one donor per frame of equally many tokens."""
     if importance.matters is None:
         return InputDiagnosis(importance)
+    frames = exchange.frames
     pairs = [
         Pair(
             frames[index].observation,
@@ -212,13 +210,13 @@ def _look_inside(
             frames[index].seed,
             group=frames[index].group,
         )
-        for index, donor in dict(reversed(draw_of(frames, importance.name, seed))).items()
+        for index, donor in dict(reversed(exchange.donors(importance.name))).items()
     ]
     fitting = [pair for pair in pairs if _as_many_tokens(session, pair)]
     if not fitting:
         return InputDiagnosis(importance, note="sites were not patched: no two inputs have equally many tokens")
     try:
-        return InputDiagnosis(importance, measure_passage(session.policy, fitting, scale))
+        return InputDiagnosis(importance, measure_passage(session, fitting, exchange.scale))
     except UnsupportedInterventionError as error:
         return InputDiagnosis(importance, note=f"sites were not patched: {error}")
 

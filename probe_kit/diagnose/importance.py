@@ -163,11 +163,6 @@ def _verdict(exchanges: Exchanges, above: NDArray[np.float64], p: float) -> tupl
     return "moves", "it changes less than half of what all inputs change together, or that was not shown"
 
 
-def untested(name: str, verdict: Matter, reason: str) -> Importance:
-    """An input that was not exchanged, and why."""
-    return Importance(name, verdict, reason)
-
-
 def exit_code(inputs: Sequence[Importance], required: Sequence[str] = ()) -> int:
     """0 if every required input arrives and matters, else 1. required: names; empty for all that were tested."""
     tested = [one for one in inputs if one.matters is not None]

@@ -5,22 +5,21 @@ stored, and of `kv`, two numbers are measured: how much the activations differ, 
 action follows when only this site is patched from the donor into the clean inference.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from probe_kit.diagnose.importance import ActionScale
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.pairs import Pair
-from probe_kit.intervene.patching.inference import infer, run_with_cache
+from probe_kit.intervene.pairs import Chunk, Given, Pair
 from probe_kit.intervene.patching.patch import Cell, patched
 from probe_kit.intervene.places import ALL, SiteGroup, resolve_sites
 
 if TYPE_CHECKING:
     from probe_kit.hooks import ActivationCache, Model
+    from probe_kit.intervene.sessions.session import ReplaySession
 
 LIKE_NONE = 1e-6
 """Relative difference of activations that rounding can make."""
@@ -61,39 +60,43 @@ def places_of(model: "Model") -> list[SiteGroup]:
 
 
 def measure_passage(
-    model: "Model", pairs: Sequence[Pair], scale: ActionScale, progress: Callable[[], None] = lambda: None
+    session: "ReplaySession", pairs: Sequence[Pair], scale: ActionScale
 ) -> tuple[SitePassage, ...]:
     """Both numbers at every site, over pairs of equally many tokens; two inferences per pair, and one per site.
 
-    progress: called after every pair. Raises what `run_with_cache` and `patched` raise.
+    scale: of the session's actions. Raises what `capture` and `patched` raise.
     """
-    places = places_of(model)
-    names = [place.name for place in places]
+    model, places = session.policy, places_of(session.policy)
     differences = np.zeros((len(pairs), len(places)))
     moved, whole = np.zeros((len(pairs), len(places))), np.zeros(len(pairs))
     for row, pair in enumerate(pairs):
-        clean, before = run_with_cache(model, pair.clean, pair.seed, names)
-        donated, donor = run_with_cache(model, pair.source, pair.seed, names)
-        change = scale.changes(_as_chunk(donated), _as_chunk(clean))[0]
+        clean, before = _captured(session, pair.clean, pair.seed, places)
+        donated, donor = _captured(session, pair.source, pair.seed, places)
+        change = scale.changes(donated[None], clean[None])[0]
         whole[row] = change @ change
         memo: dict[object, object] = {}
         for column, place in enumerate(places):
             differences[row, column] = _relative_difference(place, before, donor)
             if whole[row] and differences[row, column] > LIKE_NONE:
                 with patched(model, pair, [Cell(place, ALL)], donor, memo=memo):
-                    edited = infer(model, pair.clean, pair.seed)
-                moved[row, column] = scale.changes(_as_chunk(edited), _as_chunk(clean))[0] @ change
-        progress()
+                    edited = session.act(pair.clean, pair.seed)
+                moved[row, column] = scale.changes(edited[None], clean[None])[0] @ change
     shares = moved.sum(axis=0) / whole.sum() if whole.any() else np.full(len(places), np.nan)
     return tuple(
-        SitePassage(name, float(difference), float(share))
-        for name, difference, share in zip(names, differences.mean(axis=0), shares, strict=True)
+        SitePassage(place.name, float(difference), float(share))
+        for place, difference, share in zip(places, differences.mean(axis=0), shares, strict=True)
     )
 
 
-def _as_chunk(output: object) -> NDArray[np.float32]:
-    """(1, chunk, D) of the actions of one inference."""
-    return np.asarray(output, np.float32)[None]
+def _captured(
+    session: "ReplaySession", given: Given, seed: int, places: Sequence[SiteGroup]
+) -> "tuple[Chunk, ActivationCache]":
+    """The actions of one inference in the session's units, which of recordings are the checkpoint's own."""
+    from probe_kit.hooks import capture
+
+    with capture(session.policy, [site for place in places for site in place.sites]) as cache:
+        chunk = session.act(given, seed)
+    return chunk, cache
 
 
 def _relative_difference(place: SiteGroup, before: "ActivationCache", after: "ActivationCache") -> float:

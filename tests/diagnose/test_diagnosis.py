@@ -129,7 +129,10 @@ def test_recordings_of_the_same_frames_have_the_same_diagnosis(run: Run, tmp_pat
     write_recording(tmp_path / "frames", [[frame.observation] for frame in frames])
     source = LeRobotSource(str(tmp_path / "frames"), cameras={"base": CAMERA})
     recorded = extract_run(ExtractSettings("pi0-tiny", source=source), tmp_path / "run")
-    diagnosis = diagnose_run(recorded, frames=12, inside=False)
+    diagnosis = diagnose_run(recorded, frames=12)
+    carried = {site.place: site.carried for site in diagnosis.inputs[0].passage}
+    assert carried["kv.02"] > 0.9
+    assert carried["backbone.03"] == 0
     assert (diagnosis.n_frames, diagnosis.n_groups) == (12, 12)
     shares = {one.name: one.importance.share for one in diagnosis.inputs}
     assert shares["instruction"] > 0.5

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.diagnose.importance import exit_code
 from probe_kit.diagnose.inputs import PICTURE, STATE, Frame
-from probe_kit.diagnose.measure import in_batches, measure_inputs
+from probe_kit.diagnose.measure import InputExchange
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.hooks.contract.observation import Observation
 
@@ -62,12 +62,12 @@ def linear_policy(weights: Sequence[float], noise: float = 0.0, wandering: float
 
 
 def verdicts(infer, **settings: object) -> dict[str, str]:  # type: ignore[no-untyped-def]
-    return {one.name: one.verdict for one in measure_inputs(infer, frames(), **settings)}
+    return {one.name: one.verdict for one in InputExchange(infer, frames()).measure(**settings)}
 
 
 def test_the_shares_are_the_total_indices_of_sobol_for_a_policy_that_adds_its_inputs() -> None:
     weights, noise = np.array([1.0, 0.7, 0.4]), 0.5
-    measured = measure_inputs(linear_policy(weights, noise), frames(600, 150))
+    measured = InputExchange(linear_policy(weights, noise), frames(600, 150)).measure()
     spread = np.var([numbers_of(frame.observation) for frame in frames(600, 150)], axis=0)
     parts = weights**2 * spread
     # Donors hold another value: words that are exchanged never happen to be the same again.
@@ -103,7 +103,7 @@ def test_words_that_mean_the_same_move_as_much_as_others_in_five_of_a_hundred_dr
     policy = linear_policy([0.0, 1.0, 1.0], wandering=0.3)
     alarms = 0
     for seed in range(100):
-        (words,) = measure_inputs(policy, frames(16, 8, seed), ["instruction"], seed)
+        (words,) = InputExchange(policy, frames(16, 8, seed), seed).measure(["instruction"])
         alarms += words.verdict in ("moves", "decides")
     assert alarms <= 10, "5 % of 100, and three standard deviations"
 
@@ -113,7 +113,7 @@ def test_an_input_that_all_frames_share_is_not_varied_and_the_others_are_tested(
         Frame(frame.name, Observation(frame.observation.image, frame.observation.state, "lift"), frame.group, 1)
         for frame in frames()
     ]
-    words, picture, _ = measure_inputs(linear_policy([1.0, 1.0, 0.0]), same)
+    words, picture, _ = InputExchange(linear_policy([1.0, 1.0, 0.0]), same).measure()
     assert (words.verdict, words.matters) == ("not varied", None)
     assert picture.verdict == "decides"
     assert exit_code([words, picture]) == 0
@@ -127,17 +127,17 @@ def test_a_policy_that_differs_from_itself_is_refused() -> None:
         return rng.standard_normal((len(observations), len(seeds), 2)).astype(np.float32)
 
     with pytest.raises(UsageError, match="expected none"):
-        measure_inputs(infer, frames())
+        InputExchange(infer, frames()).measure()
 
 
 def test_a_policy_that_always_does_the_same_is_refused() -> None:
     with pytest.raises(UsageError, match="all 96 actions are equal"):
-        measure_inputs(linear_policy([0.0, 0.0, 0.0]), frames())
+        InputExchange(linear_policy([0.0, 0.0, 0.0]), frames()).measure()
 
 
 def test_an_unknown_input_is_refused_by_name() -> None:
     with pytest.raises(UsageError, match=r"picture\.wrist.*instruction, picture, state"):
-        measure_inputs(linear_policy([1.0, 0.0, 0.0]), frames(), ["picture.wrist"])
+        InputExchange(linear_policy([1.0, 0.0, 0.0]), frames()).measure(["picture.wrist"])
 
 
 def test_a_second_camera_that_is_not_read_does_not_arrive() -> None:
@@ -156,25 +156,11 @@ def test_a_second_camera_that_is_not_read_does_not_arrive() -> None:
         )
         for frame in frames()
     ]
-    found = {one.name: one for one in measure_inputs(linear_policy([1.0, 1.0, 0.0]), two)}
+    found = {one.name: one for one in InputExchange(linear_policy([1.0, 1.0, 0.0]), two).measure()}
     wrist = found["picture.wrist"]
     assert (wrist.verdict, wrist.unchanged) == ("does not arrive", wrist.n_inferences)
     assert exit_code(list(found.values()), ["instruction", "picture.first"]) == 0
     assert exit_code(list(found.values())) == 1
-
-
-def test_every_batch_has_the_same_size() -> None:
-    sizes = []
-
-    def infer(observations: Sequence[Observation], seeds: Sequence[int]) -> Actions:
-        sizes.append(len(seeds))
-        return linear_policy([1.0, 0.0, 0.0])(observations, seeds)
-
-    some = frames(19)
-    observations, seeds = [frame.observation for frame in some], [frame.seed for frame in some]
-    together = in_batches(infer, 8)(observations, seeds)
-    assert sizes == [8, 8, 8]
-    np.testing.assert_array_equal(together, linear_policy([1.0, 0.0, 0.0])(observations, seeds))
 
 
 def test_a_family_that_refuses_an_empty_instruction_is_diagnosed_without_that_blank() -> None:
@@ -185,6 +171,6 @@ def test_a_family_that_refuses_an_empty_instruction_is_diagnosed_without_that_bl
             raise InstructionError("'' holds no word")
         return policy(observations, seeds)  # type: ignore[no-any-return]
 
-    words, picture, _ = measure_inputs(infer, frames())
+    words, picture, _ = InputExchange(infer, frames()).measure()
     assert (words.verdict, words.n_inferences) == ("decides", words.n_pairs)
     assert picture.n_inferences == picture.n_pairs + 48
