@@ -164,7 +164,7 @@ def _marks(found: Sequence[RunSummary], table: Table) -> list[str]:
     """What the mark says where it stands, and a warning where it cannot stand because no control was run."""
     marked = any(MARK in text for line in table.texts for text in line)
     warning = chance_only([one.row for run in found for one in run.categories])
-    return [f"{MARK} above every control that was run"] * marked + [warning] * bool(warning)
+    return [f"{MARK} above chance, and above every control that was run"] * marked + [warning] * bool(warning)
 
 
 def _difference_cells(row: Difference) -> tuple[str, ...]:
