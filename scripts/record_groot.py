@@ -29,7 +29,7 @@ TASK = "Put the cube on the star."
 
 
 def record(checkpoint: Path, seed: int) -> dict[str, np.ndarray]:
-    """Every quantity of one inference; see `hooks.families.groot.verify`."""
+    """Every quantity of one inference; see `probe_kit.hooks.families.shared.lerobot.outputs`."""
     config: Any = PreTrainedConfig.from_pretrained(checkpoint)
     config.base_model_path = str(checkpoint / config.base_model_path)
     os.chdir(config.base_model_path)  # its configuration names the language model `vlm`

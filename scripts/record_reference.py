@@ -92,7 +92,7 @@ def stack(model: Any, entering: Tensor, mask: Tensor, positions: Tensor, **furth
 
 
 def record(policy: Any, batch: dict[str, Tensor], noise: Tensor) -> dict[str, np.ndarray]:
-    """Every quantity of one inference; see `hooks.families.shared.lerobot.verify` for names and shapes."""
+    """Every quantity of one inference; see `probe_kit.hooks.families.shared.lerobot.outputs`."""
     model, joint = policy.model, policy.model.paligemma_with_expert
     module = MODULES[policy.config.type]
     state = [policy.prepare_state(batch)] if policy.config.type == "pi0" else []
@@ -144,7 +144,7 @@ def record(policy: Any, batch: dict[str, Tensor], noise: Tensor) -> dict[str, np
 
 
 def record_tokens(policy: Any, batch: dict[str, Tensor]) -> dict[str, np.ndarray]:
-    """Every quantity of one inference of pi0-FAST; see `hooks.families.pi0_fast.verify`."""
+    """Every quantity of one inference of pi0-FAST; see `Pi0Fast.further_outputs`."""
     model, joint = policy.model, policy.model.paligemma_with_expert
     decoder, mask_of = joint.paligemma.model.language_model, modeling_pi0_fast.prepare_attention_masks_4d
     images, image_masks = policy._preprocess_images(batch)
@@ -186,7 +186,7 @@ def record_tokens(policy: Any, batch: dict[str, Tensor]) -> dict[str, np.ndarray
 
 
 def record_layers(checkpoint: Path, config: Any, seed: int) -> dict[str, np.ndarray]:
-    """Every quantity of one inference of MolmoAct2; see `hooks.families.molmoact2.verify`.
+    """Every quantity of one inference of MolmoAct2; see `MolmoAct2.further_outputs`.
 
     The instructions are equally long, because lerobot counts positions from its padding on.
     """

@@ -27,7 +27,7 @@ TASK = "Put the cube on the star"
 
 
 def record(checkpoint: Path, seed: int) -> dict[str, np.ndarray]:
-    """Every quantity of one inference; see `hooks.families.xvla.verify`."""
+    """Every quantity of one inference; see `probe_kit.hooks.families.shared.lerobot.outputs`."""
     policy: Any = XVLAPolicy.from_pretrained(str(checkpoint))
     before = PolicyProcessorPipeline.from_pretrained(
         checkpoint,
