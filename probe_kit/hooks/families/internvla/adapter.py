@@ -28,7 +28,8 @@ from probe_kit.hooks.families.internvla import INTERVENTIONS
 from probe_kit.hooks.families.internvla.checkpoint import Parts, find_parts
 from probe_kit.hooks.families.internvla.units import ActionUnits
 from probe_kit.hooks.families.shared.network_loading import Filled, fill, twin
-from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
+from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, CAMERA, QwenVLA
+from probe_kit.hooks.families.shared.sampling import seeded_noise
 from probe_kit.models.internvla import (
     InternVLANetwork,
     Schedule,

@@ -1,4 +1,4 @@
-"""Choice of output tokens: greedy, or sampled as evaluations do but with fixed seeds."""
+"""The draws from fixed seeds: output tokens, greedy or sampled as evaluations do, and the noise of flows."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -47,6 +47,12 @@ def chooser(temperature: float, seeds: Sequence[int], top: int | None = TOP, amo
         return (torch.stack(rows) + first).to(logits.device)
 
     return draw
+
+
+def seeded_noise(seeds: Sequence[int], shape: tuple[int, ...], device: str) -> Tensor:
+    """Return (B, *shape) float32 standard normal numbers, a row per seed, the same on every device."""
+    rows = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
+    return torch.stack(rows).to(device)
 
 
 def _draw(logits: Tensor, temperature: float, top: int | None, generator: torch.Generator) -> Tensor:

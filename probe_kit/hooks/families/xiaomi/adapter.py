@@ -31,7 +31,8 @@ from probe_kit.hooks.contract.state_layout import ARM_NUMBERS, laid_out
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights
 from probe_kit.hooks.families.shared.network_loading import DTYPES, Filled, fill, twin
 from probe_kit.hooks.families.shared.prompt_kv import kv_tap
-from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, CAMERA, QwenVLA, seeded_noise
+from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, CAMERA, QwenVLA
+from probe_kit.hooks.families.shared.sampling import seeded_noise
 from probe_kit.hooks.families.xiaomi import INTERVENTIONS
 from probe_kit.models.qwen import QwenInputs
 from probe_kit.models.xiaomi import (

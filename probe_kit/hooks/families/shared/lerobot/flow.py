@@ -19,6 +19,7 @@ from probe_kit.hooks.contract.sites import Site, kv_stream
 from probe_kit.hooks.families.shared.capabilities import FLOW
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy, checked_steps
 from probe_kit.hooks.families.shared.prompt_kv import attach_prompt_kv, kv_tap
+from probe_kit.hooks.families.shared.sampling import seeded_noise
 from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun, euler_path, numpy_of
 
 
@@ -152,12 +153,6 @@ class LerobotFlow(DenoisingPolicy):
         if run.calls["backbone"]:  # lerobot calls some backbones past their blocks
             produced["prefix_position_ids"] = lambda: numpy_of(run.calls["backbone"][0][1]["position_ids"])
         return produced
-
-
-def seeded_noise(seeds: Sequence[int], shape: tuple[int, ...], device: str) -> Tensor:
-    """(B, *shape) float32 standard normal, a row per seed, the same on every device."""
-    rows = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
-    return torch.stack(rows).to(device)
 
 
 def undecorated(method: Callable[..., Any]) -> Callable[..., Any]:

@@ -166,9 +166,3 @@ def recorded_inputs(policy: QwenVLA, recorded: Arrays) -> QwenInputs:
     names = ("in_input_ids", "in_attention_mask", "in_pixel_values", "in_image_grid_thw")
     ids, mask, pixels, grid = (torch.from_numpy(recorded[name]) for name in names)
     return QwenInputs(ids, mask, pixels, grid, int(policy.vlm.config.image_token_id))
-
-
-def seeded_noise(seeds: Sequence[int], shape: tuple[int, ...], device: str) -> Tensor:
-    """(B, …) float32 standard normal numbers, a row per seed, the same on every device."""
-    rows = [torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
-    return torch.stack(rows).to(device)
