@@ -110,13 +110,11 @@ def stacked(tape: ActivationCache, stream: Stream, quantity: str = "residual") -
     return numpy_of(values.reshape(steps, len(sites) // steps, *values.shape[1:]))
 
 
-def generation_outputs(
-    model: Any, stream: str, tape: ActivationCache, decoded: Any, ending: str = ""
-) -> dict[str, Produce]:
+def generation_outputs(model: Any, stream: str, tape: ActivationCache, decoded: Any) -> dict[str, Produce]:
     """Return the quantities of a decoder whose prompt and output tokens are two streams of one stack.
 
-    stream: of the output tokens. tape: with `compared_sites`. decoded: ids (B, N) and logits (B, N, V). ending: of
-    every name. States are laid out as transformers counts them: the stream at every block, and normed at the end.
+    stream: of the output tokens. tape: with `compared_sites`. decoded: ids (B, N) and logits (B, N, V).
+    States are laid out as transformers counts them: the stream at every block, and normed at the end.
     """
 
     def column(name: str, iteration: int | None) -> Tensor:
@@ -132,7 +130,7 @@ def generation_outputs(
     def logits() -> NDArray[Any]:
         return numpy_of(model.network.language_model.lm_head(states()[-1]))
 
-    produced: dict[str, Produce] = {
+    return {
         "hidden_states": lambda: numpy_of(states()),
         "logits": logits,
         "generated_ids": lambda: numpy_of(decoded.ids[0]),
@@ -141,7 +139,6 @@ def generation_outputs(
             torch.stack([column(stream, step)[:, 0, 0] for step in range(decoded.ids.shape[1])])
         ),
     }
-    return {f"{name}{ending}": own for name, own in produced.items()}
 
 
 @torch.inference_mode()
