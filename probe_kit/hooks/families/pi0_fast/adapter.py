@@ -223,24 +223,23 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     # -- verification ------------------------------------------------------------------------------------
 
-    def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> NDArray[Any]:
-        """Nothing is drawn in a golden reference."""
+    def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> dict[str, NDArray[Any]]:
+        """The chunks and their ids; nothing is drawn in a golden reference."""
         del recorded
         ids = self.tokens(batch, range(len(batch[TOKENS])))
-        return np.stack([chunk.values for chunk in self.chunks(ids)])
+        return {"actions": np.stack([chunk.values for chunk in self.chunks(ids)]), "tokens": numpy_of(ids)}
 
     def watched(self) -> dict[str, nn.Module]:
         """The logits."""
         return {"logits": self.network.model.paligemma_with_expert.paligemma.lm_head}
 
     def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
-        """Prepared pictures, and the ids that are put out with their logits."""
+        """Prepared pictures, and the logits of the ids that are put out."""
         batch = dict(run.batch)
         return {
             "prep_images": lambda: numpy_of(torch.stack(self.network._preprocess_images(batch)[0])),
             "prefix_pad": lambda: self.recorded_padding(run.recorded),
             "logits": lambda: numpy_of(torch.stack([step[:, -1] for step in run.calls["logits"]])),
-            "tokens": lambda: numpy_of(self.tokens(batch, range(len(batch[TOKENS])))),
         }
 
 

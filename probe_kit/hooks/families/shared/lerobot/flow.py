@@ -62,9 +62,9 @@ class DenoisingPolicy(LerobotPolicy):
         """(B, *noise_shape) float32 noise, a row per seed, the same on every device."""
         return seeded_noise(seeds, self.noise_shape, self.config.device)
 
-    def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> NDArray[Any]:
+    def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> dict[str, NDArray[Any]]:
         """From the recorded noise."""
-        return numpy_of(self.infer(batch, torch.from_numpy(recorded["in_noise"])))
+        return {"actions": numpy_of(self.infer(batch, torch.from_numpy(recorded["in_noise"])))}
 
 
 class LerobotFlow(DenoisingPolicy):

@@ -36,7 +36,7 @@ def lerobot_outputs(load: Callable[..., LerobotPolicy], folder: Path, recorded: 
         batch = _prepared(policy, recorded)
     else:
         batch = policy.batch(_observations(policy, recorded))
-    actions, tape, calls = watch(
+    replayed, tape, calls = watch(
         policy, lambda: policy.replay(batch, recorded), policy.watched(), policy.watched_inputs()
     )
     run = RecordedRun(batch, recorded, tape, calls)
@@ -44,8 +44,8 @@ def lerobot_outputs(load: Callable[..., LerobotPolicy], folder: Path, recorded: 
         **{name: partial(numpy_of, own) for name, own in batch.items()},
         **stream_outputs(policy, tape),
         **{name: partial(run.outputs, name) for name in policy.watched() if calls[name]},
-        "actions": lambda: actions,
-        "actions_unnormalized": lambda: policy.action_units.restore(np.asarray(actions, np.float32)),
+        **{name: partial(np.asarray, own) for name, own in replayed.items()},
+        "actions_unnormalized": lambda: policy.action_units.restore(np.asarray(replayed["actions"], np.float32)),
         **policy.further_outputs(run),
     }
     if TOKENS in batch:

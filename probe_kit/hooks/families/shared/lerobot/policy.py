@@ -601,8 +601,11 @@ class LerobotPolicy(Policy):
     # -- verification ------------------------------------------------------------------------------------
 
     @abstractmethod
-    def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> NDArray[Any]:
-        """(B, chunk, action numbers) that the network puts out with the randomness of a golden reference."""
+    def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> dict[str, NDArray[Any]]:
+        """Return what the network puts out with the randomness of a golden reference.
+
+        `actions` (B, chunk, action numbers), and what else only this inference has.
+        """
 
     def watched(self) -> dict[str, nn.Module]:
         """Modules whose outputs a golden reference holds, by the name of the quantity."""
