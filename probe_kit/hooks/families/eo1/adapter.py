@@ -17,10 +17,8 @@ from torch import Tensor, nn
 from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.eo1 import INTERVENTIONS
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
@@ -28,7 +26,7 @@ from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
 from probe_kit.hooks.families.shared.lerobot.pipelines import PREPROCESSOR, saved_steps
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE, checked_steps
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, TokenStack
-from probe_kit.hooks.families.shared.prompt_kv import kept_prompt, kv_tap
+from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.models.lerobot.eo1 import Packing, build_eo1, flow_actions
 
 TEMPLATE, PROCESSOR = "eo1_conversation_template_processor", "eo1_qwen_processor"
@@ -51,6 +49,7 @@ class Eo1(DenoisingPolicy):
 
     def __init__(self, network: Any, folder: Path) -> None:
         super().__init__(network, folder)
+        self.passages = network.model.prompt_kv
         self.prompt_kv = kept_prompt(self._vlm.config.text_config)
 
     @property
@@ -209,13 +208,6 @@ class Eo1(DenoisingPolicy):
         steps = checked_steps(int(self.config.num_denoise_steps), self.folder)
         shared = (decoder.layers, decoder.norm, int(decoder.config.hidden_size))
         return {"backbone": TokenStack(*shared, None), "expert": TokenStack(*shared, steps, first=1)}
-
-    def tap(self, site: Site) -> Tap:
-        """As in every decoder; the prompt's keys and values pass once it is read."""
-        stream = self.stream_of(site)
-        if stream is self.prompt_kv:
-            return kv_tap(self.network.model.prompt_kv, site)
-        return self.stacks[site.stream].tap(site)
 
     def watched(self) -> dict[str, nn.Module]:
         """The velocity."""

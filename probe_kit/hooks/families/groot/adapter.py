@@ -329,11 +329,6 @@ class Groot(DenoisingPolicy):
             stacks["bridge"] = BridgeStack(blocks, head.vl_self_attention, width, None, "norm1")
         return stacks
 
-    def tap(self, site: Site) -> Tap:
-        """The first norm of the block the site enters, the norm behind the last, or what a block adds."""
-        self.stream_of(site)
-        return self.stacks[site.stream].tap(site)
-
     # -- verification ------------------------------------------------------------------------------------
 
     def watched(self) -> dict[str, nn.Module]:

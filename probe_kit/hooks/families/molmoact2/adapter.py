@@ -37,7 +37,6 @@ from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, checked_steps
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
-from probe_kit.hooks.families.shared.prompt_kv import kv_tap
 from probe_kit.hooks.verification.outputs import Produce, RecordedRun, stacked
 from probe_kit.models.lerobot.molmoact2 import build_molmoact2, flow_actions, network_config, uses_cuda_graphs
 
@@ -87,6 +86,7 @@ class MolmoAct2(DenoisingPolicy):
     def __init__(self, network: Any, folder: Path) -> None:
         super().__init__(network, folder)
         text = network.model.config.text_config
+        self.passages = network._backbone().prompt_kv
         self.prompt_kv = kv_stream(int(text.num_hidden_layers), int(text.num_key_value_heads * text.head_dim))
 
     # -- loading -----------------------------------------------------------------------------------------
@@ -281,10 +281,7 @@ class MolmoAct2(DenoisingPolicy):
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the final norm, or what a block adds behind its gate."""
         self._check_graphs()
-        stream = self.stream_of(site)
-        if stream is self.prompt_kv:
-            return kv_tap(self.network._backbone().prompt_kv, site)
-        return self.stacks[site.stream].tap(site)
+        return super().tap(site)
 
     # -- verification ------------------------------------------------------------------------------------
 

@@ -23,8 +23,7 @@ from torch import Tensor, nn
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.checkpoints.checkpoint import side_files
-from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.families.pi0_fast import CAPTURED, FAST
 from probe_kit.hooks.families.pi0_fast.actions import ActionText, DecodedChunk, FastTokenizer, fast_folder
@@ -35,7 +34,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, TokenStack, flow_stacks
 from probe_kit.hooks.families.shared.lerobot.state_prompt import StatePrompt
-from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, kv_tap
+from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt
 from probe_kit.hooks.families.shared.sampling import chooser
 from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun, numpy_of
 from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, TokenPrompt, build_pi0_fast, decode_tokens
@@ -69,10 +68,12 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     acting_stream = "action"
     suffix_roles = ("action",)
+    prompt_tokens = ALL_BUT_LAST
 
     def __init__(self, network: Any, folder: Path) -> None:
         self.problems: list[tuple[str, ...]] = []
         super().__init__(network, folder)
+        self.passages = network.model.paligemma_with_expert.prompt_kv
         self.prompt_kv: Stream | None = kept_prompt(self._decoder.config)
 
     @classmethod
@@ -207,13 +208,6 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     def suffix_labels(self) -> list[str]:
         """One position at every iteration."""
         return ["action"]
-
-    def tap(self, site: Site) -> Tap:
-        """As in every decoder; the prompt's keys and values pass once it is read."""
-        stream = self.stream_of(site)
-        if stream is self.prompt_kv:
-            return kv_tap(self.network.model.paligemma_with_expert.prompt_kv, site, ALL_BUT_LAST)
-        return self.stacks[site.stream].tap(site)
 
     @property
     def unembedding(self) -> Unembedding:

@@ -285,11 +285,6 @@ class Xvla(DenoisingPolicy):
             "expert": SoftPromptedStack(expert.blocks, expert.blocks[-1], int(expert.hidden_size), steps, "norm1"),
         }
 
-    def tap(self, site: Site) -> Tap:
-        """See the stacks."""
-        self.stream_of(site)
-        return self.stacks[site.stream].tap(site)
-
     # -- verification ------------------------------------------------------------------------------------
 
     def watched(self) -> dict[str, nn.Module]:

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.hooks.capturing.gradients import frozen
-from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site, kv_stream
 from probe_kit.hooks.families.shared.capabilities import FLOW
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy, checked_steps
-from probe_kit.hooks.families.shared.prompt_kv import attach_prompt_kv, kv_tap
+from probe_kit.hooks.families.shared.prompt_kv import attach_prompt_kv
 from probe_kit.hooks.families.shared.sampling import seeded_noise
 from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun, euler_path, numpy_of
 
@@ -75,8 +74,8 @@ class LerobotFlow(DenoisingPolicy):
     def __init__(self, network: Any, folder: Path) -> None:
         super().__init__(network, folder)
         checked_steps(self.iterations, folder)
-        self._kept = attach_prompt_kv(self._joint, len(self.stacks["backbone"].layers))
-        self.prompt_kv = kv_stream(len(self._kept.keys), self._kv_width)
+        self.passages = attach_prompt_kv(self._joint, len(self.stacks["backbone"].layers))
+        self.prompt_kv = kv_stream(len(self.passages.keys), self._kv_width)
 
     @property
     @abstractmethod
@@ -105,16 +104,6 @@ class LerobotFlow(DenoisingPolicy):
     def noise_shape(self) -> tuple[int, int]:
         """Actions of a chunk, and the widest action."""
         return self.config.chunk_size, self.config.max_action_dim
-
-    def tap(self, site: Site) -> Tap:
-        """The first norm of the block the site enters, the stack's final norm, or a block's output.
-
-        Keys and values pass once the prompt is read; every iteration then begins with a copy of it.
-        """
-        stream = self.stream_of(site)
-        if stream is self.prompt_kv:
-            return kv_tap(self._kept, site)
-        return self.stacks[site.stream].tap(site)
 
     # -- verification ------------------------------------------------------------------------------------
 

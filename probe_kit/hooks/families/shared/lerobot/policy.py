@@ -24,9 +24,10 @@ from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, content_hashes, 
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.hooks.contract.card import ModelCard
-from probe_kit.hooks.contract.model import Policy
+from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.config_fields import Inert, check_one_frame, known_values
@@ -51,8 +52,10 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
 )
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
+from probe_kit.hooks.families.shared.prompt_kv import ALL_TOKENS, kv_tap
 from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun
 from probe_kit.models.initialisation import initialise
+from probe_kit.models.prompt_kv import PromptKV
 
 MOST_TOKENS = 1 << 16
 """Of a prompt: far beyond any policy, and no memory without end."""
@@ -82,6 +85,10 @@ class LerobotPolicy(Policy):
     """Steps of lerobot's processors that only this family has; None where it reads the pipelines itself."""
     other_roles: ClassVar[tuple[str, ...]]
     """What positions of the backbone hold besides pictures and padding."""
+    passages: PromptKV
+    """Where keys and values of the prompt pass, in families that have `prompt_kv`."""
+    prompt_tokens: ClassVar[slice] = ALL_TOKENS
+    """Of the prompt's keys and values, those of the backbone."""
     acting_stream: ClassVar[str]
     suffix_roles: ClassVar[tuple[str, ...]]
     """What positions of the acting stream hold."""
@@ -597,6 +604,12 @@ class LerobotPolicy(Policy):
         """The ids of each instruction, without padding."""
         tokens, mask = self.tokenise(instructions)
         return [tuple(row[kept].tolist()) for row, kept in zip(tokens, mask, strict=True)]
+
+    def tap(self, site: Site) -> Tap:
+        """Where its stack reads it; the prompt's keys and values pass once it is read."""
+        if self.stream_of(site) is self.prompt_kv:
+            return kv_tap(self.passages, site, self.prompt_tokens)
+        return self.stacks[site.stream].tap(site)
 
     # -- verification ------------------------------------------------------------------------------------
 
