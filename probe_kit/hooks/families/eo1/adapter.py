@@ -122,9 +122,13 @@ class Eo1(DenoisingPolicy):
     def batch(self, seen: Sequence[Observation], state: NDArray[np.float32] | None = None) -> dict[str, Tensor]:
         """In lerobot's keys. state: (B, numbers) as the network reads them."""
         numbers = torch.from_numpy(self.state(seen) if state is None else state)
+        packed = {**self._packed_of(seen), STATE: numbers}
+        return {name: own.to(self.config.device) for name, own in packed.items()}
+
+    def _packed_of(self, seen: Sequence[Observation]) -> dict[str, Tensor]:
+        """The chats of observations; see `_packed`."""
         pictures = {f"{IMAGES}{camera}": self._pictures(camera, seen).cpu() for camera in self.shown}
-        packed = self._packed(pictures, [one.instruction for one in seen])
-        return {name: own.to(self.config.device) for name, own in {**packed, STATE: numbers}.items()}
+        return self._packed(pictures, [one.instruction for one in seen])
 
     def _packed(self, pictures: Mapping[str, Tensor], tasks: Sequence[str]) -> dict[str, Tensor]:
         """Raises InstructionError for a text that holds one of the chat's own marks, or none."""
@@ -165,16 +169,11 @@ class Eo1(DenoisingPolicy):
     @classmethod
     def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
         """Raise InstructionError as `batch` would, from configuration and tokenizer alone."""
-        text = cls.__new__(cls)  # what packs needs no network
-        text.folder = checkpoint_folder(checkpoint)
-        text.config = cls._read_config(text.folder, evaluation)
-        text.cameras = text.shown = (next(iter(text.config.image_features)).removeprefix(IMAGES),)
-        text.token_ids(instructions)
+        cls._text_reader(checkpoint, evaluation).token_ids(instructions)
 
     def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
         """From the packing itself."""
-        pictures = {f"{IMAGES}{camera}": self._pictures(camera, seen).cpu() for camera in self.shown}
-        rows = self._labelled(self._packed(pictures, [one.instruction for one in seen]))
+        rows = self._labelled(self._packed_of(seen))
         prompts = [Roles.from_labels([label for _, label in row]) for row in rows]
         return {"backbone": prompts, "expert": [Roles.from_labels(self.suffix_labels())] * len(rows)}
 

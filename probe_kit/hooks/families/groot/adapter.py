@@ -20,7 +20,6 @@ from torch import Tensor, nn
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.checkpoints.checkpoint import side_files
-from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
@@ -283,11 +282,8 @@ class Groot(DenoisingPolicy):
     @classmethod
     def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
         """Raise InstructionError for a text without words, from configuration and tokenizer alone."""
-        text = cls.__new__(cls)  # what packs needs no network
-        text.folder = checkpoint_folder(checkpoint)
-        text.config = cls._read_config(text.folder, evaluation)
+        text = cls._text_reader(checkpoint, evaluation)
         text.config.places = Places.of(text.folder, text.config.base_model_path, text.config.vlm)
-        text.cameras = text.shown = (next(iter(text.config.image_features)).removeprefix(IMAGES),)
         text.token_ids(instructions)
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:

@@ -234,11 +234,8 @@ class MolmoAct2(DenoisingPolicy):
     @classmethod
     def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
         """Raise InstructionError for a prompt that does not fit, from configuration and tokenizer alone."""
-        text = cls.__new__(cls)  # what packs needs no network
-        text.folder = checkpoint_folder(checkpoint, SMALL_FILES)
-        text.config = cls._read_config(text.folder, evaluation)
+        text = cls._text_reader(checkpoint, evaluation, SMALL_FILES)
         text.config.checkpoint_path = str(network_folder(text.folder, text.config.checkpoint_path))
-        text.cameras = text.shown = (next(iter(text.config.image_features)).removeprefix(IMAGES),)
         text.token_ids(instructions)
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:

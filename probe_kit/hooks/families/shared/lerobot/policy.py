@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, PATTERNS, content_hashes, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.hooks.contract.card import ModelCard
@@ -508,10 +508,16 @@ class LerobotPolicy(Policy):
     @classmethod
     def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
         """Raise InstructionError as `tokenise` would, from configuration and tokenizer alone."""
-        text = cls.__new__(cls)  # what tokenises needs no network
-        text.folder, text.evaluation = checkpoint_folder(checkpoint), evaluation
+        cls._text_reader(checkpoint, evaluation).tokenise(instructions)
+
+    @classmethod
+    def _text_reader(cls, checkpoint: str, evaluation: Evaluation, patterns: Sequence[str] = PATTERNS) -> Self:
+        """Return a policy without a network, which still packs and tokenises. patterns: the files it needs."""
+        text = cls.__new__(cls)
+        text.folder, text.evaluation = checkpoint_folder(checkpoint, patterns), evaluation
         text.config = cls._read_config(text.folder, evaluation)
-        text.tokenise(instructions)
+        text.cameras = text.shown = tuple(key.removeprefix(IMAGES) for key in text.config.image_features)[:1]
+        return text
 
     def window(self, camera: str) -> PictureWindow:
         """The part of one camera's picture that this checkpoint looks at."""
