@@ -19,7 +19,8 @@ from probe_kit.hooks.checkpoints.adapter_files import (
 )
 from probe_kit.hooks.checkpoints.checkpoint import ADAPTER_FILE, CONFIG_FILE, PATTERNS, is_weights, plain_folder
 
-_CONFIGURATIONS = (CONFIG_FILE, "config.yaml")
+CONFIGURATIONS = (CONFIG_FILE, "config.yaml")
+"""Either holds the configuration of a network."""
 _READ_TOGETHER = (
     (("policy_preprocessor.json",), ("policy_preprocessor",)),
     (("policy_postprocessor.json",), ("policy_postprocessor",)),
@@ -61,7 +62,7 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
 
 def has_configuration(folder: Path) -> bool:
     """Whether a folder has the configuration of a network."""
-    return any((folder / name).is_file() for name in _CONFIGURATIONS)
+    return any((folder / name).is_file() for name in CONFIGURATIONS)
 
 
 def file_state(place: Path) -> tuple[object, ...]:

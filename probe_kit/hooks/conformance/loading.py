@@ -8,11 +8,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, ProbeKitError, UsageError, WeightsError
+from probe_kit.hooks.checkpoints.folders import CONFIGURATIONS
 from probe_kit.hooks.conformance.check import CheckFailedError, SkipTest, check, refused, require
 from probe_kit.hooks.conformance.subject import Subject
 from probe_kit.hooks.verification.verify import CHECKPOINT_FOLDER, REFERENCE_FILE, verify_reference
 
-_CONFIGURATIONS = ("config.json", "config.yaml")
 _DAMAGES = {
     "missing": "a tensor is missing",
     "extra": "a tensor is there that the network lacks",
@@ -41,9 +41,9 @@ def the_card_names_the_weights(subject: Subject) -> None:
 def every_file_that_is_read_reaches_the_card(subject: Subject) -> None:
     """A space at the end of a configuration makes another identity."""
     copied = _copy(subject)
-    configuration = next((copied / name for name in _CONFIGURATIONS if (copied / name).is_file()), None)
+    configuration = next((copied / name for name in CONFIGURATIONS if (copied / name).is_file()), None)
     if configuration is None:
-        raise SkipTest(f"the checkpoint has no {' or '.join(_CONFIGURATIONS)}")
+        raise SkipTest(f"the checkpoint has no {' or '.join(CONFIGURATIONS)}")
     before = subject.load(copied).card
     configuration.write_text(configuration.read_text(encoding="utf-8") + " ", encoding="utf-8")
     after = subject.load(copied).card
