@@ -84,9 +84,9 @@ def eo1() -> dict[str, torch.Tensor]:
     from lerobot.policies.eo1.configuration_eo1 import EO1Config
     from lerobot.policies.eo1.modeling_eo1 import EO1Policy
 
-    from probe_kit.models.qwen import full_size_qwen2_5_vl
+    from probe_kit.models.qwen import qwen2_5_vl_config
 
-    sizes = full_size_qwen2_5_vl("3B").config.to_dict()
+    sizes = qwen2_5_vl_config("3B").to_dict()
     config = EO1Config(device="cpu", dtype="float32", vlm_config=sizes, input_features=PICTURE)
     config.pretrained_path = Path()
     return EO1Policy(_on_meta(config)).state_dict()

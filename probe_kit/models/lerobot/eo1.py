@@ -24,7 +24,7 @@ from probe_kit.errors import CheckpointError
 from probe_kit.models.building import build_empty, fill_rotary, replaced
 from probe_kit.models.pretrained import load_pretrained
 from probe_kit.models.prompt_kv import PromptKV
-from probe_kit.models.qwen import full_size_qwen2_5_vl
+from probe_kit.models.qwen import qwen2_5_vl_config
 from probe_kit.models.sizes_only import building_device
 
 
@@ -52,7 +52,7 @@ def full_size_eo1() -> EO1Policy:
     config = EO1Config(
         device="cpu",
         dtype="float32",
-        vlm_config=full_size_qwen2_5_vl("3B").config.to_dict(),
+        vlm_config=qwen2_5_vl_config("3B").to_dict(),
         input_features={"observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 224, 224))},
     )
     return build_eo1(config, "meta")

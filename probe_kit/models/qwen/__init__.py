@@ -12,6 +12,7 @@ from probe_kit.models.qwen.networks import (
     build_qwen3_vl,
     full_size_qwen2_5_vl,
     full_size_qwen3_vl,
+    qwen2_5_vl_config,
 )
 from probe_kit.models.qwen.pictures import QwenPictures, merged_tokens
 
@@ -29,5 +30,6 @@ __all__ = [
     "image_slots",
     "merged_tokens",
     "pack_inputs",
+    "qwen2_5_vl_config",
     "without_precision",
 ]

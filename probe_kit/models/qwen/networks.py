@@ -66,8 +66,8 @@ def _built(make: Any, dtype: torch.dtype, device: str) -> Any:
     return network
 
 
-def full_size_qwen2_5_vl(size: str) -> Any:
-    """A released size on the meta device."""
+def qwen2_5_vl_config(size: str) -> Qwen2_5_VLConfig:
+    """Return the configuration of a released size."""
     text = {**_QWEN2_5[size], "rope_scaling": {"type": "mrope", "mrope_section": [16, 24, 24]}}
     vision = {
         "depth": 32,
@@ -80,8 +80,12 @@ def full_size_qwen2_5_vl(size: str) -> Any:
         "fullatt_block_indexes": [7, 15, 23, 31],
     }
     tied = size in _TIED
-    config = Qwen2_5_VLConfig(text_config=text, vision_config=vision, tie_word_embeddings=tied)
-    return build_qwen2_5_vl(config, torch.float32)
+    return Qwen2_5_VLConfig(text_config=text, vision_config=vision, tie_word_embeddings=tied)
+
+
+def full_size_qwen2_5_vl(size: str) -> Any:
+    """A released size on the meta device."""
+    return build_qwen2_5_vl(qwen2_5_vl_config(size), torch.float32)
 
 
 def full_size_qwen3_vl(size: str) -> Any:
