@@ -19,6 +19,17 @@ _HEAVY = 3
 _LISTED = f"import sys, {{module}}; sys.exit({_HEAVY} if 'torch' in sys.modules else 0)"
 _PATIENCE = 120
 """Seconds in which a module can be imported."""
+_RUNS = {
+    True: (
+        "two_episodes_are_extracted",
+        "Two episodes are extracted, and every stored site is loaded again.",
+    ),
+    False: (
+        "two_questions_are_asked",
+        "Questions about two episodes are asked, and every stored site is loaded again.",
+    ),
+}
+"""Name and sentence of the run by whether it acts."""
 _RUN_ADVICE = "Correct what the error names; the contract checks above do not see a scene."
 
 
@@ -71,33 +82,23 @@ def outcomes(subjects: Sequence[Subject]) -> Iterator[Outcome]:
     del model
     for subject in subjects:
         subject.close()  # a run loads its own
-    yield from _runs(subjects, mismatch, checked)
+    for subject in subjects:
+        with subject:
+            yield checked(*_RUNS[subject.acting], _RUN_ADVICE, partial(_run, subject, mismatch))
 
 
-def _runs(subjects: Sequence[Subject], mismatch: bool, checked: Callable[..., Outcome]) -> Iterator[Outcome]:
+def _run(subject: Subject, mismatch: bool) -> None:
     from probe_kit.check_adapter.smoke_run import act_twice, answer_twice
 
-    for subject in subjects:
-        name, words = subject.name, subject.instructions[0]
-        chosen: dict[str, Any] = {
-            "checkpoint": subject.given_checkpoint, "options": subject.options, "device": subject.device,
-            "dtype": subject.dtype,
-        }  # fmt: skip
-        with subject:
-            if subject.acting:
-                yield checked(
-                    "two_episodes_are_extracted",
-                    "Two episodes are extracted, and every stored site is loaded again.",
-                    _RUN_ADVICE,
-                    lambda: act_twice(name, chosen, words, mismatch, subject.folder),  # noqa: B023 - called at once
-                )
-            else:
-                yield checked(
-                    "two_questions_are_asked",
-                    "Questions about two episodes are asked, and every stored site is loaded again.",
-                    _RUN_ADVICE,
-                    lambda: answer_twice(name, chosen, words, subject.folder),  # noqa: B023 - called at once
-                )
+    chosen: dict[str, Any] = {
+        "checkpoint": subject.given_checkpoint, "options": subject.options, "device": subject.device,
+        "dtype": subject.dtype,
+    }  # fmt: skip
+    words = subject.instructions[0]
+    if subject.acting:
+        act_twice(subject.name, chosen, words, mismatch, subject.folder)
+    else:
+        answer_twice(subject.name, chosen, words, subject.folder)
 
 
 def _require_light(module: str) -> None:
