@@ -7,9 +7,6 @@ probe_kit is used: torch's own hooks read the modules of one `predict_action_chu
 compares the adapter with it.
 """
 
-import argparse
-import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +14,7 @@ import lerobot
 import numpy as np
 import torch
 import transformers
+from golden_folder import reference_parser, write_reference
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.eo1.modeling_eo1 import EO1Policy
 from lerobot.processor import PolicyProcessorPipeline
@@ -83,21 +81,13 @@ def record(checkpoint: Path, seed: int) -> dict[str, np.ndarray]:
 
 def main() -> None:
     """Write the reference beside a copy of the checkpoint."""
-    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
+    chosen = reference_parser(str(__doc__).splitlines()[0]).parse_args()
     found = record(chosen.checkpoint, chosen.seed)
-    shutil.copytree(chosen.checkpoint, chosen.folder / "checkpoint", dirs_exist_ok=True)
-    np.savez_compressed(chosen.folder / "reference.npz", **found)
-    modules = {"torch": torch, "transformers": transformers, "lerobot": lerobot}
-    versions = {name: own.__version__ for name, own in modules.items()}
-    (chosen.folder / "README.md").write_text(
-        "# Golden reference: eo1\n\nRecorded by `scripts/record_eo1.py` with lerobot's own loading, processors "
-        f"and sampling; random weights. {json.dumps(versions)}\n",
-        encoding="utf-8",
+    recorded = (
+        "eo1\n\nRecorded by `scripts/record_eo1.py` with lerobot's own loading, processors and sampling; "
+        "random weights"
     )
+    write_reference(chosen.checkpoint, chosen.folder, found, recorded, (torch, transformers, lerobot))
 
 
 if __name__ == "__main__":

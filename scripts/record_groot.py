@@ -8,10 +8,7 @@ Nothing of probe_kit is used. The script fails unless the actions of the modules
 those of `predict_action_chunk`. `probe-kit verify groot FOLDER` compares the adapter with it.
 """
 
-import argparse
-import json
 import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +17,7 @@ import lerobot
 import numpy as np
 import torch
 import transformers
+from golden_folder import reference_parser, write_reference
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.groot import processor_groot
 from lerobot.policies.groot.modeling_groot import GrootPolicy
@@ -86,25 +84,17 @@ def record(checkpoint: Path, seed: int) -> dict[str, np.ndarray]:
 
 def main() -> None:
     """Write the reference beside a copy of the checkpoint, without the base model's weights."""
-    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
+    chosen = reference_parser(str(__doc__).splitlines()[0]).parse_args()
     checkpoint, folder = chosen.checkpoint.resolve(), chosen.folder.resolve()
     with torch.inference_mode():
         found = record(checkpoint, chosen.seed)
-    shutil.copytree(checkpoint, folder / "checkpoint", dirs_exist_ok=True)
+    recorded = (
+        "groot\n\nRecorded by `scripts/record_groot.py` with lerobot's own loading, processors and modules; "
+        "random weights"
+    )
+    write_reference(checkpoint, folder, found, recorded, (torch, transformers, diffusers, lerobot))
     for weights in (folder / "checkpoint" / "base").glob("*.safetensors*"):
         weights.unlink()
-    np.savez_compressed(folder / "reference.npz", **found)
-    modules = {"torch": torch, "transformers": transformers, "diffusers": diffusers, "lerobot": lerobot}
-    versions = {name: own.__version__ for name, own in modules.items()}
-    (folder / "README.md").write_text(
-        "# Golden reference: groot\n\nRecorded by `scripts/record_groot.py` with lerobot's own loading, "
-        f"processors and modules; random weights. {json.dumps(versions)}\n",
-        encoding="utf-8",
-    )
 
 
 if __name__ == "__main__":

@@ -10,8 +10,6 @@ calls equal those of `predict_action_chunk`. `probe-kit verify FAMILY FOLDER` co
 """
 
 import argparse
-import json
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,6 +20,7 @@ import lerobot
 import numpy as np
 import torch
 import transformers
+from golden_folder import reference_parser, write_reference
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pi0 import modeling_pi0
 from lerobot.policies.pi0_fast import modeling_pi0_fast
@@ -314,11 +313,8 @@ def quantiles(checkpoint: Path, pipeline: str, feature: str) -> tuple[np.ndarray
 
 def main() -> None:
     """Write `reference.npz`, the checkpoint and a README of one paragraph."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("folder", type=Path)
+    parser = reference_parser(str(__doc__))
     parser.add_argument("--cameras", nargs="+", default=["base"])
-    parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     config: Any = PreTrainedConfig.from_pretrained(chosen.checkpoint)
     if config.type == "molmoact2":
@@ -360,19 +356,11 @@ def main() -> None:
 
 def write(chosen: argparse.Namespace, kind: str, found: dict[str, np.ndarray]) -> None:
     """The reference beside a copy of the checkpoint, and where both come from."""
-    chosen.folder.mkdir(parents=True, exist_ok=True)
-    shutil.copytree(chosen.checkpoint, chosen.folder / "checkpoint", dirs_exist_ok=True)
-    np.savez_compressed(chosen.folder / "reference.npz", **found)
-    versions = {
-        "torch": torch.__version__,
-        "transformers": transformers.__version__,
-        "lerobot": lerobot.__version__,
-    }
-    (chosen.folder / "README.md").write_text(
-        f"# Golden reference: {kind}\n\nRecorded by `scripts/record_reference.py` with lerobot's own "
-        f"blocks, called one by one; {WEIGHTS.get(kind, 'random weights')}. {json.dumps(versions)}\n",
-        encoding="utf-8",
+    recorded = (
+        f"{kind}\n\nRecorded by `scripts/record_reference.py` with lerobot's own blocks, called one by one; "
+        f"{WEIGHTS.get(kind, 'random weights')}"
     )
+    write_reference(chosen.checkpoint, chosen.folder, found, recorded, (torch, transformers, lerobot))
 
 
 if __name__ == "__main__":

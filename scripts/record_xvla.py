@@ -7,9 +7,6 @@ script fails unless the actions of the modules, called one after the other, equa
 `probe-kit verify xvla FOLDER` compares the adapter with it.
 """
 
-import argparse
-import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +14,7 @@ import lerobot
 import numpy as np
 import torch
 import transformers
+from golden_folder import reference_parser, write_reference
 from lerobot.policies.xvla.modeling_xvla import XVLAPolicy
 from lerobot.policies.xvla.soft_transformer import timestep_embedding
 from lerobot.processor import PolicyProcessorPipeline
@@ -120,22 +118,14 @@ def expert_streams(
 
 def main() -> None:
     """Write the reference beside a copy of the checkpoint."""
-    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--seed", type=int, default=0)
-    chosen = parser.parse_args()
+    chosen = reference_parser(str(__doc__).splitlines()[0]).parse_args()
     with torch.inference_mode():
         found = record(chosen.checkpoint, chosen.seed)
-    shutil.copytree(chosen.checkpoint, chosen.folder / "checkpoint", dirs_exist_ok=True)
-    np.savez_compressed(chosen.folder / "reference.npz", **found)
-    modules = {"torch": torch, "transformers": transformers, "lerobot": lerobot}
-    versions = {name: own.__version__ for name, own in modules.items()}
-    (chosen.folder / "README.md").write_text(
-        "# Golden reference: xvla\n\nRecorded by `scripts/record_xvla.py` with lerobot's own loading, processors "
-        f"and modules; random weights. {json.dumps(versions)}\n",
-        encoding="utf-8",
+    recorded = (
+        "xvla\n\nRecorded by `scripts/record_xvla.py` with lerobot's own loading, processors and modules; "
+        "random weights"
     )
+    write_reference(chosen.checkpoint, chosen.folder, found, recorded, (torch, transformers, lerobot))
 
 
 if __name__ == "__main__":
