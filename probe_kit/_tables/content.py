@@ -128,10 +128,18 @@ class Content:
         """The notes as sentences."""
         return tuple(map(_sentence, self.notes))
 
-    def is_numeric(self, column: int) -> bool:
-        """Return whether the column holds numbers, which stand to the right."""
-        texts = [row.cells[column].text for row in self.rows]
-        return column >= self.names and any(texts) and all(map(_NUMBER.match, texts))
+    @property
+    def are_numeric(self) -> tuple[bool, ...]:
+        """Whether each column holds numbers, which stand to the right."""
+        return tuple(
+            at >= self.names and any(texts) and all(map(_NUMBER.match, texts))
+            for at, texts in enumerate(self._by_column)
+        )
+
+    @property
+    def _by_column(self) -> list[tuple[str, ...]]:
+        """The cells of each column as text."""
+        return [*zip(*self.texts, strict=True)] or [()] * len(self.headings)
 
     def only(self, columns: Sequence[int]) -> Self:
         """Return the table with some of its columns, those that name the rows first."""
@@ -145,12 +153,11 @@ class Content:
 
     def filled(self, *empty: str) -> Self:
         """Return the table without columns in which no row has anything to show; or only these texts."""
-        texts = [*zip(*self.texts, strict=True)] or [("",)] * len(self.headings)
         return self.only(
             [
                 at
-                for at, column in enumerate(texts)
-                if at < self.names or any(text not in (NONE, "", *empty) for text in column)
+                for at, texts in enumerate(self._by_column)
+                if at < self.names or any(text not in (NONE, "", *empty) for text in texts)
             ]
         )
 

@@ -118,7 +118,7 @@ def _tabular(table: Content) -> list[str]:
     )
     if several:
         styler = styler.format_index(lambda name: escape(str(name)), axis="columns", level=0)
-    aligned = "".join("r" if table.is_numeric(at) else "l" for at in range(len(table.headings)))
+    aligned = "".join("r" if is_numeric else "l" for is_numeric in table.are_numeric)
     text = styler.to_latex(hrules=True, column_format=aligned, multicol_align="c")
     begin, *inside, end = text.strip().splitlines()
     starts = [at for at, (before, row) in enumerate(pairwise(table.rows), 1) if before.is_mean != row.is_mean]
