@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.selection import scores_of
 from probe_kit.retention.displays.base.style import PARTS, layer_axis, significance_handles
 from probe_kit.retention.displays.labels.label_panel import (
     BACKGROUND,
@@ -75,8 +76,7 @@ class LabelCurveDisplay(LabelPanel):
         numbers = np.unique(layers)
         best = np.array([curve.largest_excess(rows[layers == layer]) for layer in numbers])
         several = int(max((layers == layer).sum() for layer in numbers))
-        scores = results.scores
-        table = scores[(scores["view"] == view) & (scores["category"] == category)].set_index("site")
+        table = scores_of(results, category, view).set_index("site")
         shown = table.loc[[str(curve.sites[row]) for row in best]]
         limits = shown[["ci_low", "ci_high"]].to_numpy(dtype=float).T
         null = curve.null[best]

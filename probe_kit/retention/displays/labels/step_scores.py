@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.selection import scores_of
 from probe_kit.retention.displays.base.style import GREEN, PARTS, Line, significance_handles
 from probe_kit.retention.displays.labels.label_panel import (
     LabelPanel,
@@ -71,9 +72,7 @@ class StepScoresDisplay(LabelPanel):
             raise UsageError(f"the label {results.settings.target!r} has one step; expected several to show")
         row = best_row(curve, stream)
         own, scores = results.settings, curve.scores[row]
-        scores_of_sites = results.scores
-        of_place = (scores_of_sites["view"] == view) & (scores_of_sites["category"] == category)
-        table = scores_of_sites[of_place].set_index("site")
+        table = scores_of(results, category, view).set_index("site")
         balanced = curve.step_scores(scores)
         limits = [
             score_interval(
