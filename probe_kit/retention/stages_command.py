@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probe_kit._terminal.console import marked, out, print_json, say
+from probe_kit._terminal.console import marked, out, print_json
 from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.retention.label_commands import save_all
 
 if TYPE_CHECKING:
     from probe_kit.retention.choices import AnswerScore
-    from probe_kit.retention.compare.known_used import KnownUsedTable
 
 
 def show_stages(
@@ -59,12 +59,6 @@ def show_stages(
         for note in joined.notes:
             out.print(marked("[yellow]{}[/]", note))
     if figures is not None:
-        _save(joined, figures)
+        from probe_kit.retention.displays.known_used import known_used_figures
 
-
-def _save(joined: "KnownUsedTable", folder: Path) -> None:
-    from probe_kit.retention.displays.known_used import known_used_figures
-    from probe_kit.retention.displays.report_figures import save_figures
-
-    for path in save_figures(list(known_used_figures([joined])), folder):
-        say(f"figure: {path}")
+        save_all(list(known_used_figures([joined])), figures)
