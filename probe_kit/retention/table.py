@@ -83,10 +83,10 @@ class RetentionTable:
         rows = [one for run in self.summary for one in run.categories]
         item = Markup("<li><b>{}</b> {}</li>")
         sentences = Markup("").join(item.format(one.name, without_places(one.finding)) for one in rows)
-        tables = [table for title, table in self._tables().items() if title != "Controls"]
+        tables = [table for title, table in self.tables().items() if title != "Controls"]
         shown = "".join(own._repr_html_() for table in tables if (own := table.details(False)) is not None)
         details = f"<details><summary>All tables</summary>{shown}</details>"
-        return f"{self._summary_table()._repr_html_()}<ul>{sentences}</ul>{details}"
+        return f"{self.summary_table._repr_html_()}<ul>{sentences}</ul>{details}"
 
     @property
     def rule(self) -> str:
@@ -182,13 +182,13 @@ class RetentionTable:
         details: as of `to_rich`.
         """
         sentences = [f"{one.name}  {one.finding}" for run in self.summary for one in run.categories]
-        return render(style, [self._summary_table(), *self._details(details)], sentences, self.notes)
+        return render(style, [self.summary_table, *self._details(details)], sentences, self.notes)
 
     def to_markdown(self) -> str:
         """Success rates, retention, controls and differences as Markdown tables, with all columns."""
         rows = [one for run in self.summary for one in run.categories]
         sentences = [*(f"{one.name}  {one.finding}" for one in rows), *(one.details for one in rows)]
-        tables = [self._summary_table(), *self._tables().values(), *self.wording_tables, *self.further_tables]
+        tables = [self.summary_table, *self.tables().values(), *self.wording_tables, *self.further_tables]
         return render("markdown", tables, sentences, self.notes)
 
     def to_latex(self, details: Collection[Section] | Literal["all"] = ()) -> str:
@@ -196,10 +196,11 @@ class RetentionTable:
 
         details: sections whose tables stand below it, as of `to_rich`; all of them by "all".
         """
-        tables = [self._summary_table(), *self._details(details)]
+        tables = [self.summary_table, *self._details(details)]
         return render("latex", tables, notes=(*self.unpaired, *self.notes))
 
-    def _tables(self, sections: Collection[Section] | None = None) -> dict[str, Table]:
+    def tables(self, sections: Collection[Section] | None = None) -> dict[str, Table]:
+        """Return answers, success, retention and controls by title. sections: those shown, all by default."""
         return retention_tables(self.all_rows, self.differences, self.unpaired, sections)
 
     @property
@@ -207,13 +208,15 @@ class RetentionTable:
         """The wordings of each run against each other, a table per run."""
         return wording_tables(self.wordings, {row.run.location: row.run.label for row in self.rows})
 
-    def _summary_table(self) -> Table:
+    @property
+    def summary_table(self) -> Table:
+        """A row per category and run, and below them the differences of runs."""
         return summary_table(self.summary, self.differences)
 
     def _details(self, details: Collection[Section] | Literal["all"]) -> list[Table]:
         """The tables of some sections, without columns that need room."""
         sections: Collection[Section] = get_args(Section) if details == "all" else details
-        narrow = (table.details(False) for table in self._tables(sections).values())
+        narrow = (table.details(False) for table in self.tables(sections).values())
         wordings = self.wording_tables if "success" in sections else []
         further = self.further_tables if "answers" in sections else vlm_vla_tables(self.vlm_vla)
         return [*(table for table in narrow if table is not None), *wordings, *further]
@@ -251,7 +254,7 @@ class RetentionTable:
             short += [Text(run.title, style="bold")] * (len(summary) > 1) + [*map(Text, run.sentences)]
         last = Text(next_step(self.rows), style="bold") if with_next_step else Text("")
         return Group(
-            *self._details(details), *long, self._summary_table(), *notes, *short, *[last] * bool(last.plain)
+            *self._details(details), *long, self.summary_table, *notes, *short, *[last] * bool(last.plain)
         )
 
     @property

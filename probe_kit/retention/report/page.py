@@ -10,8 +10,7 @@ from probe_kit._terminal.plain_text import without_places
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.comparisons import known_used_tables
 from probe_kit.retention.columns.modes import Modes, modes_of
-from probe_kit.retention.columns.summary import summary_table
-from probe_kit.retention.columns.tables import SUBJECTS, retention_tables
+from probe_kit.retention.columns.tables import SUBJECTS
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.joins import joins_of
@@ -64,7 +63,7 @@ def report_html(
     modes = modes_of(rows)
     places = tuple(place for run in runs for place in (run.location.address, str(run.location)))
     tables = _tables(table)
-    summary = summary_table(table.summary, table.differences)
+    summary = table.summary_table
     shown_names = [without_places(name, places) for name in names]
     grid = episode_grid(as_judged, shown_names, pictures)
     in_words = _in_words(table)
@@ -125,7 +124,7 @@ _ANSWERED: dict[Modes, str] = {
 def _tables(table: RetentionTable) -> dict[str, list[Table]]:
     """By subject its tables."""
     found: dict[str, list[Table]] = {subject: [] for subject in SUBJECTS.values()}
-    for title, one in retention_tables(table.all_rows, table.differences, table.unpaired).items():
+    for title, one in table.tables().items():
         found[SUBJECTS[title]].append(one)
     return found
 
