@@ -226,9 +226,14 @@ def _by_view(drawn: Sequence[RowWithEstimates]) -> dict[str | None, Drawn]:
 
 @dataclass(frozen=True)
 class _Gap:
-    """One category of two sides. accuracies: by stream. pooled: scores of either side, None without probes."""
+    """One category of two sides.
+
+    rates: success of either side, None where a run has none. sr: their difference. accuracies: by stream. pooled:
+    scores of either side, None without probes.
+    """
 
     paired: bool
+    rates: tuple[Rate | None, Rate | None]
     sr: Rate | None
     accuracies: Mapping[str, Rate] = field(default_factory=dict)
     pooled: tuple[PooledScores, PooledScores] | None = None
@@ -236,18 +241,16 @@ class _Gap:
     @classmethod
     def of(cls, here: Sequence[RowWithEstimates], there: Sequence[RowWithEstimates]) -> "_Gap":
         """Means over the runs of either side; a number that a run lacks is left out."""
-        rates = [_rate(side) for side in (here, there)]
-        pooled = [_pooled(side) for side in (here, there)]
-        mine, theirs = rates
+        rates = mine, theirs = _rate(here), _rate(there)
+        first, second = _pooled(here), _pooled(there)
         sr = None if mine is None or theirs is None else mine.minus(theirs)
-        first, second = pooled
         if first is None or second is None:
-            return cls(mine is not None and theirs is not None and mine.paired_with(theirs), sr)
+            return cls(mine is not None and theirs is not None and mine.paired_with(theirs), rates, sr)
         same = first.shares_groups_with(second)
         paired = same if mine is None or theirs is None else mine.paired_with(theirs)
         names = [name for name in first.names if name in second.names]
         gaps = {name: first.accuracy_difference(second, name) for name in names}
-        return cls(paired, sr, gaps, (first, second))
+        return cls(paired, rates, sr, gaps, (first, second))
 
     @property
     def has_retention(self) -> bool:
@@ -310,7 +313,7 @@ def _row(
     )
     defined = all(any(one.row.retention.defined for found in side for one in found) for side in (first, second))
     ratio = _retention([gap for gap in gaps if gap.has_retention]) if defined else None
-    rates = [[_rate(of_category) for of_category in side] for side in (first, second)]
+    rates = [[gap.rates[side] for gap in gaps] for side in (0, 1)]
     known = sr is not None
     origins = {**sides[0].origins, **sides[1].origins}
     numbers: dict[str, float | Limits | None] = {
