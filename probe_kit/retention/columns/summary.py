@@ -10,6 +10,7 @@ from probe_kit.retention.columns.findings import finding
 from probe_kit.retention.columns.sentences import chance_only, describe_category, knows, verdict
 from probe_kit.retention.columns.text import (
     P_DECIDES,
+    by_run,
     difference_test,
     is_vlm,
     model_name,
@@ -188,9 +189,9 @@ def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:
     means = [row for row in all_rows if row.category == MEAN]
     asked = [row for row in rows if is_vlm(row) and _asks_for_the_answer(row)]
     asked_means = {row.run.location: row for row in means if is_vlm(row)}
-    policies = _by_run([row for row in rows if not is_vlm(row)])
+    policies = by_run([row for row in rows if not is_vlm(row)])
     beside = {row.run.suite for row in rows if not is_vlm(row)}
-    alone = _by_run([row for row in rows if is_vlm(row) and row.run.suite not in beside])
+    alone = by_run([row for row in rows if is_vlm(row) and row.run.suite not in beside])
     mean_of = {(mean.key, mean.view): mean for mean in means}
     found = []
     for of_run in (*policies, *alone):
@@ -207,10 +208,3 @@ def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:
 
 def _asks_for_the_answer(row: RetentionRow) -> bool:
     return row.answers.asked_for in (None, "target") and row.answers.picture != "none"
-
-
-def _by_run(rows: Sequence[RetentionRow]) -> list[list[RetentionRow]]:
-    found: dict[tuple[str | None, str], list[RetentionRow]] = {}
-    for row in rows:
-        found.setdefault(row.key, []).append(row)
-    return list(found.values())

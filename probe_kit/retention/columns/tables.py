@@ -13,6 +13,7 @@ from probe_kit.retention.columns.sentences import chance_only
 from probe_kit.retention.columns.text import (
     ABOVE_CHANCE,
     P_DECIDES,
+    by_run,
     call_words,
     controlled,
     difference_name,
@@ -270,12 +271,8 @@ def _difference_legend(differences: Sequence[Difference], has_tests: bool) -> st
 
 def _sizes(rows: Sequence[RetentionRow]) -> list[str]:
     """Return per run its folder and the range of its sizes; one sentence where runs have the same."""
-    by_run: dict[tuple[str | None, str], list[RetentionRow]] = {}
-    for row in rows:
-        if row.category != MEAN:
-            by_run.setdefault(row.key, []).append(row)
     sizes: dict[str, list[str]] = {}
-    for own in by_run.values():
+    for own in by_run([row for row in rows if row.category != MEAN]):
         sizes.setdefault(_size(own), []).append(Path(own[0].run.location).name)
     return [f"run{'s' * (len(names) > 1)} {', '.join(names)}: {size}" for size, names in sizes.items()]
 

@@ -173,6 +173,14 @@ def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
     return list({(row.run.location, row.category): row for row in reversed(rows)}.values())[::-1]
 
 
+def by_run(rows: Sequence[RetentionRow]) -> list[list[RetentionRow]]:
+    """Return the rows of each run, and group, in the order of their first ones."""
+    found: dict[tuple[str | None, str], list[RetentionRow]] = {}
+    for row in rows:
+        found.setdefault(row.key, []).append(row)
+    return list(found.values())
+
+
 def probed(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
     """The rows that have probes."""
     return [row for row in rows if row.view is not None]
