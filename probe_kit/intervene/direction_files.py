@@ -114,14 +114,14 @@ def write_directions(
 
 def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping[str, str]]]:
     """Return arrays by name, and what is said of each."""
+    from safetensors import SafetensorError, safe_open
+
     try:
         if path.suffix == ".npz":
             with open_arrays(path) as opened:
                 arrays = {name: np.asarray(opened[name]) for name in opened}
             said = str(arrays.pop(ENTRY, "{}"))
         else:
-            from safetensors import safe_open
-
             with safe_open(path, "np") as opened:
                 arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - no mapping
                 said = (opened.metadata() or {}).get(ENTRY, "{}")
@@ -129,12 +129,10 @@ def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping
         if not isinstance(entry, dict) or not all(isinstance(about, dict) for about in entry.values()):
             raise ValueError(f"its entry {ENTRY!r} is {said[:50]!r}; expected an object of objects")
         return arrays, entry
-    except UNREADABLE as error:
-        raise UsageError(f"{path} holds no directions: {str(error)[:200]}") from error
-    except Exception as error:
-        if type(error).__name__ != "SafetensorError":
-            raise
+    except SafetensorError as error:
         raise UsageError(f"{path} is no safetensors file: {str(error)[:200]}") from error
+    except (*UNREADABLE, TypeError) as error:  # numpy has no bfloat16
+        raise UsageError(f"{path} holds no directions: {str(error)[:200]}") from error
 
 
 def _of_autoencoder(folder: Path, name: str) -> FileDirection:

@@ -85,6 +85,15 @@ def test_what_is_no_file_of_directions_is_refused(tmp_path: Path) -> None:
         read_direction(str(tmp_path / "absent.npz"))
 
 
+def test_a_type_of_numbers_that_numpy_lacks_is_refused(tmp_path: Path) -> None:
+    import torch
+    from safetensors.torch import save_file
+
+    save_file({"a": torch.ones(3, dtype=torch.bfloat16)}, tmp_path / "half.safetensors")
+    with pytest.raises(UsageError, match=r"half.safetensors holds no directions: .*bfloat16"):
+        read_direction(str(tmp_path / "half.safetensors"))
+
+
 @pytest.mark.parametrize("entry", ["[]", '{"a": 1}', '{"a": {}, "a": {}}', "{"])
 def test_what_is_said_of_directions_must_be_an_object_by_name(tmp_path: Path, entry: str) -> None:
     np.savez(tmp_path / "some.npz", allow_pickle=False, a=np.ones(3), directions=np.array(entry))
