@@ -2,15 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS, EditLog
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP
-from probe_kit.intervene.pairs import Chunk, Pair
+from probe_kit.intervene.outcomes import BY_CONDITION, CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP
+from probe_kit.intervene.pairs import Chunk, Given, Pair
 from probe_kit.intervene.patching.patch import Cell, patched
 
 if TYPE_CHECKING:
@@ -71,48 +71,40 @@ class Condition(Protocol):
 
 @dataclass(frozen=True)
 class CleanRun:
-    """The inference as the run made it."""
+    """The inference as the run made it. inputs: which of the pair's; subclasses take others with the same seed."""
 
     name: str = CLEAN
+    inputs: ClassVar[str] = "clean"
 
     def play(self, context: ConditionContext) -> ConditionResult:
-        """Infer with nothing changed."""
-        return ConditionResult(context.session.act(context.pair.clean, context.pair.seed))
+        """Infer with nothing changed inside the network."""
+        inputs: Given | None = getattr(context.pair, self.inputs)
+        assert inputs is not None
+        return ConditionResult(context.session.act(inputs, context.pair.seed))
 
 
 @dataclass(frozen=True)
-class SourceRun:
+class SourceRun(CleanRun):
     """The source's inference with the same seed: in the scene, the two pictures in each other's place."""
 
     name: str = IMAGE_SWAP
-
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Infer with the source's inputs."""
-        return ConditionResult(context.session.act(context.pair.source, context.pair.seed))
+    inputs: ClassVar[str] = "source"
 
 
 @dataclass(frozen=True)
-class DonorRun:
+class DonorRun(CleanRun):
     """The donor's inference with the same seed: all inputs are its own."""
 
     name: str = DONOR
-
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Infer with all of the donor's inputs."""
-        assert context.pair.donor is not None
-        return ConditionResult(context.session.act(context.pair.donor, context.pair.seed))
+    inputs: ClassVar[str] = "donor"
 
 
 @dataclass(frozen=True)
-class ControlInput:
+class ControlInput(CleanRun):
     """The clean inference after a change of the varied input that means nothing."""
 
     name: str = CONTROL_INPUT
-
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Infer with the control."""
-        assert context.pair.control is not None
-        return ConditionResult(context.session.act(context.pair.control, context.pair.seed))
+    inputs: ClassVar[str] = "control"
 
 
 @dataclass(frozen=True)
@@ -145,7 +137,6 @@ class Patched:
 
 AttentionRecord = tuple[int, int, NDArray[np.float32]]
 """The attention of one inference: row in the run's episodes, call, (B, I, H, R) shares."""
-_BY_CONDITION = ("displacement", "max_action_change", "edit_log", "episode_outcomes", "chunks")
 
 
 @dataclass(frozen=True)
@@ -196,9 +187,10 @@ class ReplayBatch:
     @classmethod
     def joined(cls, parts: Sequence["ReplayBatch"]) -> "ReplayBatch":
         """Return one after the other."""
+        by_condition = (*BY_CONDITION, "chunks")
         return cls(
             **{
-                name: np.concatenate([getattr(part, name) for part in parts], axis=int(name in _BY_CONDITION))
+                name: np.concatenate([getattr(part, name) for part in parts], axis=int(name in by_condition))
                 for name in parts[0].arrays
             }
         )
