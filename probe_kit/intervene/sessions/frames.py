@@ -17,12 +17,10 @@ from probe_kit.intervene.pairs import Chunk
 from probe_kit.intervene.sessions.session import ReplaySource, sources_of
 from probe_kit.intervene.settings import why_not_replayed
 from probe_kit.runs import Run
+from probe_kit.runs.layout import DATASET
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
-
-DATASET = "dataset"
-"""The file among a run's sources that is the folder of its recordings."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +50,7 @@ class Frames(ABC):
     def __init__(self, run: Run) -> None:
         self.run = run
         self.index = list(self._listed())
+        self.observe = lru_cache(maxsize=64)(self.observe)  # type: ignore[method-assign]
 
     @property
     @abstractmethod
@@ -99,7 +98,6 @@ class RecordedFrames(Frames):
         self._reader = LeRobotFrames(self._folder)
         self._features = {camera: feature for camera, feature, _ in self._dataset["cameras"]}
         super().__init__(run)
-        self.observe = lru_cache(maxsize=64)(self.observe)  # type: ignore[method-assign]
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -150,7 +148,6 @@ class EnvironmentFrames(Frames):
         self._cameras = tuple(stored["cameras"])
         self._episodes = {episode.id: episode for _, episode in listed_episodes(self._environment, chosen)}
         super().__init__(run)
-        self.observe = lru_cache(maxsize=64)(self.observe)  # type: ignore[method-assign]
 
     @property
     def cameras(self) -> tuple[str, ...]:
