@@ -7,13 +7,14 @@ from typing import Literal
 import numpy as np
 
 from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, ConditionOutcomes, Effect
+from probe_kit.intervene.patching.sets import NOTHING, carries_nothing
 from probe_kit.intervene.patching.sweep import SwapShare, share_fields, share_of_whole
 from probe_kit.statistics.paired_tests import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 Finding = Literal["decides", "moves", "no effect", "open"]
-DECIDES, NOTHING = 0.5, 0.1
-"""Shares of the exchange of all inputs from which an input decides, and within which it has no effect."""
+DECIDES = 0.5
+"""Share of the exchange of all inputs from which an input decides; within ±`NOTHING` it has no effect."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +89,7 @@ def _finding(share: SwapShare | None, p: float, ratio: float) -> Finding:
     beyond = p < SIGNIFICANCE
     if beyond and share.value >= DECIDES and share.low > NOTHING:
         return "decides"
-    if share.low > -NOTHING and share.high < NOTHING and (not beyond or ratio < NOTHING):
+    if carries_nothing(share.low, share.high) and (not beyond or ratio < NOTHING):
         return "no effect"
     return "moves" if beyond else "open"
 
