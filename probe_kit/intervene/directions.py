@@ -12,7 +12,7 @@ token. These are found in the tokens themselves.
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,9 +39,6 @@ from probe_kit.intervene.settings import items_of
 from probe_kit.intervene.tokens import token_mask
 from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold, grouped_folds
-
-if TYPE_CHECKING:
-    pass
 
 Vector = NDArray[np.float32]
 MEAN_DIFFERENCE, PROBE = "mean-difference", "probe"

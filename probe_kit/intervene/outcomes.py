@@ -53,7 +53,7 @@ BY_CONDITION = ("displacement", "max_action_change", "edit_log", "episode_outcom
 
 @dataclass(frozen=True)
 class ConditionOutcomes:
-    """What K conditions gave for E episodes of a run; see `conditions.Replayed`.
+    """What K conditions gave for E episodes of a run; see `replay.ReplayBatch`.
 
     conditions: names of the K, the clean one first. episodes, items, groups, categories, sides: (E,), `sides`
     those of the correct picture. displacement: (K, E) metres from the middle, left positive. max_action_change:

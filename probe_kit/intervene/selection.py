@@ -27,10 +27,10 @@ Rank = tuple[bool, int, bool]
 
 @dataclass(frozen=True)
 class StoredResult:
-    """What one stored intervention says of one category. answers: of its episodes alone.
+    """What one stored intervention says of one category. outcomes: of its episodes alone.
 
-    own_readout: whether it was read as its family says it should be. misread: whether it was not, and the family
-    is one whose first inference says little (`per-step`).
+    own_readout: whether it was read as its family says it should be. wrong_readout: whether it was not, and the
+    family is one whose first inference says little (`per-step`).
     """
 
     stored: StoredIntervention

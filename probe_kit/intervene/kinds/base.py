@@ -102,7 +102,7 @@ class TableContext:
     @property
     def lacks_sides(self) -> bool:
         """Whether the run has no correct picture on a side."""
-        return self.measurement is not None and not self.measurement.outcomes.has_sides
+        return not self.measurement.outcomes.has_sides
 
     def in_words(self, text: str) -> str:
         """Return a text about the image swap, about what was exchanged in this run."""
@@ -433,9 +433,9 @@ def flips_seed(outcomes: ConditionOutcomes, seed_text: str) -> int:
     return derive_seed("sign flips", seed_text, str(outcomes.categories[0]))
 
 
-def mean_of(values: Values, otherwise: float | None = None) -> float | None:
-    """Return the mean of some numbers, and `otherwise` if there are none."""
-    return float(values.mean()) if values.size else otherwise
+def mean_of(values: Values) -> float | None:
+    """Return the mean of some numbers, and None if there are none."""
+    return float(values.mean()) if values.size else None
 
 
 def by_category[Row: Effect](rows: Iterable[Row]) -> dict[str, list[Row]]:

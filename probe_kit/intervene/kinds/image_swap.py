@@ -300,7 +300,7 @@ class ImageSwap(Intervention):
     @staticmethod
     def table(rows: Sequence[ImageSwapEffect], context: TableContext) -> "Table":
         """Return one line per category, with its verdict."""
-        if not context.measurement.outcomes.has_sides:
+        if context.lacks_sides:
             return input_table(rows, context)
         verdicts = context.verdicts
         reasons = [f"{name}: {verdict.explanation}" for name, verdict in verdicts.items() if verdict.explanation]

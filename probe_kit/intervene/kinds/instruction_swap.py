@@ -168,7 +168,7 @@ class InstructionSwap(Intervention):
     @staticmethod
     def table(rows: Sequence[InstructionSwapEffect], context: TableContext) -> "Table":
         """Return one line per category."""
-        if not context.measurement.outcomes.has_sides:
+        if context.lacks_sides:
             return input_table(rows, context)
         return effect_table(
             f"Is the instruction read? {context.subject}",

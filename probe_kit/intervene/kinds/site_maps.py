@@ -10,7 +10,7 @@ intervention or in several. Needs no model.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +33,6 @@ from probe_kit.intervene.places import ALL, RESIDUAL, PlaceName
 from probe_kit.intervene.selection import PooledConditions, Rank, pool_conditions, stored_results
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
-
-if TYPE_CHECKING:
-    pass
-
 
 # -- effects of edits at places ------------------------------------------------------------------------------
 

@@ -372,8 +372,8 @@ def classify_use(
 
     encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
     without probes. control: see `classify_behaviour`. places: None if nothing was tried inside. tie: see
-    `results.ties.describe_tie`; empty if it was not tested. other: the behaviour by the other readout, see
-    `results.readouts`; None if that is not stored.
+    `evidence.describe_tie`; empty if it was not tested. other: the behaviour by the other readout, see
+    `evidence.stored_other_readouts`; None if that is not stored.
     """
     own = replace(classify_behaviour(found, control), other=other)
     if all(one.behaviour in ("not used", "inconclusive") for one in own.by_readout):
