@@ -174,8 +174,9 @@ def open_checked(
         check_model(settings, fetch)
     if location is not None:
         _check_writable(location)
-    settings = settings.changed(**settings.source.decided()) if settings.source.command else settings
     source = settings.source.open(not fetch and _selects_only(settings, location))
+    if decided := source.decided():
+        settings = settings.changed(**decided)
     if not loaded:
         _check_words(settings, source)
     if location is not None:

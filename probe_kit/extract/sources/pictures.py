@@ -135,10 +135,8 @@ class PictureSource(Source[PictureFolder]):
             raise RecordingError(f"{table.name} has the id {twice[0]!r} twice; give each line its own")
         return cls(settings, names, lines)
 
-    @classmethod
-    def decided(cls, settings: PictureFolder) -> Mapping[str, Any]:
+    def decided(self) -> Mapping[str, Any]:
         """Return that the only inference of a picture is captured and nothing acts."""
-        del settings
         return {"captured_calls": 1, "capture_only": True, "frames": "none"}
 
     @property

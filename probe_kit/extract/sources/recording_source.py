@@ -79,18 +79,18 @@ class RecordingSource(Source[LeRobotSource]):
     def open(cls, settings: LeRobotSource, selects_only: bool) -> Self:
         """The data set, with the numbers of the chosen episodes here. Raises as `open_lerobot`."""
         del selects_only
-        opened = cls(settings, open_lerobot(settings))
+        folder = open_lerobot(settings)
+        if folder.repo is not None:
+            settings = settings.changed(folder=f"{folder.repo}@{folder.revision}")
+        opened = cls(settings, folder)
         fetched(opened.folder, opened.episodes, ())
         opened.folder.check_files(opened.episodes, ())
         return opened
 
-    @classmethod
-    def decided(cls, settings: LeRobotSource) -> Mapping[str, Any]:
+    def decided(self) -> Mapping[str, Any]:
         """Return that every frame of a row is captured and nothing acts; a revision of the hub is its commit."""
-        folder = open_lerobot(settings)
-        source = settings if folder.repo is None else settings.changed(folder=f"{folder.repo}@{folder.revision}")
-        calls = cls(source, folder).most_frames
-        return {"source": source, "captured_calls": calls, "capture_only": True, "frames": "none"}
+        calls = self.most_frames
+        return {"source": self.settings, "captured_calls": calls, "capture_only": True, "frames": "none"}
 
     @property
     def name(self) -> str:

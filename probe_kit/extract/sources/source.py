@@ -49,17 +49,9 @@ class SourceSettings(Part):
 
     def open(self, selects_only: bool = False) -> "Source[Any]":
         """Open the source. selects_only: nothing but the chosen rows is needed. Raises what is wrong with it."""
-        return self._source.open(self, selects_only)
-
-    def decided(self) -> Mapping[str, Any]:
-        """Return fields of a run's settings that the source itself decides, by name. Raises as `open`."""
-        return self._source.decided(self)
-
-    @property
-    def _source(self) -> "type[Source[Any]]":
         module, _, name = self.opens.partition(":")
         source: type[Source[Any]] = getattr(import_module(module), name)
-        return source
+        return source.open(self, selects_only)
 
     def steps(self) -> int:
         """Count the actions that an episode can have; 0 where nothing acts."""
@@ -105,10 +97,8 @@ class Source[Chosen: SourceSettings](ABC):
     def open(cls, settings: Chosen, selects_only: bool) -> Self:
         """Open the source that settings choose; see `SourceSettings.open`."""
 
-    @classmethod
-    def decided(cls, settings: Chosen) -> Mapping[str, Any]:
-        """Return fields of a run's settings that the source itself decides; see `SourceSettings.decided`."""
-        del settings
+    def decided(self) -> Mapping[str, Any]:
+        """Return fields of a run's settings that the source itself decides, by name."""
         return {}
 
     @property
