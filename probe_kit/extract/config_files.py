@@ -28,6 +28,7 @@ def portable(settings: Settings) -> dict[str, Any]:
         source["scene"] |= dict.fromkeys(_FILES_OF_SCENE)
     elif "folder" in source:
         source["folder"] = settings.source.name
+        source |= {"table": Path(source["table"]).name} if "table" in source else {}
     return config
 
 

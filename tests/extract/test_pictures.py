@@ -1,6 +1,7 @@
 """A folder of pictures with a table: one inference about each line, its numbers as labels."""
 
 import csv
+import json
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ def test_every_line_is_a_row_with_the_models_own_prediction_bit_for_bit(
     run: pk.Run, folder: Path, pi0_tiny: Policy
 ) -> None:
     assert verify_run(run.path, deep=True).ok
+    assert str(folder) not in json.dumps(run.settings), "where the pictures and their table lie is of this machine"
     assert run.episodes["instruction"].tolist() == [TEXTS[number // 2 % 2] for number in range(COUNT)]
     assert run.episodes["group_id"].tolist() == [f"g{number}" for number in range(COUNT)]
     assert run.inputs is not None
