@@ -1,6 +1,7 @@
 """A folder of pictures with a table of instructions as a source: one inference about each line of the table."""
 
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -131,7 +132,7 @@ class PictureSource(Source[PictureFolder]):
         if not lines:
             raise UsageError(f"--table {table} has no line below its heading; expected one per picture")
         ids = [_id(text, number) for number, (text, _) in enumerate(lines)]
-        if twice := [name for name in ids if ids.count(name) > 1]:
+        if twice := [name for name, count in Counter(ids).items() if count > 1]:
             raise RecordingError(f"{table.name} has the id {twice[0]!r} twice; give each line its own")
         return cls(settings, names, lines)
 
