@@ -21,6 +21,7 @@ from urllib.request import Request, urlopen
 
 from probe_kit._system.counting import counted
 from probe_kit._system.installing import install_command
+from probe_kit._system.machine import cores_here
 from probe_kit.errors import SceneError
 
 State = Literal["ok", "note", "missing"]
@@ -75,7 +76,7 @@ def _python() -> Finding:
 
 
 def _processor() -> Finding:
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = cores_here()
     advice = "" if count > 1 else "Two cores halve the time of the demo: simulation and inference overlap"
     return Finding("processor", "ok" if count > 1 else "note", f"{counted(count, 'core')} usable", advice)
 

@@ -42,9 +42,13 @@ def what_is_here() -> str:
     return f"This machine has {', '.join(_devices())}"
 
 
+def cores_here() -> int:
+    """Count the cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def _devices() -> list[str]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return [f"cpu ({counted(cores, 'core')})", *(_of_torch() if "torch" in sys.modules else _of_system())]
+    return [f"cpu ({counted(cores_here(), 'core')})", *(_of_torch() if "torch" in sys.modules else _of_system())]
 
 
 def _of_torch() -> list[str]:

@@ -4,7 +4,6 @@ It decides how fast a run comes and nothing that is stored, but for the float ro
 which batching changes more says so on its card and is never given more than the card allows.
 """
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -13,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from probe_kit._system.machine import cores_here
 from probe_kit.errors import UsageError
 from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.controllers import PolicyController
@@ -130,11 +130,6 @@ def choose(inference: Mapping[int, float], turn: float, cores: int) -> Calibrati
     )
 
 
-def cores_here() -> int:
-    """Those that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _infer(controller: PolicyController, example: Observation, batch: int) -> None:
     from torch.cuda import OutOfMemoryError
 
@@ -161,8 +156,7 @@ def _turn(settings: ExtractSettings, controller: PolicyController, source: Sourc
         per_step = (perf_counter() - began) / (turns * steps)
     finally:
         player.close()
-    inferences = -(-settings.scene.max_steps // controller.execute)
-    return per_step * controller.execute + setting_up / inferences
+    return per_step * controller.execute + setting_up / settings.most_inferences(controller.execute)
 
 
 def _seconds(work: Callable[[], object]) -> float:
