@@ -88,7 +88,7 @@ class Worker:
         )
 
     def run(self, next_number: Callable[[], int | None]) -> Iterator[Event]:
-        """EpisodeLoop what `next_number` gives until it gives None; an event per episode, when it is committed."""
+        """Play what `next_number` gives until it gives None; an event per episode, when it is committed."""
 
         def next_episode() -> Row | None:
             number = next_number()
