@@ -13,24 +13,17 @@ from numpy.typing import ArrayLike, NDArray
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 
+def heads_p(heads: int, tosses: int) -> float:
+    """Chance of at least so many heads in the tosses of a fair coin; 1.0 without any."""
+    return float(sum(comb(tosses, count) for count in range(heads, tosses + 1)) / 2**tosses)
+
+
 def sign_p(more: int, less: int) -> float:
     """Exact two-sided p that `more` against `less` is a fair coin's; 1.0 without any.
 
     Of episodes that one condition alone got right against those the other alone did, it is McNemar's exact test.
     """
-    trials, most = more + less, max(more, less)
-    tail = sum(comb(trials, heads) for heads in range(most, trials + 1)) / 2**trials
-    return float(min(1.0, 2 * tail))
-
-
-def grouped_sign_p(difference: NDArray[np.int_], groups: NDArray[np.str_]) -> float:
-    """The same with a group as the unit, so that items that share pictures count once.
-
-    difference: (E,) per episode 1, 0 or -1, by which condition was right. groups: (E,).
-    """
-    _, group_of = np.unique(groups, return_inverse=True)
-    lead = np.bincount(group_of, weights=difference)
-    return sign_p(int((lead > 0).sum()), int((lead < 0).sum()))
+    return min(1.0, 2 * heads_p(max(more, less), more + less))
 
 
 ROUNDING = 1e-9
@@ -50,8 +43,7 @@ def greater_p(effects: NDArray[np.float64]) -> float:
     Effects that are zero, up to rounding, take no part; 1 where there is none.
     """
     positive, negative = int((effects > ROUNDING).sum()), int((effects < -ROUNDING).sum())
-    trials = positive + negative
-    return float(sum(comb(trials, heads) for heads in range(positive, trials + 1)) / 2**trials)
+    return heads_p(positive, positive + negative)
 
 
 def paired_greater_p(values: NDArray[np.float64], items: ArrayLike, groups: ArrayLike) -> float:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from math import comb
 from statistics import fmean
 from typing import TYPE_CHECKING
 
@@ -13,6 +12,7 @@ from probe_kit.env.scoring.outcome import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
 from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.statistics.estimates.shares import Share
+from probe_kit.statistics.paired_tests import heads_p
 from probe_kit.statistics.significance import chance_margin
 from probe_kit.train.data.run_reader import check_several_wordings
 
@@ -246,13 +246,8 @@ def paired_items(episodes: "pd.DataFrame") -> PairedItems:
         one=int((right == 1).sum()),
         none=int((right == 0).sum()),
         both_wrong=both_wrong,
-        p=_sign_test(int((lead > 0).sum()), int((lead != 0).sum())),
+        p=heads_p(int((lead > 0).sum()), int((lead != 0).sum())),
     )
-
-
-def _sign_test(successes: int, trials: int) -> float:
-    """P(at least `successes` heads in `trials` fair tosses)."""
-    return float(sum(comb(trials, heads) for heads in range(successes, trials + 1)) / 2**trials)
 
 
 def _rate(values: "pd.Series[bool] | pd.Series[float]") -> float | None:
