@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.retention.estimators.retention import Iterations, known_iteration
+from probe_kit.retention.estimators.retention import Iterations, stream_rows
 from probe_kit.retention.estimators.stream_scores import ACTION, BACKBONE, Limits, limits
 from probe_kit.statistics.estimates.crossfit import crossfit
 from probe_kit.statistics.estimates.retention import Ratio, retention
@@ -153,9 +153,7 @@ def _rows(curve: ProbeCurve, part: str, iterations: Iterations) -> NDArray[np.in
             f"{', '.join(dict.fromkeys(label_of(site.stream) for site in curve.sites))}. Extract a policy whose "
             "backbone and action stream are captured"
         )
-    rows = curve.stream(stream)
-    step = known_iteration(stream, [curve.sites[row].iteration for row in rows], iterations)
-    return rows if step is None else rows[[curve.sites[row].iteration == step for row in rows]]
+    return stream_rows(curve, stream, iterations)
 
 
 def _peak(

@@ -93,19 +93,21 @@ class LabelRetentionTable:
     @property
     def text(self) -> Table:
         """The table as text."""
-        one, several, each = self.rows[0].retention, len(self.targets) > 1, self.has_categories
-        return Table.of(
-            "Labels, and what reaches the action"
-            if several
-            else f"{one.target}: {one.metric}, and what reaches the action",
-            (
-                *map(Heading, (*(("label", "metric") if several else ()), *(("category",) if each else ()), "run",
-                "view")), *grouped( ("backbone", ("backbone site", "score", "chance", "above chance")), ("action",
-                ("action site", "score", "chance", "above chance")), ), Heading("retention"), ), [
-                (*((row.retention.target, row.retention.metric) if several else ()), *((row.retention.category,) if
-                each else ()), row.run, row.retention.view, *_peak(row.retention.backbone),
-                *_peak(row.retention.action), _value(row.retention)) for row in self.rows ], names=2 + 2 * several
-                + each, notes=[_NOTE], )  # fmt: skip
+        first, several = self.rows[0].retention, len(self.targets) > 1
+        names = ["label", "metric"] * several + ["category"] * self.has_categories + ["run", "view"]
+        of_stream = "score", "chance", "above chance"
+        headings = (
+            *map(Heading, names),
+            *grouped(("backbone", ("backbone site", *of_stream)), ("action", ("action site", *of_stream))),
+            Heading("retention"),
+        )
+        rows = []
+        for row in self.rows:
+            own = row.retention
+            name = [own.target, own.metric] * several + [own.category] * self.has_categories + [row.run, own.view]
+            rows.append((*name, *_peak(own.backbone), *_peak(own.action), _value(own)))
+        what = "Labels" if several else f"{first.target}: {first.metric}"
+        return Table.of(f"{what}, and what reaches the action", headings, rows, names=len(names), notes=[_NOTE])
 
     @property
     def summary(self) -> Table:
