@@ -31,11 +31,12 @@ if TYPE_CHECKING:
 
 
 Null = Literal["flip_groups", "exchange_groups", "exchange_blocks"]
-NULLS: dict[Null, str] = {
-    "flip_groups": "groups flip all their labels: of the correct side, which a suite draws freely",
-    "exchange_groups": "groups exchange their labels layout by layout: of the chosen side",
-    "exchange_blocks": "groups exchange their labels as blocks, inference by inference: of every other target",
-}
+"""How label permutations are drawn.
+
+flip_groups: groups flip all their labels; of the correct side, which a suite draws freely.
+exchange_groups: groups exchange their labels layout by layout; of the chosen side.
+exchange_blocks: groups exchange their labels as blocks, inference by inference; of every other target.
+"""
 _MOST_CLASSES = 20
 _COUNTED = {INFERENCE: "a captured inference", FRAME: "a frame", SOURCE: "an episode"}
 
@@ -46,7 +47,7 @@ class Target:
 
     Made by `Target.read` from a table, or by `Target.of_run` from what a run stores.
 
-    name: of the column or side. null: how label permutations are drawn, see `NULLS`.
+    name: of the column or side. null: how label permutations are drawn, see `Null`.
     coded: task, classes and values. episodes: (n,) ids. inferences: (n,) captured inference of every label, None
     where a label is of a whole episode. group_by: column whose values folds, intervals and nulls keep together;
     None for the groups of the run. exchange_within: column within which label permutations exchange groups; None
