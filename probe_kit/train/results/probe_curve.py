@@ -147,6 +147,11 @@ class ProbeCurve:
         """No p can be lower."""
         return smallest_p(self.null.shape[1]) if self.smallest_p is None else self.smallest_p
 
+    @property
+    def penalties(self) -> Matrix:
+        """(S, F) chosen penalties: λ of ridge, 1 / C of a logistic probe."""
+        return 1 / self.strengths if self.task == "binary" else self.strengths
+
     # -- steps of an episode ----------------------------------------------------------------------------------
 
     @property

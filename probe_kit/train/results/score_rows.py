@@ -93,9 +93,8 @@ def _of_side(curve: ProbeCurve, row: int, accuracy: float) -> dict[str, Any]:
 
 def _of_label(controls: Controls, place: tuple[str, str], curve: ProbeCurve, row: int) -> dict[str, Any]:
     quantity = curve.task == "continuous"
-    penalties = 1 / curve.strengths[row] if curve.task == "binary" else curve.strengths[row]
     return {
         "spearman": fold_spearman(curve.decisions[row], curve.labels, curve.folds()) if quantity else float("nan"),
         "best_control": controls.reference(*place, curve.sites[row]),
-        "penalties": " ".join(f"{penalty:g}" for penalty in penalties),
+        "penalties": " ".join(f"{penalty:g}" for penalty in curve.penalties[row]),
     }

@@ -109,9 +109,7 @@ class TransferResults:
                     "own": float(curve.own[row].mean()),
                     "own_ci_low": own_low,
                     "own_ci_high": own_high,
-                    "penalty": float(
-                        (1 / fitted.strengths if self.task == "binary" else fitted.strengths)[row, 0]
-                    ),
+                    "penalty": float(fitted.penalties[row, 0]),
                     "n": self.labels.size,
                     "groups": np.unique(self.groups).size,
                 }
