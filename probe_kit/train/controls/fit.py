@@ -20,10 +20,17 @@ from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.run_suite import suite_of
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.problem import Problem
-from probe_kit.train.results.control_scores import RANDOM_FEATURES, ControlComparison, Controls, ControlScore
+from probe_kit.train.results.control_scores import (
+    RANDOM_FEATURES,
+    UNTRAINED,
+    ControlComparison,
+    Controls,
+    ControlScore,
+)
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.target_samples import TargetSamples
+from probe_kit.train.settings import ProbeSettings
+from probe_kit.train.target_samples import EVERYWHERE, TargetSamples
 
 SIDE_DEFAULT = (RANDOM_FEATURES, "pixels")
 """Controls of a side that are run where the suite's pictures are, unless others, or none, are requested."""
@@ -32,6 +39,8 @@ NOT_BY_DEFAULT = frozenset({"action", "position"})
 
 A policy's own action is no leak: whether a site exceeds it is another question. The layout is in no instruction.
 """
+_SIDE_SEEDS = {RANDOM_FEATURES: "binding", UNTRAINED: "twin"}
+"""Words in the seeds of the controls that sites of a side are compared with."""
 
 
 @dataclass(frozen=True)
@@ -171,17 +180,17 @@ def _compared(
     for (own, view), curve in results.curves.items():
         for stream in curve.streams if own == category else ():
             rows, reference = curve.stream(stream), references[stream].scores.mean(axis=0)
-            seed = _seed(results, name, category, view, stream)
+            seed = comparison_seed(results.settings, name, category, view, stream)
             p = better_than_reference(curve.scores[rows], reference, curve.groups, seed, curve.widening)
             yield from comparisons(name, category, view, curve, rows, float(reference.mean()), p)
 
 
-def _seed(results: ProbeResults, name: str, category: str, view: str, stream: str) -> int:
-    own = results.settings
-    if own.is_side:
-        return derive_seed("binding", own.seed, category, view, stream)
-    place = (view, stream) if own.categories == ("all",) else (category, view, stream)
-    return derive_seed("label control", own.seed, name, *place)
+def comparison_seed(settings: ProbeSettings, name: str, category: str, view: str, stream: str) -> int:
+    """Return the seed of the resamples that compare a stream in a category and view with a control."""
+    if settings.is_side:
+        return derive_seed(_SIDE_SEEDS[name], settings.seed, category, view, stream)
+    place = (view, stream) if settings.categories == (EVERYWHERE,) else (category, view, stream)
+    return derive_seed("label control", settings.seed, name, *place)
 
 
 def comparisons(

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.hashing import derive_seed
 from probe_kit.runs.layout import DATASET
 from probe_kit.statistics.estimates.shares import Accuracy
 from probe_kit.statistics.paired_bootstrap import better_than_best
-from probe_kit.train.controls.fit import comparisons, control_score
+from probe_kit.train.controls.fit import comparison_seed, comparisons, control_score
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import UNTRAINED, ControlComparison, ControlScore, UntrainedScore
 from probe_kit.train.results.probe_curve import ProbeCurve
@@ -163,13 +162,8 @@ def _compared(
     results: ProbeResults, place: tuple[str, str], stream: str, others: NDArray[np.float64]
 ) -> Iterator[ControlComparison]:
     """Yield every site of a stream against the best of the untrained network's."""
-    curve, own = results.curves[place], results.settings
-    rows = curve.stream(stream)
-    if own.is_side:
-        seed = derive_seed("twin", own.seed, *place, stream)
-    else:
-        views = place[1:] if own.categories == ("all",) else place
-        seed = derive_seed("label control", own.seed, UNTRAINED, *views, stream)
+    curve = results.curves[place]
+    rows, seed = curve.stream(stream), comparison_seed(results.settings, UNTRAINED, *place, stream)
     p = better_than_best(curve.scores[rows], others, curve.groups, seed, curve.widening)
     yield from comparisons(UNTRAINED, *place, curve, rows, float(others.mean(axis=1).max()), p)
 
