@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.train.choices import Incomplete
 from probe_kit.train.columns.table import EPISODE, INFERENCE
-from probe_kit.train.data.captured_call import captured_calls, check_call
+from probe_kit.train.data.captured_call import check_call, reached_calls
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.target import Target
 
@@ -77,7 +77,7 @@ def target_samples(
             f"episode. Use --window N for the first N inferences, or leave out the column {INFERENCE!r}"
         )
     check_call(run, call)
-    grid, reached, chosen = _label_grid(run, target), _reached(run), _of_categories(run, categories)
+    grid, reached, chosen = _label_grid(run, target), reached_calls(run), _of_categories(run, categories)
     start: NDArray[np.intp] = np.full(len(reached), call)
     left_out: dict[str, int] = {}
     if align_to is not None:
@@ -167,14 +167,6 @@ def _events(run: RunReader, target: Target, align_to: Target) -> NDArray[np.intp
     return np.where(happened.any(axis=1), happened.argmax(axis=1), -1)
 
 
-def _reached(run: RunReader) -> NDArray[np.bool_]:
-    """(E, C) whether an episode has a captured inference."""
-    calls = captured_calls(run)
-    if not hasattr(run, "reached"):
-        return np.ones((len(run.episodes), 1), bool)
-    return np.stack([run.reached(call) for call in range(calls)], axis=1)
-
-
 def _of_categories(run: RunReader, categories: Sequence[str] | None) -> NDArray[np.bool_]:
     if categories is None or EVERYWHERE in categories:
         return np.ones(len(run.episodes), bool)
@@ -199,7 +191,7 @@ def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
     """
     place = {name: row for row, name in enumerate(run.episodes[EPISODE].astype(str))}
     planned = _planned(run)
-    reached = _reached(run)
+    reached = reached_calls(run)
     grid = np.full((len(place), reached.shape[1] if target.per_step else 1), np.nan)
     for number, name in enumerate(target.episodes):
         row = place.get(name)

@@ -12,7 +12,7 @@ from probe_kit.runs.action_errors import compare_actions, why_not_compared
 from probe_kit.train.choices import Task
 from probe_kit.train.columns.cells import Cell
 from probe_kit.train.columns.table import EPISODE, INFERENCE
-from probe_kit.train.data.captured_call import captured_calls
+from probe_kit.train.data.captured_call import reached_calls
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
@@ -246,9 +246,8 @@ def _rows(run: RunReader, ids: Sequence[str]) -> NDArray[np.intp]:
 
 def _inferences(run: RunReader) -> Iterator[tuple[str, int]]:
     """Episode and number of every captured inference, in the order of the episodes."""
-    reached = [run.reached(call) for call in range(captured_calls(run))] if hasattr(run, "reached") else None
-    for row, name in enumerate(run.episodes[EPISODE].astype(str)):
-        count = 1 if reached is None else sum(bool(own[row]) for own in reached)
+    counts = reached_calls(run).sum(axis=1).tolist()
+    for name, count in zip(run.episodes[EPISODE].astype(str), counts, strict=True):
         yield from ((name, call) for call in range(count))
 
 
@@ -260,10 +259,9 @@ def frames_of_inferences(run: RunReader) -> Iterator[tuple[Any, int, list[int]]]
     """
     if not hasattr(run, "trajectories") or not hasattr(run, "control_steps"):
         raise UsageError(f"{run.location} has no trajectories; `sim.*` and the state need them")
-    trajectories, steps, calls = run.trajectories, run.control_steps, captured_calls(run)
-    reached = np.array([run.reached(call) for call in range(calls)])  # type: ignore[attr-defined]
+    trajectories, steps, reached = run.trajectories, run.control_steps, reached_calls(run)
     for row, seen in enumerate(trajectories):
-        yield seen, row, [int(steps[row, call]) for call in range(calls) if reached[call, row]]
+        yield seen, row, steps[row, np.flatnonzero(reached[row])].astype(int).tolist()
 
 
 def _of_frames(run: RunReader, values: Sequence[Callable[[Instant], Cell]]) -> Iterator[list[Cell]]:

@@ -1,5 +1,8 @@
 """Captured inferences of a run: how many there are, and whether one of them is."""
 
+import numpy as np
+from numpy.typing import NDArray
+
 from probe_kit._system.counting import counted
 from probe_kit.errors import UsageError
 from probe_kit.train.data.run_reader import RunReader
@@ -18,3 +21,10 @@ def check_call(run: RunReader, call: int) -> None:
 def captured_calls(run: RunReader) -> int:
     """Return the inferences captured per episode, at most; 1 for a run that was not made by probe_kit."""
     return int(getattr(run, "captured_calls", 1))
+
+
+def reached_calls(run: RunReader) -> NDArray[np.bool_]:
+    """(E, C) whether an episode has a captured inference; all have the only one of a run not made by probe_kit."""
+    if not hasattr(run, "reached"):
+        return np.ones((len(run.episodes), 1), bool)
+    return np.stack([run.reached(call) for call in range(captured_calls(run))], axis=1)
