@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
+import numpy as np
 import pytest
 
 from probe_kit.intervene.kinds import every_kind
@@ -15,7 +16,7 @@ from probe_kit.intervene.kinds.instruction_swap import InstructionSwap
 from probe_kit.intervene.kinds.interchange import Interchange
 from probe_kit.intervene.kinds.joint import EVERY, MINIMAL, JointEffect, JointPlaces
 from probe_kit.intervene.kinds.site_maps import PatchEffect
-from probe_kit.intervene.outcomes import CLEAN
+from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
 from probe_kit.intervene.results.verdict import UseVerdict, classify_use
 
 SWAPS = {
@@ -48,7 +49,11 @@ def swap(response: str) -> ImageSwapEffect:
 
 def context(verdict: UseVerdict | None) -> TableContext:
     verdicts = {} if verdict is None else {"public-info": verdict}
-    return TableContext(cast("Measurement", None), "", verdicts)
+    names, numbers, moved = np.array(["one"]), np.zeros((1, 1)), np.zeros((1, 1, 5))
+    outcomes = ConditionOutcomes(
+        (CLEAN,), names, names, names, names, np.array(["left"]), numbers, numbers, moved, numbers[0]
+    )
+    return TableContext(Measurement(outcomes, "", {}, {}, str.encode), "", verdicts)
 
 
 @pytest.mark.parametrize("response", SWAPS)
