@@ -6,7 +6,7 @@ Two runs of one identity take different times, so no other record holds the hash
 comes from them, and the folder may be deleted as a unit. A record that is missing among others is damage.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
@@ -65,9 +65,9 @@ def write_seconds(root: Root, number: int, seconds: Seconds) -> None:
 
 def read_seconds(root: Root, commits: Mapping[int, Commit]) -> dict[int, Seconds]:
     """By episode number, NaN for all where none are stored. Raises RunDamagedError for the first that is wrong."""
-    if problem := next(seconds_problems(root, commits), None):
-        raise RunDamagedError(problem)
     records = {number: _parse(root, number, key, raw) for number, key, raw in numbered(root.location, TIMES)}
+    if problem := next(_missing(root, commits, records), None):
+        raise RunDamagedError(problem)
     stored = {number: Seconds(record.inference, record.simulation) for number, record in records.items()}
     return {number: stored.get(number, NOT_MEASURED) for number in commits}
 
@@ -81,6 +81,11 @@ def seconds_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]
             _parse(root, number, key, raw)
         except RunDamagedError as error:
             yield str(error)
+    yield from _missing(root, commits, stored)
+
+
+def _missing(root: Root, commits: Mapping[int, Commit], stored: Collection[int]) -> Iterator[str]:
+    """A sentence per episode without seconds, unless no episode has any."""
     for number in sorted(commits) if stored else ():
         if number not in stored:
             yield f"{root.location}/{seconds_key(number)} is missing. {_ADVICE}"

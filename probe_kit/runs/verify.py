@@ -125,8 +125,9 @@ def _audit(location: Location, deep: bool) -> Audit:
     problems += filter(None, (stored.problem(sizes.get(stored.key)) for stored in objects))
     problems += _content_problems(location, objects) if deep else _metadata_problems(root)
     if deep and not problems and planned:
-        problems += _differences(Run(location)) if columns is not None else ()
-        problems += _reading_problems(root)
+        run = Run(location)
+        problems += _differences(run) if columns is not None else ()
+        problems += _reading_problems(run)
     return Audit(
         path=str(location),
         committed=len(commits),
@@ -190,15 +191,14 @@ def _differences(run: Run) -> Iterator[str]:
             yield str(error)
 
 
-def _reading_problems(root: Root) -> Iterator[str]:
+def _reading_problems(run: Run) -> Iterator[str]:
     """The complaints of all readers of a run and of the results that are stored with it."""
-    run = Run(root.location)
     yield from _complaints(run.check_records)
     yield from _complaints(lambda: (run.episodes, run.items, run.failed))
     if not run.commits():
         return
-    for name in root.arrays:
-        if name not in root.left_out:
+    for name in run.root.arrays:
+        if name not in run.root.left_out:
             # Metadata of others may claim what no run has. One row shows that; the others have their hashes.
             yield from _complaints(partial(_read_first, run, name))
     if run.has_trajectories:
