@@ -130,9 +130,9 @@ class CheckedStore(WrapperStore[Store]):
         """Raise RunDamagedError for a file that was made larger: a sparse one stands for all memory."""
         if not isinstance(self._store, LocalStore):
             return
-        file, length = self._store.root / key, self._sums[key].length
-        if file.is_file() and (size := file.stat().st_size) > length:
-            raise self._damaged(key, f"has {size} bytes; {length} were written")
+        file, known = self._store.root / key, self._sums[key]
+        if file.is_file() and (size := file.stat().st_size) > known.length:
+            raise self._damaged(key, str(known.size_problem(size)))
 
     def _checked(self, key: str, value: Buffer | None, byte_range: ByteRequest | None) -> Buffer:
         if value is None:

@@ -180,10 +180,9 @@ def size_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
     for number, commit in commits.items():
         for key, known in commit.objects.items():
             size = sizes.get(key)
-            if size == known.length or (size is None and is_left_out(key, root.left_out)):
-                continue
-            problem = "is missing" if size is None else f"has {size} bytes; {known.length} were written"
-            yield f"{DATA}/{key} of episode {commit.episode_id} {problem}. {redo(number)}"
+            problem = known.size_problem(size)
+            if problem and not (size is None and is_left_out(key, root.left_out)):
+                yield f"{DATA}/{key} of episode {commit.episode_id} {problem}. {redo(number)}"
 
 
 def committed_sums(root: Root, commits: Mapping[int, Commit]) -> dict[str, Sum]:

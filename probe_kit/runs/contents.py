@@ -35,10 +35,10 @@ class StoredObject:
 
     def problem(self, size: int | None) -> str | None:
         """The fault in an object of this size, None for one that is missing."""
-        if size == self.known.length or (size is None and self.optional):
+        if size is None and self.optional:
             return None
-        words = "is missing" if size is None else f"has {size} bytes; {self.known.length} were written"
-        return f"{self.key}{self.owner} {words}. {self.advice}"
+        words = self.known.size_problem(size)
+        return f"{self.key}{self.owner} {words}. {self.advice}" if words else None
 
 
 def record_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | None) -> Iterator[str]:
@@ -102,12 +102,14 @@ def sizes_of(location: Location, objects: Iterable[StoredObject]) -> dict[str, i
     }
 
 
-def stray_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | None) -> list[str]:
-    """Keys of all objects that no record leads to, such as copies made by hand; nothing reads them."""
-    known = {
-        *record_keys(root, commits, columns),
-        *(stored.key for stored in stored_objects(root, commits, columns)),
-    }
+def stray_keys(
+    root: Root, commits: Mapping[int, Commit], columns: Columns | None, objects: Iterable[StoredObject]
+) -> list[str]:
+    """Keys of all objects that no record leads to, such as copies made by hand; nothing reads them.
+
+    objects: those of `stored_objects`.
+    """
+    known = {*record_keys(root, commits, columns), *(stored.key for stored in objects)}
     return [key for key in root.location.keys("") if key not in known and not _expected(key)]
 
 

@@ -1,9 +1,9 @@
 """The files of a run: their names, and the layout of a stream. Only this package uses them directly.
 
 RUN/
-  run.json           the root: settings, streams, hashes of the plan and of all metadata, and its own
+  run.json           the root: settings, streams, hashes of all metadata, and its own, see `root`
   label.json         what tables call the run; may be changed, see `label`
-  left-out.json      only in a copy without activations: what it left out, see `left_out`
+  left-out.json      only in a copy without activations: what it left out, see `root`
   plan/<n>.json      the episodes in order, each with its item's content hash; a further record when the run grows
   commits/<n>.json   one per finished episode, written last: hashes of its objects, and its own
   times/<n>.json     seconds that an episode took, which no other hash covers, see `seconds`
@@ -19,7 +19,7 @@ RUN/
   videos/            GIFs, if asked for
   frames/<n>.webp    first and last frame of an episode, or all of them, see `thumbnails`
 
-Every object is bound to the root by hashes, see `hashes`.
+Every object is bound to the root by hashes, see `records`.
 """
 
 from collections.abc import Callable, Mapping
@@ -121,7 +121,7 @@ _STREAM_PARTS: Mapping[str, Callable[[Any], bool]] = {
     "probed": _is_flag,
     "sums": _is_flag,
 }
-"""The storage format of a stream, and the hashes that detect damage in each part of it."""
+"""Parts of a stream as `run.json` stores it, each with the check of its value."""
 
 
 @dataclass(frozen=True)

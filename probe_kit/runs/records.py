@@ -48,10 +48,16 @@ class Sum(NamedTuple):
         """As stored: blocks only where there are any."""
         return list(self) if self.blocks else [self.length, self.digest]
 
+    def size_problem(self, size: int | None) -> str | None:
+        """The fault in an object of this size, in words; None if there is none. size: None if it is missing."""
+        if size is None:
+            return "is missing"
+        return None if size == self.length else f"has {size} bytes; {self.length} were written"
+
     def problem(self, content: bytes) -> str | None:
         """The difference between this sum and that of `content`, in words; None if there is none."""
-        if len(content) != self.length:
-            return f"has {len(content)} bytes; {self.length} were written"
+        if problem := self.size_problem(len(content)):
+            return problem
         return None if digest(content) == self.digest else "has other bytes than were written"
 
 

@@ -136,7 +136,7 @@ def _audit(location: Location, deep: bool) -> Audit:
         sealed=columns is not None,
         deep=deep,
         problems=tuple(problems),
-        strays=() if problems else tuple(stray_keys(root, commits, columns)),
+        strays=() if problems else tuple(stray_keys(root, commits, columns, objects)),
         left_out=tuple(sorted(left_out)),
     )
 

@@ -308,7 +308,6 @@ class RunWriter[PlanT: WrittenPlan]:
         write_inputs(store, planned.index, episode.inputs, _WRITE_ALL)
         for key, content in episode.pictures.items():
             self.location.write(key, content)
-        pictures = {key: Sum.of(content) for key, content in episode.pictures.items()}
         self.location.flush(f"{DATA}/{key}" for key in store.sums)
         parts = {
             "run": self.root.identity,
@@ -319,8 +318,8 @@ class RunWriter[PlanT: WrittenPlan]:
             "roles": json.loads(json.dumps(episode.roles)),
             "provenance": name_of(self.provenance),
             "control_steps": [int(step) for step in episode.control_steps],
-            "objects": {key: known.to_json() for key, known in store.sums.items()},
-            "pictures": {key: known.to_json() for key, known in pictures.items()},
+            "objects": store.sums,
+            "pictures": {key: Sum.of(content) for key, content in episode.pictures.items()},
         }
         optional = {
             "instruction_ids": None if episode.instruction_ids is None else list(episode.instruction_ids),

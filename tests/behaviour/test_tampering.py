@@ -18,7 +18,7 @@ from probe_kit.intervene import stored_image_swaps
 from probe_kit.retention import retention_table
 from probe_kit.runs import open_run, seal, verify_run
 from probe_kit.runs.commits import write_failure
-from probe_kit.runs.contents import stray_keys
+from probe_kit.runs.contents import stored_objects, stray_keys
 from probe_kit.runs.records import Sum, as_record
 from probe_kit.runs.run import Run
 from probe_kit.runs.store import locate
@@ -635,7 +635,8 @@ def test_copies_that_lie_about_change_nothing_and_are_named(run: Path, little_ru
 def unprotected(run: Run) -> set[str]:
     """Files that no hash covers."""
     commits = dict(zip(run.episodes["episode"], run.commits(), strict=True))
-    return set(stray_keys(run.root, commits, run.columns))
+    objects = stored_objects(run.root, commits, run.columns)
+    return set(stray_keys(run.root, commits, run.columns, objects))
 
 
 def test_no_file_of_a_run_is_without_protection(little_runs: Path) -> None:
