@@ -32,6 +32,7 @@ from zarr.storage import WrapperStore
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
 from probe_kit.runs.location import Location, check_size
+from probe_kit.runs.records import NAME_DIGITS
 
 if TYPE_CHECKING:
     from obstore import ReadableFile
@@ -45,7 +46,6 @@ LONGEST_PAUSE = 5.0
 """Seconds between two requests of the same thing."""
 _QUICK = timedelta(seconds=5)
 """The same for a store that never answered."""
-STAMP_DIGITS = 16
 _NO_BUCKET = "NoSuchBucket"
 _METADATA_SERVICES = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
 """Services of cloud machines, where a client looks last for credentials."""
@@ -305,7 +305,7 @@ class Bucket(Location):
 
     def derived(self, folder: str, stamp: str) -> str:
         """A folder per stamp."""
-        return f"{folder}/{stamp[:STAMP_DIGITS]}"
+        return f"{folder}/{stamp[:NAME_DIGITS]}"
 
     @contextmanager
     def rebuilding(self, folder: str, stamp: str) -> Iterator[Store]:

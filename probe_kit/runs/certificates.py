@@ -5,7 +5,6 @@ certificates/<digits>.json     a record per process, named by the sha256 of its 
 """
 
 import json
-import re
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
@@ -16,11 +15,8 @@ from probe_kit.hashing import sha256_json
 from probe_kit.runs.layout import CERTIFICATE_FILE, CERTIFICATES
 from probe_kit.runs.location import Location
 from probe_kit.runs.provenance import Provenance, name_of
-from probe_kit.runs.records import RESTORE, Record
+from probe_kit.runs.records import NAME_DIGITS, RESTORE, Record, is_hash_name, named_by_hash
 from probe_kit.runs.root import Root
-
-DIGITS = 16
-_NAMED = re.compile(rf"[0-9a-f]{{{DIGITS}}}\.json")
 
 
 class Certificate(Record):
@@ -36,7 +32,7 @@ class Certificate(Record):
 def write_certificate(root: Root, parts: Mapping[str, Any], provenance: Provenance) -> None:
     """Record the checks and loaded parts of one process; `certificate.json` stays from the first one."""
     own = json.loads(json.dumps({**parts, "provenance": name_of(provenance), "run": root.identity}, default=list))
-    key = f"{CERTIFICATES}/{sha256_json(own)[:DIGITS]}.json"
+    key = f"{CERTIFICATES}/{sha256_json(own)[:NAME_DIGITS]}.json"
     root.location.create(key, Certificate.model_validate(own).to_bytes())
     if not root.location.exists(CERTIFICATE_FILE):
         root.location.create(CERTIFICATE_FILE, Certificate.model_validate({**own, **provenance}).to_bytes())
@@ -49,12 +45,10 @@ def read_certificate(root: Root) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """
     first = Certificate.read(root.location, CERTIFICATE_FILE, RESTORE, run=root.identity).content
     records = []
-    for file, raw in root.location.read_all(CERTIFICATES, ".json").items():
-        if not _NAMED.fullmatch(file):
-            continue  # not referenced, such as a copy
-        name = f"{root.location}/{CERTIFICATES}/{file}"
+    for digits, key, raw in named_by_hash(root.location, CERTIFICATES):
+        name = f"{root.location}/{key}"
         record = Certificate.parse(raw, name, RESTORE, run=root.identity).content
-        if sha256_json(record)[:DIGITS] != file.removesuffix(".json"):
+        if sha256_json(record)[:NAME_DIGITS] != digits:
             raise RunDamagedError(f"{name} is another process's. {RESTORE}")
         records.append(record)
     if not records:
@@ -75,5 +69,5 @@ def _repeats(first: dict[str, Any], record: dict[str, Any]) -> bool:
 
 def certificate_keys(location: Location) -> list[str]:
     """Keys of all certificates."""
-    records = [key for key in location.keys(CERTIFICATES) if _NAMED.fullmatch(key.rpartition("/")[2])]
+    records = [key for key in location.keys(CERTIFICATES) if is_hash_name(key.rpartition("/")[2])]
     return [CERTIFICATE_FILE, *records]

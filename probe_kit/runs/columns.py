@@ -12,7 +12,6 @@ A seal says which episodes it was made of. It is older than a run that has more;
 not committed any more shows that the run lost it.
 """
 
-import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -27,7 +26,7 @@ from probe_kit.runs.arrays import bounded_codecs, decode_bfloat16, open_array
 from probe_kit.runs.checking import CheckedStore
 from probe_kit.runs.commits import Commit, commit_key, stamp_of
 from probe_kit.runs.layout import COLUMNS, LATER, SEALED, StoredStream
-from probe_kit.runs.records import Record, Sum, Sums
+from probe_kit.runs.records import NAME_DIGITS, Record, Sum, Sums, named_by_hash
 from probe_kit.runs.root import Root
 from probe_kit.runs.store import Location
 
@@ -36,9 +35,7 @@ if TYPE_CHECKING:
     import zarr
 
 
-STAMP_DIGITS = 16
 METADATA = "zarr.json"
-_NAMED = re.compile(rf"[0-9a-f]{{{STAMP_DIGITS}}}\.json")
 
 
 class Seal(Record):
@@ -128,7 +125,7 @@ def find_columns(root: Root, commits: Mapping[int, Commit]) -> Columns | None:
 
 def seal_key(stamp: str) -> str:
     """Where the hashes of the columns lie that were made from the commits that `stamp` names."""
-    return f"{SEALED}/{stamp[:STAMP_DIGITS]}.json"
+    return f"{SEALED}/{stamp[:NAME_DIGITS]}.json"
 
 
 def write_seal(root: Root, commits: Mapping[int, Commit], sums: Mapping[str, Sum]) -> None:
@@ -141,12 +138,10 @@ def _read_seals(root: Root, commits: Mapping[int, Commit]) -> list[Seal]:
     """All seals, each checked."""
     seals = []
     advice = f"Delete it; `probe-kit run verify {root.location} --seal` builds the columns again"
-    for file, raw in root.location.read_all(SEALED, ".json").items():
-        if not _NAMED.fullmatch(file):
-            continue  # a copy under another name
-        name = f"{root.location}/{SEALED}/{file}"
+    for _, key, raw in named_by_hash(root.location, SEALED):
+        name = f"{root.location}/{key}"
         seal = Seal.parse(raw, name, advice, run=root.identity)
-        if seal_key(seal.stamp) != f"{SEALED}/{file}":
+        if seal_key(seal.stamp) != key:
             raise RunDamagedError(f"{name} belongs to other episodes. {advice}")
         if lost := _metadata(root) - {*seal.objects}:
             raise RunDamagedError(f"{name} names no hash of {min(lost)}. {advice}")

@@ -15,7 +15,6 @@ from probe_kit.runs.records import Record, Sum, Sums
 from probe_kit.runs.root import Root, is_left_out
 
 _NUMBERED = re.compile(r"([0-9]{8})\.json")
-_METADATA = f"{DATA}/{TRAJECTORY}/zarr.json"
 Span = Annotated[tuple[str, int, int], Field(strict=False)]
 """Role, first token, and the token behind the last one."""
 
@@ -134,7 +133,7 @@ def _problems(root: Root, commit: Commit) -> Iterator[str]:
     if further := {*commit.objects} - needed - {trajectory}:
         yield f"names {min(further)}, which is no object of this episode"
     if trajectory in commit.objects:
-        if _METADATA not in root.sums:
+        if not root.has_trajectories:
             yield f"names {trajectory}, though the run keeps no trajectories"
         if type(commit.outcome.get("steps")) is not int:
             yield "does not say how many steps its trajectory has"

@@ -7,7 +7,6 @@ libraries are not the same numbers, so a run is not continued there unless that 
 """
 
 import platform
-import re
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -21,13 +20,11 @@ from probe_kit.errors import RunDamagedError, SettingsMismatchError
 from probe_kit.hashing import sha256_json, sha256_text
 from probe_kit.runs.layout import PROVENANCE
 from probe_kit.runs.location import Location
-from probe_kit.runs.records import RESTORE, Record
+from probe_kit.runs.records import NAME_DIGITS, RESTORE, Record, named_by_hash
 from probe_kit.runs.root import Root
 
 Provenance = Mapping[str, Any]
 
-DIGITS = 16
-_NAMED = re.compile(rf"[0-9a-f]{{{DIGITS}}}\.json")
 _LIBRARIES = ("torch", "lerobot", "transformers", "timm", "pybullet", "zarr", "numcodecs", "numpy", "pillow")
 DECISIVE = (
     "device",
@@ -90,7 +87,7 @@ class ProvenanceRecord(Record):
 
 def name_of(provenance: Provenance) -> str:
     """The name by which commits refer to it."""
-    return sha256_json(provenance)[:DIGITS]
+    return sha256_json(provenance)[:NAME_DIGITS]
 
 
 def keep_provenance(location: Location, provenance: Provenance) -> None:
@@ -102,13 +99,12 @@ def keep_provenance(location: Location, provenance: Provenance) -> None:
 def read_provenances(root: Root) -> dict[str, Provenance]:
     """Every provenance of a run by its name. Raises RunDamagedError for one of another content."""
     provenances: dict[str, Provenance] = {}
-    for file, raw in root.location.read_all(PROVENANCE, ".json").items():
-        if _NAMED.fullmatch(file):  # else a copy under another name
-            where = f"{root.location}/{PROVENANCE}/{file}"
-            content = ProvenanceRecord.parse(raw, where, RESTORE).content
-            if f"{name_of(content)}.json" != file:
-                raise RunDamagedError(f"{where} was changed after it was written. {RESTORE}")
-            provenances[name_of(content)] = content
+    for name, key, raw in named_by_hash(root.location, PROVENANCE):
+        where = f"{root.location}/{key}"
+        content = ProvenanceRecord.parse(raw, where, RESTORE).content
+        if name_of(content) != name:
+            raise RunDamagedError(f"{where} was changed after it was written. {RESTORE}")
+        provenances[name] = content
     return provenances
 
 

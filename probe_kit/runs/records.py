@@ -11,7 +11,8 @@ Hashes detect accidents. They are no protection against an attacker who recomput
 """
 
 import json
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from hashlib import blake2b
 from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
@@ -25,6 +26,9 @@ HASH = "blake2b"
 DIGEST_BYTES, BLOCK_BYTES = 32, 8
 _HEX, _BLOCK_HEX = 2 * DIGEST_BYTES, 2 * BLOCK_BYTES
 _HEXADECIMAL = frozenset("0123456789abcdef")
+NAME_DIGITS = 16
+"""Digits of a hash by which a record or a derived folder is called."""
+_HASH_NAME = re.compile(rf"[0-9a-f]{{{NAME_DIGITS}}}\.json")
 RESTORE = "Restore it from a copy, or extract the run again"
 
 
@@ -135,6 +139,18 @@ def first_error(error: ValidationError) -> str:
     first = error.errors(include_url=False)[0]
     place = ".".join(map(str, first["loc"]))
     return f"{place or 'it'} is {str(first['input'])[:40]!r} ({first['msg']})"
+
+
+def is_hash_name(name: str) -> bool:
+    """Whether an object is called by the first digits of a hash, as `<digits>.json`; copies have other names."""
+    return bool(_HASH_NAME.fullmatch(name))
+
+
+def named_by_hash(location: Location, folder: str) -> Iterator[tuple[str, str, bytes]]:
+    """Digits, key and content of the objects in `folder` that are called by the first digits of a hash."""
+    for name, raw in location.read_all(folder, ".json").items():
+        if is_hash_name(name):
+            yield name.removesuffix(".json"), f"{folder}/{name}", raw
 
 
 def digest(content: bytes) -> str:

@@ -25,6 +25,7 @@ from probe_kit.runs.layout import (
     MEAN_VIEW,
     RUN_FILE,
     SCHEMA_VERSION,
+    TRAJECTORY,
     LaterViews,
     StoredStream,
     VectorKind,
@@ -220,6 +221,11 @@ class Root:
         }
         shapes = stored_inputs_of(self.own_settings).get("inputs", {})
         return {**arrays, **{f"{INPUTS}/{name}": 2 + len(shape) for name, shape in shapes.items()}}
+
+    @property
+    def has_trajectories(self) -> bool:
+        """Whether the run was begun with room for what happens in episodes step by step."""
+        return f"{DATA}/{TRAJECTORY}/zarr.json" in self.sums
 
     @property
     def later_views(self) -> LaterViews:

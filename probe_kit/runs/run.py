@@ -58,7 +58,7 @@ from probe_kit.runs.selection import select_items
 from probe_kit.runs.sources import RunSources
 from probe_kit.runs.store import Location, locate
 from probe_kit.runs.summary import run_html, run_text
-from probe_kit.runs.trajectories import Trajectories, has_trajectories, names_trajectory
+from probe_kit.runs.trajectories import Trajectories, names_trajectory
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -458,7 +458,7 @@ class Run:
         """
         if TRAJECTORY in self.root.left_out:
             return False
-        return has_trajectories(self.root) and all(map(names_trajectory, self._commits.values()))
+        return self.root.has_trajectories and all(map(names_trajectory, self._commits.values()))
 
     @cached_property
     def trajectories(self) -> Trajectories:

@@ -1,6 +1,5 @@
 """Sealing: turns pooled rows into one block per site and view, and roles into a column."""
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,15 @@ from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.runs.arrays import codecs
-from probe_kit.runs.columns import STAMP_DIGITS, seal_key, write_seal
+from probe_kit.runs.columns import seal_key, write_seal
 from probe_kit.runs.layout import COLUMNS, DATA, SEALED, StoredStream, VectorKind
 from probe_kit.runs.recording import RecordingStore
+from probe_kit.runs.records import is_hash_name
 from probe_kit.runs.rows import Rows
 from probe_kit.runs.run import Run, read_run
 from probe_kit.runs.store import Location, locate
 
 EPISODES_PER_CHUNK = 1024
-_SEAL = re.compile(rf"{SEALED}/[0-9a-f]{{{STAMP_DIGITS}}}\.json")
 # What is held in memory at a time; all rows are read once more for every further slab.
 SLAB_BYTES = 1 << 30
 
@@ -62,7 +61,7 @@ def _seal(run: Run) -> bool:
 def _remove_former_seals(run: Run) -> None:
     """Remove seals of other commits: a process that saw fewer may have written one late to an object store."""
     for key in run.location.keys(SEALED):
-        if _SEAL.fullmatch(key) and key != seal_key(run.stamp):
+        if is_hash_name(key.removeprefix(f"{SEALED}/")) and key != seal_key(run.stamp):
             run.location.delete(key)
 
 

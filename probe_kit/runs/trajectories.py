@@ -18,8 +18,7 @@ from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
 from probe_kit.errors import RunDamagedError
 from probe_kit.runs.arrays import ROOM, codecs
 from probe_kit.runs.commits import Commit
-from probe_kit.runs.layout import DATA, TRAJECTORY
-from probe_kit.runs.root import Root
+from probe_kit.runs.layout import TRAJECTORY
 from probe_kit.runs.rows import Rows
 
 
@@ -37,11 +36,6 @@ def create_trajectories(store: Store, frames: int, codec: str) -> None:
         attributes={"channels": list(CHANNELS)},
         config={"write_empty_chunks": True},
     )
-
-
-def has_trajectories(root: Root) -> bool:
-    """Whether the run was begun with room for them."""
-    return f"{DATA}/{TRAJECTORY}/zarr.json" in root.sums
 
 
 def names_trajectory(commit: Commit) -> bool:

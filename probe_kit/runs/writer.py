@@ -4,7 +4,6 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
 from math import prod
 from typing import Any, Protocol, Self
 
@@ -47,7 +46,7 @@ from probe_kit.runs.records import Sum
 from probe_kit.runs.root import Root, new_root, read_root
 from probe_kit.runs.seconds import Seconds, write_seconds
 from probe_kit.runs.store import Location
-from probe_kit.runs.trajectories import create_trajectories, has_trajectories, write_trajectory
+from probe_kit.runs.trajectories import create_trajectories, write_trajectory
 
 # Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
 # a reader must be able to tell an empty chunk from a lost one. Not stored in the array, so asked for here.
@@ -223,11 +222,6 @@ class RunWriter[PlanT: WrittenPlan]:
             root.identity, root.stored_plan, plan["episodes"], selection, plan["suite_parent"], tokens
         )
 
-    @cached_property
-    def _keeps_trajectories(self) -> bool:
-        """Not in a run that was begun before there were any: all of its episodes stay alike."""
-        return has_trajectories(self.root)
-
     @contextmanager
     def owned(self) -> Iterator[None]:
         """Work on the run while the body runs; failures of earlier attempts are forgotten."""
@@ -303,7 +297,7 @@ class RunWriter[PlanT: WrittenPlan]:
                 if array.shards:
                     store.shards[f"{stream}/{kind}"] = prod(array.shards) // prod(array.chunks)
                 array[planned.index] = values
-        if episode.trajectory is not None and self._keeps_trajectories:
+        if episode.trajectory is not None and self.root.has_trajectories:
             write_trajectory(store, planned.index, episode.trajectory, _WRITE_ALL)
         write_inputs(store, planned.index, episode.inputs, _WRITE_ALL)
         for key, content in episode.pictures.items():

@@ -94,11 +94,16 @@ def _is_respelled(fault: Fault) -> bool:
     """Whether the fault changes the spelling of JSON records and none of their values."""
     for path, content in fault.change.items():
         try:
-            if content is None or json.loads(content) != json.loads(path.read_bytes()):
+            if content is None or _values(content) != _values(path.read_bytes()):
                 return False
         except ValueError:
             return False
     return True
+
+
+def _values(content: bytes) -> str:
+    """One spelling of the values, in which 1, 1.0 and true differ."""
+    return json.dumps(json.loads(content), sort_keys=True)
 
 
 def _summary(audit: Audit) -> tuple[object, ...]:
