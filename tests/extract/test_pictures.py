@@ -14,6 +14,7 @@ from probe_kit.diagnose.diagnosis import diagnose_run
 from probe_kit.errors import ProbeKitError, RecordingError, UsageError
 from probe_kit.extract import ExtractSettings, PictureFolder, extract_run, prepare
 from probe_kit.extract.rollout.worker import torch_threads
+from probe_kit.extract.sources.pictures import PictureSource
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, Policy
 from probe_kit.intervene import Interchange, ReplaySource, run_intervention
@@ -152,3 +153,14 @@ def test_workers_show_the_same_pictures(run: pk.Run, folder: Path, tmp_path: Pat
     again = extract_run(ExtractSettings("pi0-tiny", source=source(folder), workers=2), tmp_path / "run")
     site = pk.Site("expert", 3, iteration=9)
     np.testing.assert_array_equal(again.column(site, "mean"), run.column(site, "mean"))
+
+
+def test_a_run_names_the_table_that_was_read_even_if_it_is_changed_later(folder: Path, tmp_path: Path) -> None:
+    table = tmp_path / "table.csv"
+    table.write_bytes((folder / "table.csv").read_bytes())
+    opened = PictureSource.open(PictureFolder(folder, table), selects_only=False)
+    before = opened.identity(1)
+    table.write_text("picture,instruction\n0.png,another\n", encoding="utf-8")
+    assert opened.identity(1) == before
+    changed = PictureSource.open(PictureFolder(folder, table), selects_only=False)
+    assert changed.identity(1) != before

@@ -108,8 +108,11 @@ class PictureSource(Source[PictureFolder]):
     executes = False
     groups = "groups of pictures"
 
-    def __init__(self, settings: PictureFolder, names: Sequence[str], lines: Sequence[tuple[Cells, Line]]) -> None:
+    def __init__(
+        self, settings: PictureFolder, names: Sequence[str], lines: Sequence[tuple[Cells, Line]], digest: str
+    ) -> None:
         self.settings, self.columns, self.lines = settings, tuple(names), list(lines)
+        self._digest = digest
         self.cameras: list[str] = []
         self.prediction: tuple[int, int] = (0, 0)
         first = self.lines[0][1]
@@ -120,6 +123,8 @@ class PictureSource(Source[PictureFolder]):
         """Read the table and all its pictures. Raises RecordingError for a line that cannot be shown."""
         del selects_only
         table, folder = Path(settings.table).expanduser(), Path(settings.folder).expanduser()
+        # Hashed once, where it is read: a table that is changed later would name a run that never showed it.
+        digest = sha256(read_regular(table, MOST_BYTES)).hexdigest()[: 2 * _DIGITS]
         read = open_table(table, (PICTURE, INSTRUCTION))
         if not {PICTURE, INSTRUCTION} <= set(read.names):
             columns = ", ".join(read.names) or "no line"
@@ -134,7 +139,7 @@ class PictureSource(Source[PictureFolder]):
         ids = [_id(text, number) for number, (text, _) in enumerate(lines)]
         if twice := [name for name, count in Counter(ids).items() if count > 1]:
             raise RecordingError(f"{table.name} has the id {twice[0]!r} twice; give each line its own")
-        return cls(settings, names, lines)
+        return cls(settings, names, lines, digest)
 
     def decided(self) -> Mapping[str, Any]:
         """Return that the only inference of a picture is captured and nothing acts."""
@@ -205,10 +210,9 @@ class PictureSource(Source[PictureFolder]):
         del execute
         shapes = {"columns": [len(self.columns)], "prediction": list(self.prediction)}
         shapes |= {"pixels": [1, SIDE, SIDE, 3]} if self.settings.pixels else {}
-        table = read_regular(Path(self.settings.table).expanduser(), MOST_BYTES)
         data_set = {
             "kind": "pictures",
-            "meta_blake2b": sha256(table).hexdigest()[: 2 * _DIGITS],
+            "meta_blake2b": self._digest,
             "fps": 1.0,
             "frames": "every:1",
             "cameras": [[camera, PICTURE, "image"] for camera in self.cameras],
