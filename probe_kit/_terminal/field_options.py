@@ -22,14 +22,17 @@ from probe_kit.errors import UsageError
 class Part(BaseModel):
     """A frozen group of settings. Values without a name are those of the first fields.
 
-    Raises UsageError naming the field, the value and what is expected in its place.
+    Raises UsageError naming the field, the value and what is expected in its place, TypeError for more values than
+    fields.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     def __init__(self, *first: Any, **values: Any) -> None:
+        names = [name for name in type(self).model_fields if name != "kind"]
+        if len(first) > len(names):
+            raise TypeError(f"{type(self).__name__} has {len(names)} fields; {len(first)} values are given")
         try:
-            names = (name for name in type(self).model_fields if name != "kind")
             super().__init__(**dict(zip(names, first, strict=False)), **values)
         except ValidationError as error:
             raise UsageError(in_words(type(self).__name__, error)) from None

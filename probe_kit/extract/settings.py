@@ -96,12 +96,13 @@ class Settings(Part):
                 f"than actions; use --max-steps {MOST_FRAMES - 1} or --frames ends"
             )
 
-    def __init__(self, model: Any = None, **values: Any) -> None:
+    def __init__(self, model: Any = None, checkpoint: str | None = None, **values: Any) -> None:
         """Take parts, or fields of any part by their names. model: a family, or the part.
 
         Raises UsageError and SceneError for values that cannot be used, TypeError for a name that is no field.
         """
-        super().__init__(**self._by_part(model, values))
+        named = {} if checkpoint is None else {"checkpoint": checkpoint}
+        super().__init__(**self._by_part(model, named | values))
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
@@ -247,8 +248,8 @@ class ExtractSettings(Settings):
 
     sources: ClassVar[tuple[type[SourceSettings], ...]] = SOURCES
 
-    def __init__(self, model: Any = None, *checkpoint: str | None, **values: Any) -> None:
-        super().__init__(model, **values, **dict(zip(("checkpoint",), checkpoint, strict=False)))
+    def __init__(self, model: Any = None, checkpoint: str | None = None, **values: Any) -> None:
+        super().__init__(model, checkpoint, **values)
 
     @classmethod
     def _by_part(cls, model: Any, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -310,8 +311,8 @@ class AskSettings(Settings):
     task: AskTask
     machine: AskMachine
 
-    def __init__(self, model: Any = None, *checkpoint: str | None, **values: Any) -> None:
-        super().__init__(model, **values, **dict(zip(("checkpoint",), checkpoint, strict=False)))
+    def __init__(self, model: Any = None, checkpoint: str | None = None, **values: Any) -> None:
+        super().__init__(model, checkpoint, **values)
 
     @classmethod
     def per_prompt_and_size(

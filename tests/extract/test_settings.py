@@ -15,6 +15,7 @@ from probe_kit.env.spec import PRESETS
 from probe_kit.errors import UsageError
 from probe_kit.extract import AskSettings, EnvSource, ExtractSettings, LeRobotSource, extract_run, prepare
 from probe_kit.extract.config_files import read_config
+from probe_kit.extract.parts import ModelSettings
 from probe_kit.extract.preparation import open_checked
 from probe_kit.extract.settings import SOURCES, run_label
 from probe_kit.hooks import Edit, Site
@@ -145,6 +146,13 @@ def test_a_value_that_cannot_be_used_is_refused_by_its_name(values: dict[str, An
     with pytest.raises(UsageError) as refused:
         ExtractSettings("pi0", **values)
     assert message in str(refused.value)
+
+
+def test_more_values_without_a_name_than_there_are_fields_are_refused() -> None:
+    with pytest.raises(TypeError, match="takes from 1 to 3 positional arguments but 4 were given"):
+        ExtractSettings("pi0", "checkpoint", "cuda")  # type: ignore[misc]
+    with pytest.raises(TypeError, match="has 6 fields; 7 values are given"):
+        ModelSettings("pi0", None, {}, False, 0, None, "cuda")
 
 
 def test_an_unknown_name_is_refused_with_the_nearest_known_one() -> None:
