@@ -51,7 +51,7 @@ def test_another_adapter_over_the_same_network_keeps_its_memory(pi0_tiny: Pi0, o
     """The prompt passes once, however often an adapter is put around it."""
     again = type(pi0_tiny)(pi0_tiny.network, pi0_tiny.folder)
     again.card = pi0_tiny.card
-    assert again._kept is pi0_tiny._kept
+    assert again.passages is pi0_tiny.passages
     site = Site("kv", 0, "keys")
     with capture(again, [site]) as tape:
         again.act([observation], [0])
