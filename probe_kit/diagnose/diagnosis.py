@@ -49,13 +49,13 @@ class InputDiagnosis:
 
     @property
     def where(self) -> str:
-        """Where it is lost or which sites carry it; the note where nothing was measured inside."""
+        """The place of the loss, or the sites that carry it; the note where nothing was measured inside."""
         return describe_passage(self.passage, self.importance.matters) or self.note
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What became of every input of a run's model.
+    """The diagnosis of every input of a run's model.
 
     key: of the stored diagnosis. label: of the run. n_frames, n_groups: that were used.
     """
@@ -68,10 +68,10 @@ class Diagnosis:
 
     def exit_code(self, required: Sequence[str] = ()) -> int:
         """0 if every required input arrives and matters, else 1; see `importance.exit_code`."""
-        names = [one.name for one in self.inputs]
+        names = [diagnosed.name for diagnosed in self.inputs]
         if unknown := [name for name in required if name not in names]:
             raise UsageError(f"no input is called {unknown[0]!r}; this source has {', '.join(names)}")
-        return exit_code([one.importance for one in self.inputs], required)
+        return exit_code([diagnosed.importance for diagnosed in self.inputs], required)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; numbers that are not known are None."""
@@ -82,12 +82,12 @@ class Diagnosis:
             "n_groups": self.n_groups,
             "inputs": [
                 {
-                    **_plain(asdict(one.importance)),
-                    "where": one.where,
-                    "note": one.note,
-                    "passage": [_plain(asdict(site)) for site in one.passage],
+                    **_plain(asdict(diagnosed.importance)),
+                    "where": diagnosed.where,
+                    "note": diagnosed.note,
+                    "passage": [_plain(asdict(site)) for site in diagnosed.passage],
                 }
-                for one in self.inputs
+                for diagnosed in self.inputs
             ],
         }
 
@@ -100,7 +100,7 @@ class Diagnosis:
             numbers["share_ci"] = tuple(_number(end) for end in numbers["share_ci"])
             numbers |= {name: _number(numbers[name]) for name in ("share", "control", "every", "p")}
             sites = tuple(
-                SitePassage(site["place"], site["difference"], _number(site["carried"]))
+                SitePassage(site["name"], site["difference"], _number(site["carried"]))
                 for site in record["passage"]
             )
             inputs.append(InputDiagnosis(Importance(**numbers), sites, record["note"]))
@@ -184,16 +184,16 @@ def _diagnose(
     progress: Progress,
 ) -> Diagnosis:
     def infer(observations: Sequence["Observation"], seeds: Sequence[int]) -> Actions:
-        return np.stack([session.act(*given) for given in zip(observations, seeds, strict=True)])
+        return np.stack([session.act(*inference) for inference in zip(observations, seeds, strict=True)])
 
     progress("inputs")
     policy = session.policy
     reads_state, camera = policy.state_numbers is not None, policy.card.cameras[0] if policy.card.cameras else ""
     exchange = InputExchange(infer, frames, seed)
     inputs = []
-    for one in exchange.measure(names, reads_state=reads_state, camera=camera):
-        progress(f"sites of {one.name}")
-        inputs.append(_look_inside(session, exchange, one) if inside else InputDiagnosis(one))
+    for importance in exchange.measure(names, reads_state=reads_state, camera=camera):
+        progress(f"sites of {importance.name}")
+        inputs.append(_look_inside(session, exchange, importance) if inside else InputDiagnosis(importance))
     groups = len({frame.group for frame in frames})
     return Diagnosis("", "", len(frames), groups, tuple(inputs))
 
@@ -222,6 +222,6 @@ def _look_inside(session: "ReplaySession", exchange: InputExchange, importance: 
 
 
 def _as_many_tokens(session: "ReplaySession", pair: Pair) -> bool:
-    rows = [session.policy.token_roles([given]) for given in (pair.clean, pair.source)]  # type: ignore[list-item]
+    rows = [session.policy.token_roles([observation]) for observation in (pair.clean, pair.source)]  # type: ignore[list-item]
     counts = [{stream: len(roles[0]) for stream, roles in row.items()} for row in rows]
     return counts[0] == counts[1]

@@ -44,11 +44,11 @@ def _observed(session: ObservedSession, count: int) -> Iterator[Frame]:
     for frame in session.frames.index:
         groups.setdefault(frame.group, []).append(frame)
     turns = -(-count // len(groups))
-    chosen = [
+    spread = [
         [frames[int(at)] for at in np.unique(np.linspace(0, len(frames) - 1, min(turns, len(frames))).round())]
         for frames in groups.values()
     ]
-    in_turn = [frame for turn in zip_longest(*chosen) for frame in turn if frame is not None]
+    in_turn = [frame for turn in zip_longest(*spread) for frame in turn if frame is not None]
     for frame in in_turn[:count]:
         yield Frame(frame.name, session.frames.observe(frame), frame.group, frame.seed)
 

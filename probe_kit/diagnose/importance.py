@@ -1,4 +1,4 @@
-"""How much of the action an input decides: total-effect indices, their intervals and the verdict. Loads no model.
+"""The share of the action that an input decides: total-effect indices, intervals and the verdict. Loads no model.
 
 The index of an input is the share of the action's variance that is due to it, alone and together with others:
 S = Σ (a(x) − a(x with another value of the input))² / 2 V, by Jansen's estimator (M. Jansen, Computer Physics
@@ -61,7 +61,7 @@ class ActionScale:
 
 @dataclass(frozen=True)
 class Exchanges:
-    """What exchanges of one input changed, pair by pair.
+    """The changes of the action by exchanges of one input, pair by pair.
 
     exchanged, control, every: (P,) shares of the variance, see `ActionScale.shares`: with the donor's input, with
     the control of the input, and with all inputs of the donor. groups: (P,). largest: (P,) the largest change of
@@ -79,7 +79,7 @@ class Exchanges:
 
 @dataclass(frozen=True)
 class Importance:
-    """Whether an input arrives and how much of the action it decides.
+    """The importance of one input: does it arrive, and how much of the action does it decide?
 
     share: the total-effect index, 1 where nothing else matters, with its 95 % interval by groups (Student).
     control: the index of a change that should not matter. every: of all inputs together. p: exact, one-sided, by
@@ -107,7 +107,7 @@ class Importance:
 
     @property
     def matters(self) -> bool | None:
-        """Whether it decides or moves the action; None where that was not tested."""
+        """True if the input decides or moves the action, False if not; None where that was not tested."""
         return None if self.verdict in ("not varied", "not an input") else self.verdict in MATTERS
 
 
@@ -165,6 +165,6 @@ def _verdict(exchanges: Exchanges, above: NDArray[np.float64], p: float) -> tupl
 
 def exit_code(inputs: Sequence[Importance], required: Sequence[str] = ()) -> int:
     """0 if every required input arrives and matters, else 1. required: names; empty for all that were tested."""
-    tested = [one for one in inputs if one.matters is not None]
-    judged = [one for one in inputs if one.name in required] if required else tested
-    return 0 if judged and all(one.matters for one in judged) else 1
+    tested = [importance for importance in inputs if importance.matters is not None]
+    judged = [importance for importance in inputs if importance.name in required] if required else tested
+    return 0 if judged and all(importance.matters for importance in judged) else 1

@@ -40,8 +40,8 @@ def inputs_of(frames: Sequence[Frame], camera: str = "") -> tuple[str, ...]:
     """
     if not frames:
         raise UsageError("the source has no frame; diagnose needs at least two that differ")
-    further = list(frames[0].observation.cameras)
-    pictures = [f"{PICTURE}.{name}" for name in (camera or "first", *further)] if further else [PICTURE]
+    cameras = list(frames[0].observation.cameras)
+    pictures = [f"{PICTURE}.{name}" for name in (camera or "first", *cameras)] if cameras else [PICTURE]
     return (INSTRUCTION, *pictures, STATE)
 
 

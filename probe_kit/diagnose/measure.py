@@ -34,21 +34,21 @@ class InputExchange:
     def measure(
         self, names: Sequence[str] = (), *, reads_state: bool = True, camera: str = ""
     ) -> tuple[Importance, ...]:
-        """How much of the action every input decides.
+        """Return how much of the action every input decides.
 
         names: of the inputs; empty for all. reads_state: whether the model is given a state at all. camera: the
         name of the first one. Raises UsageError for an unknown name, fewer than two groups, or a policy that gives
         other actions for the same observation and seed.
         """
-        known = inputs_of(self.frames, camera)
-        if unknown := [name for name in names if name not in known]:
-            raise UsageError(f"no input is called {unknown[0]!r}; this source has {', '.join(known)}")
+        available = inputs_of(self.frames, camera)
+        if unknown := [name for name in names if name not in available]:
+            raise UsageError(f"no input is called {unknown[0]!r}; this source has {', '.join(available)}")
         if not self.scale.varies.any():
             raise UsageError(
                 f"all {2 * len(self.frames)} actions are equal, whatever is seen; give frames that differ"
             )
-        measured = map(self._measure, names or known)
-        return tuple(one if reads_state else _without_state(one) for one in measured)
+        measured = map(self._measure, names or available)
+        return tuple(importance if reads_state else _without_state(importance) for importance in measured)
 
     def donors(self, name: str) -> list[tuple[int, int]]:
         """Pairs (frame, donor) of an input, the same at every call; see `draw_donors`."""
@@ -120,7 +120,9 @@ class InputExchange:
     def _blanked(self, name: str) -> Actions:
         """Actions of all frames without one input; of none where the family refuses text without words."""
         try:
-            return self.infer([with_input(one, name, self._blank) for one in self._observations], self._seeds)
+            return self.infer(
+                [with_input(observation, name, self._blank) for observation in self._observations], self._seeds
+            )
         except InstructionError:
             return np.zeros((0, 1, 1), np.float32)
 

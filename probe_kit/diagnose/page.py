@@ -21,13 +21,13 @@ _HEAD = (
 
 def draw_passage(diagnosis: "Diagnosis") -> "Figure":
     """A curve per input over the sites in the network's order: the difference, and the share carried on."""
-    curves = [one for one in diagnosis.inputs if one.passage]
-    places = list(dict.fromkeys(site.place for one in curves for site in one.passage))
+    curves = [diagnosed for diagnosed in diagnosis.inputs if diagnosed.passage]
+    places = list(dict.fromkeys(site.name for diagnosed in curves for site in diagnosed.passage))
     figure, axes = panels(2, width=max(4.2, 0.28 * len(places)), height=2.6, columns=1, share=False)
-    for at, one in enumerate(curves):
-        x = [places.index(site.place) for site in one.passage]
-        axes[0].plot(x, [site.difference for site in one.passage], label=one.name, **_look(at))
-        axes[1].plot(x, [site.carried for site in one.passage], label=one.name, **_look(at))
+    for at, diagnosed in enumerate(curves):
+        x = [places.index(site.name) for site in diagnosed.passage]
+        axes[0].plot(x, [site.difference for site in diagnosed.passage], label=diagnosed.name, **_look(at))
+        axes[1].plot(x, [site.carried for site in diagnosed.passage], label=diagnosed.name, **_look(at))
     for panel, label in zip(axes, ("relative difference", "share carried"), strict=True):
         plain(panel)
         panel.set_xticks(range(len(places)), places, rotation=90, fontsize=7)
@@ -51,10 +51,10 @@ def write_page(diagnosis: "Diagnosis", file: Path) -> None:
 
     from probe_kit.retention.displays.base.display import picture_of
 
-    items = Markup("").join(Markup("<li>{}</li>").format(sentence(one)) for one in diagnosis.inputs)
+    items = Markup("").join(Markup("<li>{}</li>").format(sentence(diagnosed)) for diagnosed in diagnosis.inputs)
     parts = [_HEAD.format(title=escape(f"Inputs of {diagnosis.label}")), diagnosis_table(diagnosis)._repr_html_()]
     parts.append(Markup("<ul>{}</ul>").format(items))
-    if any(one.passage for one in diagnosis.inputs):
+    if any(diagnosed.passage for diagnosed in diagnosis.inputs):
         content, size = picture_of(draw_passage(diagnosis))
         image = '<img alt="sites on the way to the action" width={} src="data:image/png;base64,{}">'
         parts.append(Markup(image).format(size["width"], b64encode(content).decode()))

@@ -9,7 +9,7 @@ COLUMNS = ("instruction", "other")
 
 
 def read_paraphrases(file: Path) -> dict[str, str]:
-    """By instruction, its other words.
+    """Return, by instruction, its other words.
 
     Raises UsageError for a file without the columns, a blank cell, and an instruction with two other texts.
     """

@@ -1,4 +1,4 @@
-"""Where an input passes on its way to the action: at which sites two inferences differ, and which carry it on.
+"""The way of an input to the action: at which sites two inferences differ, and which carry the change on.
 
 The clean and the donor inference have the same seed and differ in one input. At every site of the streams that are
 stored, and of `kv`, two numbers are measured: how much the activations differ, and how much of the change of the
@@ -31,19 +31,19 @@ CARRIES = 0.5
 class SitePassage:
     """One site of the network. Means over pairs.
 
-    place: as `--sites` names it. difference: norm of the difference of the activations, relative to the clean
+    name: as `--sites` names it. difference: norm of the difference of the activations, relative to the clean
     ones. carried: the change of the action under the patch of this site, projected on the change under the donor's
     input, 1 for all of it; NaN where the donor changes no action.
     """
 
-    place: str
+    name: str
     difference: float
     carried: float
 
     @property
     def stream(self) -> str:
         """The stream of the site."""
-        return self.place.partition(".")[0]
+        return self.name.partition(".")[0]
 
     @property
     def differs(self) -> bool:
@@ -56,7 +56,7 @@ def places_of(model: "Model") -> list[SiteGroup]:
     streams = list(model.streams)
     if model.prompt_kv is not None:
         streams.insert(1, KV_STREAM)
-    return [place for stream in streams for place in resolve_sites(f"{stream}.*", model)]
+    return [group for stream in streams for group in resolve_sites(f"{stream}.*", model)]
 
 
 def measure_passage(
@@ -68,49 +68,49 @@ def measure_passage(
     """
     model, places = session.policy, places_of(session.policy)
     differences = np.zeros((len(pairs), len(places)))
-    moved, whole = np.zeros((len(pairs), len(places))), np.zeros(len(pairs))
+    moved, squares = np.zeros((len(pairs), len(places))), np.zeros(len(pairs))
     for row, pair in enumerate(pairs):
         clean, before = _captured(session, pair.clean, pair.seed, places)
         donated, donor = _captured(session, pair.source, pair.seed, places)
         change = scale.changes(donated[None], clean[None])[0]
-        whole[row] = change @ change
+        squares[row] = change @ change
         memo: dict[object, object] = {}
-        for column, place in enumerate(places):
-            differences[row, column] = _relative_difference(place, before, donor)
-            if whole[row] and differences[row, column] > LIKE_NONE:
-                with patched(model, pair, [Cell(place, ALL)], donor, memo=memo):
+        for column, group in enumerate(places):
+            differences[row, column] = _relative_difference(group, before, donor)
+            if squares[row] and differences[row, column] > LIKE_NONE:
+                with patched(model, pair, [Cell(group, ALL)], donor, memo=memo):
                     edited = session.act(pair.clean, pair.seed)
                 moved[row, column] = scale.changes(edited[None], clean[None])[0] @ change
-    shares = moved.sum(axis=0) / whole.sum() if whole.any() else np.full(len(places), np.nan)
+    shares = moved.sum(axis=0) / squares.sum() if squares.any() else np.full(len(places), np.nan)
     return tuple(
-        SitePassage(place.name, float(difference), float(share))
-        for place, difference, share in zip(places, differences.mean(axis=0), shares, strict=True)
+        SitePassage(group.name, float(difference), float(share))
+        for group, difference, share in zip(places, differences.mean(axis=0), shares, strict=True)
     )
 
 
 def _captured(
-    session: "ReplaySession", given: Given, seed: int, places: Sequence[SiteGroup]
+    session: "ReplaySession", observation: Given, seed: int, places: Sequence[SiteGroup]
 ) -> "tuple[Chunk, ActivationCache]":
     """The actions of one inference in the session's units, which of recordings are the checkpoint's own."""
     from probe_kit.hooks import capture
 
-    with capture(session.policy, [site for place in places for site in place.sites]) as cache:
-        chunk = session.act(given, seed)
+    with capture(session.policy, [site for group in places for site in group.sites]) as cache:
+        chunk = session.act(observation, seed)
     return chunk, cache
 
 
-def _relative_difference(place: SiteGroup, before: "ActivationCache", after: "ActivationCache") -> float:
+def _relative_difference(group: SiteGroup, before: "ActivationCache", after: "ActivationCache") -> float:
     """Norm of the difference over all tokens and iterations of a place, relative to the norm before."""
     difference = norm = 0.0
-    for site in place.sites:
-        here, there = before[site].float(), after[site].float()
-        difference += float((there - here).square().sum())
-        norm += float(here.square().sum())
+    for site in group.sites:
+        clean, donated = before[site].float(), after[site].float()
+        difference += float((donated - clean).square().sum())
+        norm += float(clean.square().sum())
     return float(np.sqrt(difference / norm)) if norm else 0.0
 
 
 def describe_passage(passage: Sequence[SitePassage], matters: bool | None) -> str:
-    """Where the input is lost, or which sites carry it, as a sentence without its stop; empty if unknown."""
+    """Return where the input is lost, or which sites carry it, as a sentence without its stop; empty if unknown."""
     if not passage:
         return ""
     reached = [site for site in passage if site.differs]
@@ -118,7 +118,7 @@ def describe_passage(passage: Sequence[SitePassage], matters: bool | None) -> st
         return "no site inside the network differs: it ends before the first layer"
     if passage[-1] is not reached[-1]:
         following = passage[passage.index(reached[-1]) + 1]
-        return f"the difference ends behind {reached[-1].place}; {following.place} is bit-equal"
+        return f"the difference ends behind {reached[-1].name}; {following.name} is bit-equal"
     if matters:
         carriers = [site for site in passage if site.carried >= CARRIES]
         spans = [_span([site for site in carriers if site.stream == stream]) for stream in _streams(carriers)]
@@ -126,8 +126,8 @@ def describe_passage(passage: Sequence[SitePassage], matters: bool | None) -> st
     strongest = max(passage, key=lambda site: site.difference)
     last = passage[-1]
     return (
-        f"it is strongest at {strongest.place} (relative difference {strongest.difference:.2g}) and reaches "
-        f"{last.place} ({last.difference:.2g}): the loss is in the action part itself"
+        f"it is strongest at {strongest.name} (relative difference {strongest.difference:.2g}) and reaches "
+        f"{last.name} ({last.difference:.2g}): the loss is in the action part itself"
     )
 
 
@@ -137,5 +137,5 @@ def _streams(sites: Sequence[SitePassage]) -> list[str]:
 
 def _span(sites: Sequence[SitePassage]) -> str:
     """The first and the last of some sites of one stream, such as `backbone.00–02`."""
-    first, last = sites[0].place, sites[-1].place
+    first, last = sites[0].name, sites[-1].name
     return first if first == last else f"{first}–{last.partition('.')[2]}"

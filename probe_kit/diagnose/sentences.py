@@ -31,17 +31,19 @@ _FINDINGS = {
 
 def diagnosis_table(diagnosis: "Diagnosis") -> Table:
     """One line per input, with one sentence per input below it."""
-    rows = [_row(one) for one in diagnosis.inputs]
+    rows = [_row(diagnosed) for diagnosed in diagnosis.inputs]
     title = f"Inputs of {diagnosis.label}: {diagnosis.n_frames} frames of {diagnosis.n_groups} groups"
     numbers = tuple(diagnosis.to_json()["inputs"])
-    return Table.of(title, _HEADINGS, rows, notes=[sentence(one) for one in diagnosis.inputs], numbers=numbers)
+    return Table.of(
+        title, _HEADINGS, rows, notes=[sentence(diagnosed) for diagnosed in diagnosis.inputs], numbers=numbers
+    )
 
 
-def _row(one: "InputDiagnosis") -> Sequence[Cell]:
-    importance = one.importance
+def _row(diagnosed: "InputDiagnosis") -> Sequence[Cell]:
+    importance = diagnosed.importance
     tested = importance.matters is not None
     texts = (
-        one.name,
+        diagnosed.name,
         ("yes" if importance.arrives else "no") if tested else "–",
         importance.verdict,
         with_limits(importance.share, importance.share_ci, whole),
@@ -54,9 +56,9 @@ def _row(one: "InputDiagnosis") -> Sequence[Cell]:
     return [Cell(text, alarm=heading.text in lost) for heading, text in headed]
 
 
-def sentence(one: "InputDiagnosis") -> str:
-    """What became of an input, and where: one sentence."""
-    importance = one.importance
+def sentence(diagnosed: "InputDiagnosis") -> str:
+    """Return one sentence: what became of an input, and where."""
+    importance = diagnosed.importance
     reason = f" ({importance.reason})" if importance.verdict in ("not varied", "not an input", "open") else ""
-    where = f"; {one.where}" if one.where else ""
-    return f"{one.name} {_FINDINGS[importance.verdict]}{reason}{where}."
+    where = f"; {diagnosed.where}" if diagnosed.where else ""
+    return f"{diagnosed.name} {_FINDINGS[importance.verdict]}{reason}{where}."

@@ -63,7 +63,7 @@ def test_words_and_pictures_decide_color_and_pass_by_one_block(diagnosis: dict[s
     for name in ("instruction", "picture"):
         assert inputs[name]["verdict"] in ("decides", "moves"), "12 frames do not always tell them apart"
         assert inputs[name]["share"] > 0.5
-    carried = {site["place"]: site["carried"] for site in inputs["instruction"]["passage"]}
+    carried = {site["name"]: site["carried"] for site in inputs["instruction"]["passage"]}
     assert carried["kv.02"] > 0.9
     assert abs(carried["kv.01"]) < 0.1
     assert carried["backbone.03"] == 0, "nothing reads it"
@@ -130,7 +130,7 @@ def test_recordings_of_the_same_frames_have_the_same_diagnosis(run: Run, tmp_pat
     source = LeRobotSource(str(tmp_path / "frames"), cameras={"base": CAMERA})
     recorded = extract_run(ExtractSettings("pi0-tiny", source=source), tmp_path / "run")
     diagnosis = diagnose_run(recorded, frames=12)
-    carried = {site.place: site.carried for site in diagnosis.inputs[0].passage}
+    carried = {site.name: site.carried for site in diagnosis.inputs[0].passage}
     assert carried["kv.02"] > 0.9
     assert carried["backbone.03"] == 0
     assert (diagnosis.n_frames, diagnosis.n_groups) == (12, 12)
