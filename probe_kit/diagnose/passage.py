@@ -110,7 +110,7 @@ def _relative_difference(group: SiteGroup, before: "ActivationCache", after: "Ac
 
 
 def describe_passage(passage: Sequence[SitePassage], matters: bool | None) -> str:
-    """Return where the input is lost, or which sites carry it, as a sentence without its stop; empty if unknown."""
+    """Return where the input is lost, or which sites carry it, as a sentence without its stop; else empty."""
     if not passage:
         return ""
     reached = [site for site in passage if site.differs]
