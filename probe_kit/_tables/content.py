@@ -70,7 +70,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Content:
-    """What a renderer reads: a table of text, and the numbers behind it.
+    """The part of a table that a renderer reads: its text, and the numbers behind it.
 
     names: how many of the first columns name the rows. notes: sentences below it, which need no capital letter and
     no stop. numbers: an object per row or per number, shares in [0, 1], None where unknown. overflow: of a
@@ -101,7 +101,7 @@ class Content:
         names = int(more.get("names", 1))
         cells = [tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in row) for row in rows]
         lines = [Row(row, mean is not None and mean in [cell.text for cell in row[:names]]) for row in cells]
-        heads = tuple(one if isinstance(one, Heading) else Heading(one) for one in headings)
+        heads = tuple(heading if isinstance(heading, Heading) else Heading(heading) for heading in headings)
         return cls(title, heads, tuple(lines), notes=tuple(filter(None, notes)), **more)
 
     @property
@@ -114,8 +114,8 @@ class Content:
         """The headings as text, with the name over them where two columns have one heading."""
         texts = self.columns
         return tuple(
-            f"{one.group} {one.text}" if one.group and texts.count(one.text) > 1 else one.text
-            for one in self.headings
+            f"{heading.group} {heading.text}" if heading.group and texts.count(heading.text) > 1 else heading.text
+            for heading in self.headings
         )
 
     @property
@@ -130,7 +130,7 @@ class Content:
 
     @property
     def are_numeric(self) -> tuple[bool, ...]:
-        """Whether each column holds numbers, which stand to the right."""
+        """Return by column whether it holds numbers, which stand to the right."""
         return tuple(
             at >= self.names and any(texts) and all(map(_NUMBER.match, texts))
             for at, texts in enumerate(self._by_column)
@@ -161,9 +161,11 @@ class Content:
             ]
         )
 
-    def details(self, shown: bool) -> Self | None:
+    def details(self, are_details: bool) -> Self | None:
         """Return the columns that need room, or those that do not; None where there are none of them."""
-        columns = [at for at, one in enumerate(self.headings) if at >= self.names and one.is_detail == shown]
+        columns = [
+            at for at, heading in enumerate(self.headings) if at >= self.names and heading.is_detail == are_details
+        ]
         return self.only([*range(self.names), *columns]) if columns else None
 
 

@@ -38,12 +38,12 @@ def environment(*folders: Path, places: tuple[str, ...] = ()) -> "Environment":
             return value
         return without_places(value, places)
 
-    made = Environment(
+    templates = Environment(
         loader=FileSystemLoader([*folders, _FOLDER]), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True, finalize=shown,
     )  # fmt: skip
-    made.filters |= {"heat": heat_colour, "sort_key": sort_key, "unbroken": unbroken}
-    return made
+    templates.filters |= {"heat": heat_colour, "sort_key": sort_key, "unbroken": unbroken}
+    return templates
 
 
 def html(table: Content) -> str:

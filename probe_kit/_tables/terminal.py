@@ -70,17 +70,17 @@ def _fitting(table: Content, width: int) -> tuple[Content, list[str]]:
 def _sections(table: Content) -> list[str]:
     """Return the section of every row: its first name where names of the first column repeat, else nothing."""
     firsts = [row.cells[0].text for row in table.rows]
-    is_divided = table.names > 1 and any(one == other for one, other in pairwise(firsts))
+    is_divided = table.names > 1 and any(previous == other for previous, other in pairwise(firsts))
     return firsts if is_divided else [""] * len(firsts)
 
 
 def _names(table: Content) -> list[str]:
     """Return what stands before every row: its names, and below a section those behind the first."""
-    found = []
+    names = []
     for row, section in zip(table.rows, _sections(table), strict=True):
         texts = [cell.text for cell in row.cells[: table.names]]
-        found.append(f"{_INDENT}{' · '.join(texts[1:])}" if section else " · ".join(texts))
-    return found
+        names.append(f"{_INDENT}{' · '.join(texts[1:])}" if section else " · ".join(texts))
+    return names
 
 
 def _name_heading(table: Content) -> str:
@@ -114,7 +114,7 @@ def _tables(table: Content, width: int) -> "Iterator[RenderableType]":
     if any(needed[at] > room for at in columns):
         yield from _lists(table)
         return
-    heads = [list(own) for _, own in groupby(columns, key=lambda at: table.headings[at].group)]
+    heads = [list(group) for _, group in groupby(columns, key=lambda at: table.headings[at].group)]
     blocks: list[list[int]] = []
     for piece in (piece for head in heads for piece in _pieces(head, needed, room)):
         if blocks and sum(needed[at] for at in (*blocks[-1], *piece)) <= room:
@@ -153,12 +153,12 @@ def _table(table: Content, columns: Sequence[int]) -> "Iterator[RenderableType]"
     for section, below in groupby(rows, key=lambda row: row[0]):
         if is_divided:
             yield Text(section, style="bold")
-        made = _empty(table, columns, has_headings=not is_divided)
+        part = _empty(table, columns, has_headings=not is_divided)
         for _, name, row in below:
             cells = [row.cells[at] for at in columns]
             height = max(cell.text.count("\n") for cell in cells)
-            made.add_row(Text(name + "\n" * height), *map(_text, cells), style=_style(row))
-        yield made
+            part.add_row(Text(name + "\n" * height), *map(_text, cells), style=_style(row))
+        yield part
 
 
 def _empty(table: Content, columns: Sequence[int], has_headings: bool = True) -> "RichTable":
@@ -168,13 +168,13 @@ def _empty(table: Content, columns: Sequence[int], has_headings: bool = True) ->
     from rich.text import Text
 
     needed = _column_widths(table)
-    made = RichTable(
+    empty = RichTable(
         box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False, show_header=has_headings
     )
-    made.add_column(Text(_name_heading(table)), no_wrap=True, vertical="bottom", min_width=_name_width(table))
+    empty.add_column(Text(_name_heading(table)), no_wrap=True, vertical="bottom", min_width=_name_width(table))
     for at in columns:
-        made.add_column(Text(table.headings[at].text), no_wrap=True, min_width=needed[at] - GAP)
-    return made
+        empty.add_column(Text(table.headings[at].text), no_wrap=True, min_width=needed[at] - GAP)
+    return empty
 
 
 def _text(cell: Cell) -> "Text":

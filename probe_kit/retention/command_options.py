@@ -32,7 +32,7 @@ class Radii(tuple[float, ...]):
         return cls(map(_radius, split(text) or ())) if isinstance(text, str) else text
 
     def __str__(self) -> str:
-        """As it is typed."""
+        """Return the radii as they are typed."""
         return ",".join(f"{radius:g}" for radius in self)
 
 

@@ -62,7 +62,7 @@ def retention(
     the VLM answers right. Probe: a held-out probe of the policy is right. Success: the cube ends on the correct
     picture. Each in both layouts. Both runs need the same first frames.
     """
-    given = locals()
+    values = locals()
     from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour.vlm_answers import scored
@@ -71,9 +71,9 @@ def retention(
     from probe_kit.retention.training_steps import read_steps
     from probe_kit.runs import open_run
 
-    kind, chosen = own.read_comparison(compare)
+    kind, runs_compared = own.read_comparison(compare)
     if kind == "stages":
-        _check_only(given, WITH_STAGES, "compare", "--compare stages")
+        _check_only(values, WITH_STAGES, "compare", "--compare stages")
         common.check_no_others({f"--format {style}": style not in ("table", "json")}, "--compare stages")
         paths = list(runs or ())
         _check_doubles(paths)
@@ -82,7 +82,7 @@ def retention(
         show_stages(paths, views, key, wording, score, with_side_words, style == "json", figures)
         return
     if target:
-        _check_only(given, WITH_TARGET, "target", "labels of your own")
+        _check_only(values, WITH_TARGET, "target", "labels of your own")
         _show_labels(
             runs or (), target, family, probes, views, iterations, wording, partial, style, html, figures,
             "all" in details,
@@ -91,10 +91,10 @@ def retention(
     if family != "label":
         raise UsageError("--family is for labels of your own; give --target COLUMN too, or leave it out")
     if as_paper:
-        _check_only(given, WITH_AS_PAPER, "as_paper", "the paper's own numbers (--as-paper)")
+        _check_only(values, WITH_AS_PAPER, "as_paper", "the paper's own numbers (--as-paper)")
         common.check_no_others({f"--score {score}": score == "order-balanced"}, "--as-paper")
     if kind == "steps":
-        _check_only(given, WITH_STEPS, "compare", "a table of training steps (--compare steps)")
+        _check_only(values, WITH_STEPS, "compare", "a table of training steps (--compare steps)")
     check_epsilons(rule, epsilons is not None)
     if not runs:
         raise UsageError("give run folders, or groups of them as --compare groups NAME=RUN,RUN NAME=RUN,RUN")
@@ -109,22 +109,22 @@ def retention(
     listed = [run for of_group in opened.values() for run in of_group]
     keys = _keys([path for paths in grouped.values() for path in paths], probes or [])
     if kind == "steps":
-        training = read_steps(chosen, listed)
+        training = read_steps(runs_compared, listed)
         order = sorted(range(len(listed)), key=lambda at: training[str(listed[at].location)])
         listed, keys = [listed[at] for at in order], [keys[at] for at in order]
     table = make_table(
         opened if kind == "groups" else listed, views, iterations=steps, keys=keys,
         epsilons=epsilons or SENSITIVITY_RADII, rule=rule, last_steps=last_steps, absent_below=absent_below,
         score=score, vlm_vla=kind == "vlm-vla", with_side_words=with_side_words,
-        against=chosen if kind in ("run", "groups") else None,
+        against=runs_compared if kind in ("run", "groups") else None,
     )  # fmt: skip
     if as_paper:
         _print(table.as_paper, style, table.notes)
     elif kind == "steps":
         _show_steps(table, training, style, figures)
     else:
-        shown = [scored(run, score, with_side_words) for run in listed]
-        _write_files(shown, table, figures, html, "all" in details)
+        scored_runs = [scored(run, score, with_side_words) for run in listed]
+        _write_files(scored_runs, table, figures, html, "all" in details)
         _print_sections(table, style, details)
 
 
@@ -216,18 +216,18 @@ def _show_labels(
     show_label_retention(opened, table, style, html, figures, details)
 
 
-def _check_only(given: Mapping[str, object], allowed: Collection[str], option: str, table: str) -> None:
+def _check_only(values: Mapping[str, object], allowed: Collection[str], option: str, table: str) -> None:
     """Raise UsageError for an option of `retention` that differs from its default and does not go with a table.
 
-    given: the value of every parameter. allowed: what goes with it. option: the one that asks for the table.
+    values: the value of every parameter. allowed: what goes with it. option: the one that asks for the table.
     table: what it is called.
     """
-    others = {
-        f"--{'format' if name == 'style' else name.replace('_', '-')}": given[name] != parameter.default
+    are_set = {
+        f"--{'format' if name == 'style' else name.replace('_', '-')}": values[name] != parameter.default
         for name, parameter in signature(retention).parameters.items()
         if name not in (*allowed, option)
     }
-    common.check_no_others(others, table)
+    common.check_no_others(are_set, table)
 
 
 def _check_places(html: Path | None, figures: Path | None) -> None:
@@ -243,22 +243,22 @@ def check_file(figures: Path | None) -> None:
         raise UsageError(f"--figures {figures} is a file; give a folder")
 
 
-def _keys(paths: list[str], chosen: list[str]) -> list[str | None]:
+def _keys(paths: list[str], texts: list[str]) -> list[str | None]:
     """The key of every run in order, None where none was chosen; a run goes by its path or its folder's name."""
     keys: list[str | None] = [None] * len(paths)
-    for text in chosen:
+    for text in texts:
         name, separator, key = text.rpartition("=")
         if not (separator and name and key):
             raise UsageError(f"--probes {text!r} is not RUN=KEY; `probe-kit run show RUN` lists the keys")
-        found = [at for at, path in enumerate(paths) if _place(path) == _place(name)]
-        found = found or [at for at, path in enumerate(paths) if _place(path).rpartition("/")[2] == name]
-        if len(found) != 1:
+        matches = [at for at, path in enumerate(paths) if _place(path) == _place(name)]
+        matches = matches or [at for at, path in enumerate(paths) if _place(path).rpartition("/")[2] == name]
+        if len(matches) != 1:
             raise UsageError(
-                f"--probes {text!r}: {name} is {'several' if found else 'none'} of the runs {', '.join(paths)}"
+                f"--probes {text!r}: {name} is {'several' if matches else 'none'} of the runs {', '.join(paths)}"
             )
-        if keys[found[0]] is not None:
+        if keys[matches[0]] is not None:
             raise UsageError(f"--probes chooses probes of {name} twice; choose one")
-        keys[found[0]] = key
+        keys[matches[0]] = key
     return keys
 
 

@@ -15,9 +15,9 @@ from probe_kit.train.data.run_reader import RunReader
 
 @dataclass(frozen=True)
 class Joins:
-    """found: what could be joined. refused: why other pairs could not, a sentence each."""
+    """tables: of the pairs that could be joined. refused: why other pairs could not, a sentence each."""
 
-    found: tuple[KnownUsedTable, ...]
+    tables: tuple[KnownUsedTable, ...]
     refused: tuple[str, ...]
 
 
@@ -28,19 +28,19 @@ def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
     are corrected over all pairs.
     """
     names = {row.run.location: row.run.label for row in table.rows}
-    asked = [run for run in runs if ask_of(run) is not None]
-    acted = [run for run in runs if ask_of(run) is None and _judged(run, table)]
-    found, refused = [], []
-    for vlm, policy in product(asked, acted):
-        own = under_rule(policy, table.rule, table.last_steps)
+    vlms = [run for run in runs if ask_of(run) is not None]
+    policies = [run for run in runs if ask_of(run) is None and _judged(run, table)]
+    joins, refused = [], []
+    for vlm, policy in product(vlms, policies):
+        judged = under_rule(policy, table.rule, table.last_steps)
         try:
-            joined = match_runs(vlm, own, table.results.get(str(policy.location)))
+            joined = match_runs(vlm, judged, table.results.get(str(policy.location)))
         except (UsageError, OtherFramesError) as error:
             refused.append(f"Not joined: {error}.")
             continue
         asked_as, acted_as = (names.get(str(run.location), run.label) for run in (vlm, policy))
-        found.append(replace(joined, asked=asked_as, acted=acted_as))
-    return Joins(tuple(correct_joins(found)), tuple(refused))
+        joins.append(replace(joined, asked=asked_as, acted=acted_as))
+    return Joins(tuple(correct_joins(joins)), tuple(refused))
 
 
 def _judged(run: RunReader, table: RetentionTable) -> bool:

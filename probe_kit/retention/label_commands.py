@@ -44,8 +44,8 @@ def print_text_of(table: Any, style: str) -> None:
     if style == "json":
         print_json_text(table.to_json())
     else:
-        own = {"csv": table.to_csv, "markdown": table.to_markdown, "latex": table.to_latex}
-        print_text(own[style]() if style in own else table.to_text(style))
+        formats = {"csv": table.to_csv, "markdown": table.to_markdown, "latex": table.to_latex}
+        print_text(formats[style]() if style in formats else table.to_text(style))
 
 
 def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = False) -> None:

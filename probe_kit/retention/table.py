@@ -80,12 +80,14 @@ class RetentionTable:
         """The summary with its sentences, and folded below it the tables; pointing at a heading explains it."""
         from markupsafe import Markup
 
-        rows = [one for run in self.summary for one in run.categories]
+        rows = [category for run in self.summary for category in run.categories]
         item = Markup("<li><b>{}</b> {}</li>")
-        sentences = Markup("").join(item.format(one.name, without_places(one.finding)) for one in rows)
+        sentences = Markup("").join(
+            item.format(category.name, without_places(category.finding)) for category in rows
+        )
         tables = [table for title, table in self.tables().items() if title != "Controls"]
-        shown = "".join(own._repr_html_() for table in tables if (own := table.details(False)) is not None)
-        details = f"<details><summary>All tables</summary>{shown}</details>"
+        pages = "".join(part._repr_html_() for table in tables if (part := table.details(False)) is not None)
+        details = f"<details><summary>All tables</summary>{pages}</details>"
         return f"{self.summary_table._repr_html_()}<ul>{sentences}</ul>{details}"
 
     @property
@@ -95,7 +97,7 @@ class RetentionTable:
 
     @property
     def last_steps(self) -> int:
-        """How many control steps at the end it judged."""
+        """The number of control steps at the end that it judged."""
         return self.rows[0].rules.last_steps if self.rows else 1
 
     @property
@@ -117,12 +119,12 @@ class RetentionTable:
 
     @property
     def rules(self) -> "pd.DataFrame":
-        """What the outcome rule gives away, by `run` and `category`, with the fields of `OutcomeRuleScores`."""
+        """Return what the rule gives away, by `run` and `category`, with the fields of `OutcomeRuleScores`."""
         return part_frame(self.all_rows, "rules", by_view=False)
 
     @property
     def answers(self) -> "pd.DataFrame":
-        """How VLM runs were asked and answered, by `run` and `category`, with the fields of `AnswerStats`."""
+        """Return the answers of VLM runs by `run` and `category`, with the fields of `AnswerStats`."""
         return part_frame([row for row in self.all_rows if row.run.mode == "answers"], "answers", by_view=False)
 
     @property
@@ -137,7 +139,7 @@ class RetentionTable:
 
     @property
     def controls(self) -> "pd.DataFrame":
-        """What probes are compared with, by `run`, `category` and `view`, with the fields of `ControlScores`."""
+        """Return the controls of probes by `run`, `category` and `view`, with the fields of `ControlScores`."""
         return part_frame(self.all_rows, "controls")
 
     @property
@@ -181,13 +183,16 @@ class RetentionTable:
 
         details: as of `to_rich`.
         """
-        sentences = [f"{one.name}  {one.finding}" for run in self.summary for one in run.categories]
+        sentences = [f"{category.name}  {category.finding}" for run in self.summary for category in run.categories]
         return render(style, [self.summary_table, *self._details(details)], sentences, self.notes)
 
     def to_markdown(self) -> str:
         """Success rates, retention, controls and differences as Markdown tables, with all columns."""
-        rows = [one for run in self.summary for one in run.categories]
-        sentences = [*(f"{one.name}  {one.finding}" for one in rows), *(one.details for one in rows)]
+        rows = [category for run in self.summary for category in run.categories]
+        sentences = [
+            *(f"{category.name}  {category.finding}" for category in rows),
+            *(category.details for category in rows),
+        ]
         tables = [self.summary_table, *self.tables().values(), *self.wording_tables, *self.further_tables]
         return render("markdown", tables, sentences, self.notes)
 
@@ -218,8 +223,8 @@ class RetentionTable:
         sections: Collection[Section] = get_args(Section) if details == "all" else details
         narrow = (table.details(False) for table in self.tables(sections).values())
         wordings = self.wording_tables if "success" in sections else []
-        further = self.further_tables if "answers" in sections else vlm_vla_tables(self.vlm_vla)
-        return [*(table for table in narrow if table is not None), *wordings, *further]
+        further_tables = self.further_tables if "answers" in sections else vlm_vla_tables(self.vlm_vla)
+        return [*(table for table in narrow if table is not None), *wordings, *further_tables]
 
     @property
     def summary(self) -> list[RunSummary]:
@@ -248,7 +253,7 @@ class RetentionTable:
         summary = self.summary
         why = self.unpaired if details or len(summary) > 1 else ()
         notes = [Text(sentence, style="yellow") for sentence in (*why, *self.notes)]
-        long = [Text(one.details) for run in summary for one in run.categories] if details else []
+        long = [Text(category.details) for run in summary for category in run.categories] if details else []
         short: list[Text] = []
         for run in summary:
             short += [Text(run.title, style="bold")] * (len(summary) > 1) + [*map(Text, run.sentences)]
@@ -308,16 +313,16 @@ def retention_table(
     """
     check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
-    for run in (one for of_group in groups.values() for one in of_group):
+    for run in (of_category for of_group in groups.values() for of_category in of_group):
         check_scene_run(run, "a retention table")
     listed = [(name, scored(run, score, with_side_words)) for name, of_group in groups.items() for run in of_group]
     if keys is not None and len(keys) != len(listed):
         raise UsageError(f"{len(keys)} keys for {len(listed)} runs; give one per run, or None for the newest")
     _check_doubles([run for _, run in listed])
-    chosen = list(keys or [None] * len(listed))
+    key_of_run = list(keys or [None] * len(listed))
     order = sorted(range(len(listed)), key=lambda at: ask_of(listed[at][1]) is None)
-    listed, chosen = [listed[at] for at in order], [chosen[at] for at in order]
-    results, notes = _read_probes([run for _, run in listed], chosen)
+    listed, key_of_run = [listed[at] for at in order], [key_of_run[at] for at in order]
+    results, notes = _read_probes([run for _, run in listed], key_of_run)
     unscored = [note for _, run in listed if (note := _not_scored(run, rule, last_steps))]
     if unscored and isinstance(runs, Mapping):
         raise NoTrajectoryError(f"groups cannot be compared by the rule {rule}: {unscored[0]}")
@@ -326,12 +331,18 @@ def retention_table(
     drawn: list[RowWithEstimates] = []
     means: list[RetentionRow] = []
     for name, run in listed:
-        found = run_rows(run, results.get(str(run.location)), settings, name)
-        drawn += found
-        shown = dict.fromkeys(one.row.view for one in found)
-        means += [mean_row([one for one in found if one.row.view == view], averaged_fields()) for view in shown]
+        of_run = run_rows(run, results.get(str(run.location)), settings, name)
+        drawn += of_run
+        views_of = dict.fromkeys(of_category.row.view for of_category in of_run)
+        means += [
+            mean_row([of_category for of_category in of_run if of_category.row.view == view], averaged_fields())
+            for view in views_of
+        ]
     names = distinct_labels([run for _, run in listed], labels)
-    results = {place: replace(own, label=(labels or {}).get(place, own.label)) for place, own in results.items()}
+    results = {
+        location: replace(probes, label=(labels or {}).get(location, probes.label))
+        for location, probes in results.items()
+    }
     compared = PairedRuns([], ())
     if isinstance(runs, Mapping):
         by_group = {name: [run for group, run in listed if group == name] for name in runs}
@@ -387,16 +398,16 @@ def _heard(run: RunReader) -> bool:
 
 def _check_doubles(runs: Sequence[RunReader]) -> None:
     """A run that counts twice makes every interval too narrow; a copy of its folder is the same run."""
-    seen: dict[str, str] = {}
+    location_of: dict[str, str] = {}
     for run in runs:
         stamp = getattr(run, "stamp", None)
         for name in (run.location.address, *([f"{run.settings_sha256} {stamp}"] if stamp else [])):
-            if name in seen:
-                other = "" if seen[name] == str(run.location) else f", once as its copy {seen[name]}"
+            if name in location_of:
+                other = "" if location_of[name] == str(run.location) else f", once as its copy {location_of[name]}"
                 raise UsageError(
                     f"{run.location} is given twice{other}; its episodes would count twice. Leave one out"
                 )
-            seen[name] = str(run.location)
+            location_of[name] = str(run.location)
 
 
 def _read_probes(
@@ -411,16 +422,17 @@ def _read_probes(
                 missing.append(f"Success rates only: no probes of {run.location} belong to this table.")
             continue
         try:
-            found = load_side_results(run, key)
+            probes = load_side_results(run, key)
         except NoProbesError as error:
             if run.streams or ask_of(run) is None:
                 shares = "Success rates" if ask_of(run) is None else "Answers"
                 missing.append(f"{shares} only: {error}")
             continue
-        results[str(run.location)] = found
-        if not is_current(found.settings, run):
+        results[str(run.location)] = probes
+        if not is_current(probes.settings, run):
             missing.append(
-                f"The probes {found.key} of {run.location} are of other episodes than the run has now: accuracies "
-                f"and success rates do not belong together. `probe-kit train {run.location}` fits new ones."
+                f"The probes {probes.key} of {run.location} are of other episodes than the run has now: "
+                "accuracies and success rates do not belong together. "
+                f"`probe-kit train {run.location}` fits new ones."
             )
     return results, missing

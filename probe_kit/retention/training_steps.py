@@ -34,8 +34,8 @@ def training_step(run: RunReader) -> int:
     Raises UsageError for a run whose checkpoint is unknown or names no step.
     """
     checkpoint = checkpoint_of(run)
-    if (found := split_checkpoint(checkpoint)) is not None:
-        return found[1]
+    if (training := split_checkpoint(checkpoint)) is not None:
+        return training[1]
     raise UsageError(
         f"the training step of {run.location} is unknown: its checkpoint is {checkpoint or 'not stored'!r}; "
         "expected a folder such as checkpoints/020000 or checkpoint-500. Give the steps in the order of the runs, "
@@ -49,8 +49,8 @@ def read_steps(text: str | None, runs: Sequence[RunReader]) -> dict[str, int]:
     Raises UsageError for another text, a number of steps that is not that of the runs, runs of one step, or VLM
     runs, which have no retention.
     """
-    if asked := [str(run.location) for run in runs if ask_of(run) is not None]:
-        raise UsageError(f"--compare steps is for policy runs; {asked[0]} is a VLM run. Leave it out")
+    if vlms := [str(run.location) for run in runs if ask_of(run) is not None]:
+        raise UsageError(f"--compare steps is for policy runs; {vlms[0]} is a VLM run. Leave it out")
     if text is None:
         steps = [training_step(run) for run in runs]
     else:
@@ -86,17 +86,17 @@ def step_table(table: RetentionTable, steps: Mapping[str, int]) -> Table:
     numbers = [_numbers(row, steps, drifts) for row in ordered]
     means = [row for row in ordered if row.category == MEAN]
     views = {steps[row.run.location]: row.view for row in means if row.view is not None}
-    made = Table.of(
+    steps_table = Table.of(
         "Training steps", tuple(_COLUMNS), [_cells(row) for row in numbers], names=2, numbers=tuple(numbers),
         mean=spell(MEAN),
     ).filled("n/a")  # fmt: skip
     notes = [
-        *(_COLUMNS[name] for name in made.columns if _COLUMNS[name]),
+        *(_COLUMNS[name] for name in steps_table.columns if _COLUMNS[name]),
         "each with its 95 % interval",
         _by_step("view", {step: str(view) for step, view in views.items()}),
         _by_step("mean over", {steps[row.run.location]: ", ".join(map(spell, row.categories)) for row in means}),
     ]
-    return replace(made, notes=("; ".join(filter(None, notes)),))
+    return replace(steps_table, notes=("; ".join(filter(None, notes)),))
 
 
 def _by_step(name: str, values: Mapping[int, str]) -> str:

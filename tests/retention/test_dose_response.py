@@ -51,10 +51,10 @@ def steered(run: ArrayRun) -> None:
 def test_it_shows_episodes_that_turn_by_dose_and_side_beside_controls(run: ArrayRun) -> None:
     steered(run)
     display = DoseResponseDisplay.from_run(run, "color").plot()
-    assert display.place == "backbone.01 image"
+    assert display.position == "backbone.01 image"
     np.testing.assert_allclose(display.coefficients, [0, 2, 4])
     np.testing.assert_allclose(display.net, [0, 50, 100])
-    np.testing.assert_allclose((display.left + display.right) / 2, display.net)
+    np.testing.assert_allclose((display.net_left + display.net_right) / 2, display.net)
     np.testing.assert_allclose(display.controls, [[np.nan, 0, 12.5]])
     np.testing.assert_allclose(display.relative_change, 1)
     assert display.significant.tolist() == [False, True, True]

@@ -103,11 +103,11 @@ def _tabular(table: Content) -> list[str]:
     """Return the lines of a tabular, by pandas' Styler; columns go by number, since two may have one heading."""
     import pandas as pd
 
-    several = any(one.group for one in table.headings)
+    several = any(heading.group for heading in table.headings)
     numbers = range(len(table.headings))
     columns: pd.Index = pd.Index(numbers)
     if several:
-        columns = pd.MultiIndex.from_arrays([[one.group for one in table.headings], numbers])
+        columns = pd.MultiIndex.from_arrays([[heading.group for heading in table.headings], numbers])
     texts = [[escape(cell.text) for cell in row.cells] for row in table.rows]
     styles = [[_css(cell) for cell in row.cells] for row in table.rows]
     frame = pd.DataFrame(texts, columns=columns, dtype=object)

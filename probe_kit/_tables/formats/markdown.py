@@ -8,9 +8,9 @@ from probe_kit._tables.content import Cell, Content
 
 def render(tables: Sequence[Content], sentences: Sequence[str] = (), notes: Sequence[str] = ()) -> str:
     """Return the first table, the sentences as a list, the other tables, and the notes as quotations."""
-    first, *others = map(_table, tables)
+    first, *following = map(_table, tables)
     items = [*(f"* {markdown_safe(sentence)}" for sentence in sentences), *[""] * bool(sentences)]
-    return "\n".join([first, *items, *others, *(f"> {markdown_safe(note)}\n" for note in notes)])
+    return "\n".join([first, *items, *following, *(f"> {markdown_safe(note)}\n" for note in notes)])
 
 
 def _table(table: Content) -> str:

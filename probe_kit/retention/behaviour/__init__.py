@@ -1,1 +1,1 @@
-"""What a run did: success rates, answers, wordings."""
+"""The behaviour of a run: success rates, answers, wordings."""

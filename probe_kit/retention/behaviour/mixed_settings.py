@@ -1,4 +1,4 @@
-"""What rows of one table should have in common and do not."""
+"""Sentences about settings that rows of one table should share and do not."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -44,24 +44,24 @@ def mixed_settings(results: Mapping[str, ProbeResults], views: Sequence[str] | N
 
     views: those that are shown, if not all are; then it does not matter which others there are.
     """
-    found = []
+    differences = []
     for name, value in _COMPARED.items():
         if name == "views" and views is not None:
             continue
         runs: dict[str, list[str]] = {}
-        for run, one in results.items():
-            runs.setdefault(value(one.settings), []).append(Path(run).name)
+        for run, probes in results.items():
+            runs.setdefault(value(probes.settings), []).append(Path(run).name)
         if len(runs) > 1:
             parts = (f"{setting} ({', '.join(names)})" for setting, names in runs.items())
-            found.append(f"{name} {' against '.join(parts)}")
-    labels = {one.settings.target for one in results.values()} - {"correct"}
+            differences.append(f"{name} {' against '.join(parts)}")
+    labels = {probes.settings.target for probes in results.values()} - {"correct"}
     notes = [f"Probes were asked for the target {label!r}: {SIDES[label]}." for label in sorted(labels)]
-    calls = {one.settings.call for one in results.values()} - {0}
+    calls = {probes.settings.call for probes in results.values()} - {0}
     notes += [f"Probes are of captured inference {call}, counted from 0." for call in sorted(calls)]
-    if not found:
+    if not differences:
         return notes
     return [
         *notes,
-        f"The rows mix probe settings: {'; '.join(found)}. Compare them with care, or fit all runs alike; "
+        f"The rows mix probe settings: {'; '.join(differences)}. Compare them with care, or fit all runs alike; "
         "`probe-kit run show RUN` lists what a run has, --probes RUN=KEY chooses.",
     ]

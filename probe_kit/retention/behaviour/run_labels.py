@@ -1,4 +1,4 @@
-"""What runs are called in tables, figures and titles: no two by the same name."""
+"""The names of runs in tables, figures and titles, no two of them equal."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -21,16 +21,16 @@ def full_name(label: str, random_weights: bool, heard: bool = False, group: str 
     return name if group is None else f"{group}: {name}"
 
 
-def distinct_labels(runs: Sequence[RunReader], given: Mapping[str, str] | None = None) -> dict[str, str]:
-    """By location, the label of each run, so that no two full names are equal.
+def distinct_labels(runs: Sequence[RunReader], names: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return the label of each run by its location, so that no two full names are equal.
 
-    given: labels by location instead of the runs' own. Runs of one name get the hash of their settings, where that
+    names: labels by location instead of the runs' own. Runs of one name get the hash of their settings, where that
     is the same their folders, and else a number. Raises UsageError for a label of a run that is none of these.
     """
     labels = {str(run.location): run.label for run in runs}
-    if unknown := sorted((given or {}).keys() - labels.keys()):
+    if unknown := sorted((names or {}).keys() - labels.keys()):
         raise UsageError(f"labels are given for {', '.join(unknown)}; the runs are {', '.join(labels)}")
-    labels |= given or {}
+    labels |= names or {}
     for mark in _MARKS:
         doubles = _doubles(runs, labels)
         for number, run in enumerate(runs, 1):

@@ -1,4 +1,4 @@
-"""What the policy did: success rate, whether it differs from guessing, and on which side it errs."""
+"""The success rate of a policy, whether it differs from guessing, and on which side the policy errs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Regime(StrEnum):
-    """What a success rate says about knowledge that reaches the action."""
+    """The three readings of a success rate: how far knowledge reaches the action."""
 
     KNOWLEDGE = "evidence of usable knowledge"
     NO_RELIABLE_KNOWLEDGE = "no reliable usable knowledge"
@@ -85,15 +85,15 @@ class SuccessRate:
 
 
 def regime(
-    sr: float, margin: float, share_wrong: float, share_outside: float, asked: bool = False
+    sr: float, margin: float, share_wrong: float, share_outside: float, answers: bool = False
 ) -> tuple[Regime, str]:
     """The regime of a success rate, and why in a few words. asked: it is one of answers, `oob` one not read."""
-    share = "accuracy" if asked else "SR"
+    share = "accuracy" if answers else "SR"
     if sr > 0.5 + margin:
         return Regime.KNOWLEDGE, f"{share} {sr:.3f} is above 0.5 + Δ = {0.5 + margin:.3f}"
     if sr >= 0.5 - margin:
         return Regime.NO_RELIABLE_KNOWLEDGE, f"{share} {sr:.3f} is within 0.5 ± Δ = {margin:.3f}"
-    nowhere = "no answer could be read in" if asked else "the cube ends outside both zones in"
+    nowhere = "no answer could be read in" if answers else "the cube ends outside both zones in"
     cause = (
         f"{nowhere} {share_outside:.0%} of episodes"
         if share_outside >= share_wrong
@@ -206,7 +206,7 @@ def units_of(episodes: "pd.DataFrame") -> "NDArray[np.str_]":
 
 
 def independent_items(episodes: "pd.DataFrame") -> float:
-    """How many items the success rate rests on: all of them, or fewer where those of a group answer alike.
+    """Return how many items the success rate rests on: all of them, or fewer where those of a group answer alike.
 
     The number of items over how much more the success rate varies between groups than it would if their items had
     nothing in common.

@@ -23,7 +23,7 @@ SCORES: Mapping[str, tuple[str, str]] = {
 
 
 def ask_of(run: RunReader) -> Mapping[str, Any] | None:
-    """How a run was asked, None for one that acts."""
+    """Return how a run was asked, None for one that acts."""
     ask: Mapping[str, Any] | None = getattr(run, "settings", {}).get("ask")
     return ask
 
@@ -37,9 +37,9 @@ def read_by_clause(episodes: "pd.DataFrame", text: "pd.Series[str]") -> tuple[fl
 
     text: outcomes of the answers in text. The accuracy is None where the share is `MANY_BY_CLAUSE` or less.
     """
-    found = episodes["parse_tier"] == "clause"
-    share = float(found.mean())
-    return share, float(((text == "correct") & ~found).mean()) if share > MANY_BY_CLAUSE else None
+    in_clause = episodes["parse_tier"] == "clause"
+    share = float(in_clause.mean())
+    return share, float(((text == "correct") & ~in_clause).mean()) if share > MANY_BY_CLAUSE else None
 
 
 class ScoredAnswers:
@@ -59,7 +59,7 @@ class ScoredAnswers:
 
     @cached_property
     def episodes(self) -> "pd.DataFrame":
-        """As of the run, `outcome` and `side_placed` being those of the score; `outcome_text` is kept."""
+        """Return the episodes of the run with `outcome` and `side_placed` by the score; `outcome_text` stays."""
         episodes = self._run.episodes
         if not self._with_side_words and "side_word" in episodes:
             episodes = episodes[~episodes["side_word"].astype(bool)]

@@ -23,14 +23,14 @@ EpisodeKey = tuple[str, str, str]
 class CommonItems:
     """The episodes of one category that several runs have in common.
 
-    episodes: (item, layout) of them. n_items: items of them. of_items: items of any of the runs. whole: whether
-    every run has these episodes and no others.
+    episodes: (item, layout) of them. n_items: items of them. of_items: items of any of the runs.
+    is_complete: whether every run has these episodes and no others.
     """
 
     episodes: frozenset[tuple[str, str]]
     n_items: int
     of_items: int
-    whole: bool
+    is_complete: bool
 
     def select(self, episodes: "pd.DataFrame") -> "pd.DataFrame":
         """The rows of a table of episodes that are among these, with their index."""
@@ -44,7 +44,7 @@ class CommonItems:
 
 
 def common_items(runs: Sequence[RunReader]) -> dict[str, CommonItems]:
-    """By category that all runs have, the episodes in common, of which there may be none.
+    """Return by category that all runs have the episodes in common, of which there may be none.
 
     Items are the same where id and content hash are equal. Runs of one suite need no hashes. Nothing is in common
     of runs of several suites if one of them holds no hashes, as arrays do.
@@ -52,9 +52,9 @@ def common_items(runs: Sequence[RunReader]) -> dict[str, CommonItems]:
     by_content = all(has_item_content(run) for run in runs)
     if not by_content and len({run.suite for run in runs}) > 1:
         return {}
-    found = [_episodes(run.episodes, by_content) for run in runs]
-    shared = [name for name in found[0] if all(name in one for one in found)]
-    return {name: _common([one[name] for one in found]) for name in shared}
+    episodes = [_episodes(run.episodes, by_content) for run in runs]
+    shared = [name for name in episodes[0] if all(name in of_run for of_run in episodes)]
+    return {name: _common([of_run[name] for of_run in episodes]) for name in shared}
 
 
 def has_item_content(run: RunReader) -> bool:
@@ -64,18 +64,18 @@ def has_item_content(run: RunReader) -> bool:
 
 def wording_of(run: RunReader) -> str:
     """The wordings of a run's episodes, comma-separated."""
-    named = run.episodes["wording"].unique() if "wording" in run.episodes else [OWN_WORDS]
-    return ", ".join(map(str, named))
+    wordings = run.episodes["wording"].unique() if "wording" in run.episodes else [OWN_WORDS]
+    return ", ".join(map(str, wordings))
 
 
-def _common(found: Sequence[frozenset[EpisodeKey]]) -> CommonItems:
-    common = reduce(frozenset.intersection, found)
-    every = reduce(frozenset.union, found)
+def _common(of_runs: Sequence[frozenset[EpisodeKey]]) -> CommonItems:
+    common = reduce(frozenset.intersection, of_runs)
+    every = reduce(frozenset.union, of_runs)
     return CommonItems(
         frozenset((item, layout) for item, layout, _ in common),
         len({item for item, _, _ in common}),
         len({(item, content) for item, _, content in every}),
-        all(one == common for one in found),
+        all(episodes == common for episodes in of_runs),
     )
 
 

@@ -111,8 +111,8 @@ class Side:
     @classmethod
     def of(cls, name: str, run: RunReader, rows: Sequence[RowWithEstimates]) -> "Side":
         """Return a single run; rows: those of several runs, of which its own are taken."""
-        place = str(run.location)
-        return cls(name, (run,), tuple(row for row in rows if row.row.run.location == place), place)
+        location = str(run.location)
+        return cls(name, (run,), tuple(row for row in rows if row.row.run.location == location), location)
 
 
 def compare(
@@ -138,13 +138,13 @@ def compare(
         mine, theirs, views = _behaviour(mine), _behaviour(theirs), [None]
     outcomes = _outcomes(sides[0].rows), _outcomes(sides[1].rows)
     calls = {row.row.run.call for side in sides for row in side.rows}
-    found = [
+    differences = [
         row for view in views for row in _compare((sides[0], sides[1]), view, (mine[view], theirs[view]), outcomes)
     ]
     call = next(iter(calls)) if len(calls) == 1 and of == "all" else None
-    mode = sides[0].rows[0].row.run.mode if found else "acts"
-    named = [replace(row, call=call, run=first.run, minus_run=second.run, mode=mode) for row in found]
-    return [_with_counts(row, shared) for row in named]
+    mode = sides[0].rows[0].row.run.mode if differences else "acts"
+    labelled = [replace(row, call=call, run=first.run, minus_run=second.run, mode=mode) for row in differences]
+    return [_with_counts(row, shared) for row in labelled]
 
 
 def with_holm(rows: Sequence[Difference]) -> list[Difference]:
@@ -152,8 +152,8 @@ def with_holm(rows: Sequence[Difference]) -> list[Difference]:
 
     Categories of all pairs are one family, means of all pairs another; views do not multiply tests of success.
     """
-    found = corrected(rows, lambda row: row.p, lambda row: row.category == MEAN, _test)
-    return [replace(row, p_holm=p) for row, p in zip(rows, found, strict=True)]
+    p_values = corrected(rows, lambda row: row.p, lambda row: row.category == MEAN, _test)
+    return [replace(row, p_holm=p) for row, p in zip(rows, p_values, strict=True)]
 
 
 def _test(row: Difference) -> tuple[str | None, str, str, str]:
@@ -165,8 +165,10 @@ def _with_counts(row: Difference, items: Mapping[str, CommonItems]) -> Differenc
     names = row.categories or (row.category,)
     if not all(name in items for name in names):
         return row
-    found = [items[name] for name in names]
-    return replace(row, n_items=sum(one.n_items for one in found), of_items=sum(one.of_items for one in found))
+    counts = [items[name] for name in names]
+    return replace(
+        row, n_items=sum(count.n_items for count in counts), of_items=sum(count.of_items for count in counts)
+    )
 
 
 def _on_common_items(
@@ -176,18 +178,21 @@ def _on_common_items(
     seed_texts = {str(run.location): seed_text_of(run) for run in runs}
     seed_text = seed_text_of(runs[0])
 
-    def common(one: RowWithEstimates) -> RowWithEstimates:
-        own = items.get(one.row.category)
-        if own is None or (own.whole and seed_texts[one.row.run.location] == seed_text):
-            return one
-        outcomes = None if one.outcomes is None else own.select(one.outcomes)
+    def common(row: RowWithEstimates) -> RowWithEstimates:
+        in_common = items.get(row.row.category)
+        if in_common is None or (in_common.is_complete and seed_texts[row.row.run.location] == seed_text):
+            return row
+        outcomes = None if row.outcomes is None else in_common.select(row.outcomes)
         rates = {} if outcomes is None else {"sr": success_share(outcomes, seed_text)}
-        streams = one.estimates.streams if own.whole else None
+        streams = row.estimates.streams if in_common.is_complete else None
         estimates = RowEstimates(rates, None if streams is None else streams.as_of(seed_text))
-        return replace(one, estimates=estimates, outcomes=outcomes)
+        return replace(row, estimates=estimates, outcomes=outcomes)
 
-    shared = {name for name, own in items.items() if own.n_items}
-    return replace(side, rows=tuple(common(one) for one in side.rows if others_too or one.row.category in shared))
+    shared = {name for name, items_of in items.items() if items_of.n_items}
+    return replace(
+        side,
+        rows=tuple(common(row) for row in side.rows if others_too or row.row.category in shared),
+    )
 
 
 Outcomes = Mapping[str, Sequence["pd.DataFrame"]]
@@ -198,19 +203,19 @@ Drawn = Mapping[str, Sequence[RowWithEstimates]]
 
 def _outcomes(drawn: Sequence[RowWithEstimates]) -> Outcomes:
     """Once per run, whatever number of views it has."""
-    found: dict[str, dict[str, pd.DataFrame]] = {}
-    for one in drawn:
-        if one.outcomes is not None:
-            found.setdefault(one.row.category, {})[one.row.run.location] = one.outcomes
-    return {category: list(tables.values()) for category, tables in found.items()}
+    by_category: dict[str, dict[str, pd.DataFrame]] = {}
+    for row in drawn:
+        if row.outcomes is not None:
+            by_category.setdefault(row.row.category, {})[row.row.run.location] = row.outcomes
+    return {category: list(tables.values()) for category, tables in by_category.items()}
 
 
 def _behaviour(views: Mapping[str | None, Drawn]) -> dict[str | None, Drawn]:
-    """What does not depend on the view, under the view None."""
+    """Return what does not depend on the view, under the view None."""
     first = next(iter(views.values()), {})
     return {
         None: {
-            category: [replace(one, estimates=RowEstimates(one.estimates.rates)) for one in of_category]
+            category: [replace(row, estimates=RowEstimates(row.estimates.rates)) for row in of_category]
             for category, of_category in first.items()
         }
     }
@@ -219,8 +224,8 @@ def _behaviour(views: Mapping[str | None, Drawn]) -> dict[str | None, Drawn]:
 def _by_view(drawn: Sequence[RowWithEstimates]) -> dict[str | None, Drawn]:
     """Rows per view and category."""
     views: dict[str | None, dict[str, list[RowWithEstimates]]] = {}
-    for one in drawn:
-        views.setdefault(one.row.view, {}).setdefault(one.row.category, []).append(one)
+    for row in drawn:
+        views.setdefault(row.row.view, {}).setdefault(row.row.category, []).append(row)
     return dict(views)
 
 
@@ -239,10 +244,10 @@ class _Gap:
     pooled: tuple[PooledScores, PooledScores] | None = None
 
     @classmethod
-    def of(cls, here: Sequence[RowWithEstimates], there: Sequence[RowWithEstimates]) -> "_Gap":
+    def of(cls, minuends: Sequence[RowWithEstimates], subtrahends: Sequence[RowWithEstimates]) -> "_Gap":
         """Means over the runs of either side; a number that a run lacks is left out."""
-        rates = mine, theirs = _rate(here), _rate(there)
-        first, second = _pooled(here), _pooled(there)
+        rates = mine, theirs = _rate(minuends), _rate(subtrahends)
+        first, second = _pooled(minuends), _pooled(subtrahends)
         sr = None if mine is None or theirs is None else mine.minus(theirs)
         if first is None or second is None:
             return cls(mine is not None and theirs is not None and mine.paired_with(theirs), rates, sr)
@@ -259,28 +264,32 @@ class _Gap:
 
 
 def _rate(rows: Sequence[RowWithEstimates]) -> Rate | None:
-    shares = [one.estimates.rates["sr"] for one in rows if "sr" in one.estimates.rates]
+    shares = [row.estimates.rates["sr"] for row in rows if "sr" in row.estimates.rates]
     return Rate.pooled(shares) if shares and len(shares) == len(rows) else None
 
 
 def _pooled(rows: Sequence[RowWithEstimates]) -> PooledScores | None:
-    streams = [one.estimates.streams for one in rows if one.estimates.streams is not None]
+    streams = [row.estimates.streams for row in rows if row.estimates.streams is not None]
     return PooledScores.of(streams) if streams and len(streams) == len(rows) else None
 
 
 def _compare(
     sides: tuple[Side, Side], view: str | None, drawn: tuple[Drawn, Drawn], outcomes: tuple[Outcomes, Outcomes]
 ) -> list[Difference]:
-    here, there = drawn
-    gaps = {category: _Gap.of(here[category], there[category]) for category in here if category in there}
+    minuends, subtrahends = drawn
+    gaps = {
+        category: _Gap.of(minuends[category], subtrahends[category])
+        for category in minuends
+        if category in subtrahends
+    }
     gaps = {category: gap for category, gap in gaps.items() if gap.sr is not None or gap.accuracies}
     rows = [
         _row(sides, [category], view, [gap], drawn, _gains(outcomes, [category], [gap]))
         for category, gap in gaps.items()
     ]
     if rows:
-        common, found = list(gaps), list(gaps.values())
-        mean = _row(sides, common, view, found, drawn, _gains(outcomes, common, found))
+        common, of_all = list(gaps), list(gaps.values())
+        mean = _row(sides, common, view, of_all, drawn, _gains(outcomes, common, of_all))
         rows.append(replace(mean, category=MEAN, categories=tuple(common)))
     return rows
 
@@ -301,28 +310,30 @@ def _row(
     drawn: tuple[Drawn, Drawn],
     gains: Gains | None,
 ) -> Difference:
-    """Of one category, or of the mean of several."""
+    """Return the difference in one category, or in the mean of several."""
     first, second = ([of_side[category] for category in categories] for of_side in drawn)
     sr, backbone, action = (
-        _mean_rate(found)
-        for found in (
+        _mean_rate(of_stream)
+        for of_stream in (
             [gap.sr for gap in gaps],
             [gap.accuracies.get(BACKBONE) for gap in gaps],
             [gap.accuracies.get(ACTION) for gap in gaps],
         )
     )
-    defined = all(any(one.row.retention.defined for found in side for one in found) for side in (first, second))
+    defined = all(
+        any(row.row.retention.defined for of_runs in side for row in of_runs) for side in (first, second)
+    )
     ratio = _retention([gap for gap in gaps if gap.has_retention]) if defined else None
     rates = [[gap.rates[side] for gap in gaps] for side in (0, 1)]
-    known = sr is not None
+    has_rates = sr is not None
     origins = {**sides[0].origins, **sides[1].origins}
     numbers: dict[str, float | Limits | None] = {
-        name: float(np.mean([rate.value for rate in of_side if rate is not None])) if known else None
+        name: float(np.mean([rate.value for rate in of_side if rate is not None])) if has_rates else None
         for name, of_side in zip(("sr_group", "sr_minus"), rates, strict=True)
     }
-    for name, found in (("sr", sr), ("backbone", backbone), ("action", action), ("retention", ratio)):
-        if found is not None:
-            numbers |= {name: found.value, f"{name}_ci": limits(found.interval)}
+    for name, estimate in (("sr", sr), ("backbone", backbone), ("action", action), ("retention", ratio)):
+        if estimate is not None:
+            numbers |= {name: estimate.value, f"{name}_ci": limits(estimate.interval)}
     return Difference(
         sides[0].name,
         sides[1].name,
@@ -339,9 +350,9 @@ def _row(
     )
 
 
-def _mean_rate(found: Sequence[Rate | None]) -> Rate | None:
-    known = [rate for rate in found if rate is not None]
-    return Rate.mean(known) if known else None
+def _mean_rate(rates: Sequence[Rate | None]) -> Rate | None:
+    defined = [rate for rate in rates if rate is not None]
+    return Rate.mean(defined) if defined else None
 
 
 def _retention(gaps: Sequence[_Gap]) -> Ratio | None:
@@ -349,6 +360,6 @@ def _retention(gaps: Sequence[_Gap]) -> Ratio | None:
     pairs = [gap.pooled for gap in gaps if gap.pooled is not None]
     if not pairs:
         return None
-    here, there = (Scores.mean([pair[side].scores for pair in pairs]) for side in (0, 1))
+    minuend, subtrahend = (Scores.mean([pair[side].scores for pair in pairs]) for side in (0, 1))
     between = np.sum([mine.covariance_with(theirs) for mine, theirs in pairs], axis=0) / len(pairs) ** 2
-    return retention_difference(here, there, between)
+    return retention_difference(minuend, subtrahend, between)

@@ -33,7 +33,7 @@ class Gains:
 
     @classmethod
     def of(cls, first: "Sequence[pd.DataFrame]", second: "Sequence[pd.DataFrame]") -> "Gains | None":
-        """From tables of episodes, each of one run and category; several runs of a side count by their mean.
+        """Return the test of tables of episodes, each of one run and category; runs of a side count by their mean.
 
         None unless every run of both sides has the same episodes.
         """
@@ -45,22 +45,22 @@ class Gains:
             return None
         gains = [mine[episode] - theirs[episode] for episode in mine]
         scale = min(_FINEST, lcm(*(gain.denominator for gain in gains)))
-        whole: NDArray[np.int64] = np.array([round(gain * scale) for gain in gains])
+        scaled: NDArray[np.int64] = np.array([round(gain * scale) for gain in gains])
         groups = [units[episode] for episode in mine]
-        more, fewer = int((whole > 0).sum()), int((whole < 0).sum())
-        return cls(flip_gains_p(whole, groups), len(set(groups)), more, fewer)
+        more, fewer = int((scaled > 0).sum()), int((scaled < 0).sum())
+        return cls(flip_gains_p(scaled, groups), len(set(groups)), more, fewer)
 
 
 def _of_side(tables: "Sequence[pd.DataFrame]") -> tuple[dict[str, Fraction], dict[str, str]] | None:
     """Per episode how much of it was right, averaged over runs, and its group; None if runs differ in episodes."""
-    found: dict[str, list[Fraction]] = {}
+    by_episode: dict[str, list[Fraction]] = {}
     units: dict[str, str] = {}
     for table in tables:
         names = table["item_id"].astype(str) + ":" + table["layout"].astype(str)
         for name, share, unit in zip(names, shares_of(table, "correct"), units_of(table), strict=True):
-            found.setdefault(name, []).append(Fraction(float(share)).limit_denominator(_FINEST))
+            by_episode.setdefault(name, []).append(Fraction(float(share)).limit_denominator(_FINEST))
             units[name] = unit
-    runs = {len(shares) for shares in found.values()}
+    runs = {len(shares) for shares in by_episode.values()}
     if len(runs) > 1:
         return None
-    return {name: sum(shares, Fraction(0)) / len(shares) for name, shares in found.items()}, units
+    return {name: sum(shares, Fraction(0)) / len(shares) for name, shares in by_episode.items()}, units

@@ -46,7 +46,7 @@ _MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class Comparison:
-    """Whether two of the three are right of equally many items.
+    """A test whether two of the three are right of equally many items.
 
     only_first, only_second: items on which they differ. p_mcnemar: exact over items; p_groups: the same, whole
     groups of items turned together; p: the larger of the two. p_holm: over all categories and pairs, of all joins
@@ -133,8 +133,8 @@ class KnownUsedTable:
 
 
 def match_runs(
-    asked: RunReader,
-    acted: RunReader,
+    vlm: RunReader,
+    policy: RunReader,
     results: ProbeResults | None = None,
     view: str | None = None,
     seed: int = 0,
@@ -146,22 +146,25 @@ def match_runs(
     Raises UsageError for runs of the wrong kinds or without a question in common, OtherFramesError if their first
     frames differ or carry no hash.
     """
-    check_scene_run(acted, "a comparison with answers")
-    _check_kinds(asked, acted)
-    pairs = _same_questions(asked, acted)
-    chosen = None if results is None else view or results.settings.views[0]
-    if results is not None and chosen not in results.settings.views:
-        raise UsageError(f"view {chosen!r} was not probed; probed were {', '.join(results.settings.views)}")
-    known, used = (_right(pairs[column]) for column in ("outcome_asked", "outcome"))
-    encoded = None if results is None or chosen is None else _encoded(pairs, results, chosen)
-    whole, unprobed = _only_probed(_items(pairs, known, used, encoded))
-    signals = {} if results is None or chosen is None else _signals(results, chosen)
-    rows = [_joined(str(name), own, signals.get(str(name))) for name, own in whole.groupby("category", sort=False)]
+    check_scene_run(policy, "a comparison with answers")
+    _check_kinds(vlm, policy)
+    pairs = _same_questions(vlm, policy)
+    probed_view = None if results is None else view or results.settings.views[0]
+    if results is not None and probed_view not in results.settings.views:
+        raise UsageError(f"view {probed_view!r} was not probed; probed were {', '.join(results.settings.views)}")
+    answered, acted_on = (_right(pairs[column]) for column in ("outcome_asked", "outcome"))
+    encoded = None if results is None or probed_view is None else _encoded(pairs, results, probed_view)
+    items, unprobed = _only_probed(_items(pairs, answered, acted_on, encoded))
+    signals = {} if results is None or probed_view is None else _signals(results, probed_view)
+    rows = [
+        _joined(str(name), of_category, signals.get(str(name)))
+        for name, of_category in items.groupby("category", sort=False)
+    ]
     if len(rows) > 1:
-        rows.append(_over_all(whole, rows, seed))
-    notes = [*unprobed, *_missing(pairs, asked, acted), *_of_picture(asked), *without_signal(rows)]
-    score = str(getattr(asked, "score", "text"))
-    joined = KnownUsedTable(asked.label, acted.label, score, chosen, tuple(rows), tuple(notes))
+        rows.append(_over_all(items, rows, seed))
+    notes = [*unprobed, *_missing(pairs, vlm, policy), *_of_picture(vlm), *without_signal(rows)]
+    score = str(getattr(vlm, "score", "text"))
+    joined = KnownUsedTable(vlm.label, policy.label, score, probed_view, tuple(rows), tuple(notes))
     return correct_joins([joined])[0]
 
 
@@ -170,13 +173,13 @@ def correct_joins(joins: Sequence[KnownUsedTable]) -> list[KnownUsedTable]:
 
     The tests of all categories are one family; those over all categories are a summary and no part of it.
     """
-    tests = [one for join in joins for row in join.rows if row.category != OVERALL for one in row.comparisons]
-    p_holm = iter(corrected(tests, lambda one: one.p))
+    tests = [test for join in joins for row in join.rows if row.category != OVERALL for test in row.comparisons]
+    p_holm = iter(corrected(tests, lambda test: test.p))
 
     def of_row(row: CategoryCounts) -> CategoryCounts:
         if row.category == OVERALL:
             return row
-        return replace(row, comparisons=tuple(replace(one, p_holm=next(p_holm)) for one in row.comparisons))
+        return replace(row, comparisons=tuple(replace(test, p_holm=next(p_holm)) for test in row.comparisons))
 
     return [replace(join, rows=tuple(of_row(row) for row in join.rows)) for join in joins]
 
@@ -184,45 +187,45 @@ def correct_joins(joins: Sequence[KnownUsedTable]) -> list[KnownUsedTable]:
 # -- the same questions ----------------------------------------------------------------------------------
 
 
-def _check_kinds(asked: RunReader, acted: RunReader) -> None:
-    if ask_of(asked) is None or ask_of(acted) is not None:
+def _check_kinds(vlm: RunReader, policy: RunReader) -> None:
+    if ask_of(vlm) is None or ask_of(policy) is not None:
         raise UsageError(
-            f"{asked.location} and {acted.location} are not a VLM run and a policy run, in this order; make them "
+            f"{vlm.location} and {policy.location} are not a VLM run and a policy run, in this order; make them "
             "with `probe-kit ask` and `probe-kit extract`"
         )
 
 
-def _same_questions(asked: RunReader, acted: RunReader) -> "pd.DataFrame":
+def _same_questions(vlm: RunReader, policy: RunReader) -> "pd.DataFrame":
     """The episodes of both: columns of the policy run, and `outcome_asked`."""
-    for run in (asked, acted):
+    for run in (vlm, policy):
         if FRAME not in run.episodes or run.episodes[FRAME].isna().any():
             raise OtherFramesError(
                 f"{run.location} does not say what its first frames were; it was made before runs kept their "
                 "hash. Make it again with this version"
             )
     keys = ["item_id", "layout"]
-    for run in (asked, acted):
+    for run in (vlm, policy):
         if run.episodes.duplicated(keys).any():
             raise UsageError(
                 f"{run.location} holds an item more than once in a layout, such as in several wordings; join runs "
                 "that ask every item once"
             )
-    there = asked.episodes[[*keys, "outcome", FRAME]]
-    pairs = acted.episodes.merge(there, on=keys, suffixes=("", "_asked"))
+    answers = vlm.episodes[[*keys, "outcome", FRAME]]
+    pairs = policy.episodes.merge(answers, on=keys, suffixes=("", "_asked"))
     if pairs.empty:
         raise UsageError(
-            f"{asked.location} and {acted.location} have no question in common; ask about the same suite"
+            f"{vlm.location} and {policy.location} have no question in common; ask about the same suite"
         )
     other = pairs.loc[pairs[FRAME] != pairs[f"{FRAME}_asked"], "episode_id"]
     if len(other):
         raise OtherFramesError(
-            f"{len(other)} of {len(pairs)} episodes begin with another frame in {asked.location} than in "
-            f"{acted.location} ({', '.join(other[:_MOST_NAMED])} …): a VLM and a policy that saw different "
+            f"{len(other)} of {len(pairs)} episodes begin with another frame in {vlm.location} than in "
+            f"{policy.location} ({', '.join(other[:_MOST_NAMED])} …): a VLM and a policy that saw different "
             "pictures cannot be joined. Repeat one of them with the --seed, --scene and suite of the other"
         )
     both: pd.DataFrame = pairs[pairs.groupby("item_id")["layout"].transform("nunique") == 2]
     if both.empty:
-        raise UsageError(f"{asked.location} and {acted.location} share no item in both layouts; finish both runs")
+        raise UsageError(f"{vlm.location} and {policy.location} share no item in both layouts; finish both runs")
     return both.reset_index(drop=True)
 
 
@@ -235,11 +238,11 @@ def _right(outcomes: "pd.Series[str]") -> Bools:
 
 def _encoded(pairs: "pd.DataFrame", results: ProbeResults, view: str) -> NDArray[np.float64]:
     """(E,) whether the probe's decision is right, NaN where nothing was probed."""
-    found: dict[str, bool] = {}
+    is_right: dict[str, bool] = {}
     for (_, name), curve in results.curves.items():
         if name == view:
-            found |= dict(zip(curve.episodes.tolist(), encoded_decisions(curve).tolist(), strict=True))
-    return np.array([found.get(episode, np.nan) for episode in pairs["episode_id"]], np.float64)
+            is_right |= dict(zip(curve.episodes.tolist(), encoded_decisions(curve).tolist(), strict=True))
+    return np.array([is_right.get(episode, np.nan) for episode in pairs["episode_id"]], np.float64)
 
 
 def encoded_decisions(curve: ProbeCurve) -> Bools:
@@ -255,21 +258,21 @@ def encoded_decisions(curve: ProbeCurve) -> Bools:
 
 
 def _signals(results: ProbeResults, view: str) -> dict[str, bool]:
-    """By category, whether the best site of the backbone beats chance and every control that was run."""
-    found = {}
+    """Return by category whether the best site of the backbone beats chance and every control that was run."""
+    signals = {}
     for (category, name), curve in results.curves.items():
         stream = curve.backbone_stream
         peak = None if stream is None or name != view else best_site(curve, stream)
         if peak is not None:
-            found[category] = has_signal(results.controls.exceeds(category, view, str(peak.site), peak.p_fwe))
-    return found
+            signals[category] = has_signal(results.controls.exceeds(category, view, str(peak.site), peak.p_fwe))
+    return signals
 
 
 # -- counting --------------------------------------------------------------------------------------------
 
 
 def _items(
-    pairs: "pd.DataFrame", known: Bools, used: Bools, encoded: NDArray[np.float64] | None
+    pairs: "pd.DataFrame", answered: Bools, used: Bools, encoded: NDArray[np.float64] | None
 ) -> "pd.DataFrame":
     """A row per item: right in both layouts or not; its episodes' own marks as text."""
     import pandas as pd
@@ -279,14 +282,14 @@ def _items(
             "item_id": pairs["item_id"],
             "category": pairs["category"],
             "group": units_of(pairs),
-            "known": known,
+            "answered": answered,
             "used": used,
             "encoded": np.nan if encoded is None else encoded,
         }
     )
-    episodes["marks"] = [_mark(*row) for row in episodes[["known", "encoded", "used"]].itertuples(index=False)]
+    episodes["marks"] = [_mark(*row) for row in episodes[["answered", "encoded", "used"]].itertuples(index=False)]
     by_item = episodes.groupby("item_id", sort=False)
-    items = by_item.agg({"category": "first", "group": "first", "known": "all", "used": "all", "marks": list})
+    items = by_item.agg({"category": "first", "group": "first", "answered": "all", "used": "all", "marks": list})
     items["encoded"] = by_item["encoded"].min().where(by_item["encoded"].count() == 2)
     return items.reset_index()
 
@@ -300,36 +303,37 @@ def _only_probed(items: "pd.DataFrame") -> "tuple[pd.DataFrame, list[str]]":
     return items[~dropped], [f"{int(dropped.sum())} items are left out: they were not probed in both layouts."]
 
 
-def _mark(known: bool, encoded: float, used: bool) -> str:
+def _mark(answered: bool, encoded: float, used: bool) -> str:
     middle = "-" if np.isnan(encoded) else str(int(encoded))
-    return f"{int(known)}{middle}{int(used)}"
+    return f"{int(answered)}{middle}{int(used)}"
 
 
 def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> CategoryCounts:
-    known, used = items["known"].to_numpy(bool), items["used"].to_numpy(bool)
+    answered, used = items["answered"].to_numpy(bool), items["used"].to_numpy(bool)
     values = items["encoded"].to_numpy(float)
     probed = bool(len(values)) and not np.isnan(values).any()
     encoded = values == 1 if probed else None
     marks = ["1", "0"]
     middle = marks if probed else ["-"]
-    sets = [known, *([] if encoded is None else [encoded]), used]
+    sets = [answered, *([] if encoded is None else [encoded]), used]
     codes = [
-        _mark(*row) for row in zip(known, values if probed else np.full(len(known), np.nan), used, strict=True)
+        _mark(*row)
+        for row in zip(answered, values if probed else np.full(len(answered), np.nan), used, strict=True)
     ]
     every = ["".join(parts) for parts in product(marks, middle, marks)]
-    singles = [mark if probed else f"{mark[0]}-{mark[2]}" for own in items["marks"] for mark in own]
+    singles = [mark if probed else f"{mark[0]}-{mark[2]}" for of_item in items["marks"] for mark in of_item]
     return CategoryCounts(
         category=category,
         n_items=len(items),
         n_groups=int(items["group"].nunique()),
-        answered_correctly=int(known.sum()),
+        answered_correctly=int(answered.sum()),
         encoded=None if encoded is None else int(encoded.sum()),
         acted_correctly=int(used.sum()),
         counts={code: codes.count(code) for code in every},
         guessed={code: len(items) * _by_coin(code) for code in every},
         episodes={code: singles.count(code) for code in every},
         has_signal=clear if probed else None,
-        comparisons=tuple(_comparisons(known, encoded, used, items["group"].to_numpy(str))),
+        comparisons=tuple(_comparisons(answered, encoded, used, items["group"].to_numpy(str))),
         **({} if clear is False else _kept(sets, encoded)),
     )
 
@@ -339,60 +343,66 @@ def _by_coin(code: str) -> float:
     return float(np.prod([COIN if mark == "1" else 1 - COIN for mark in code if mark != "-"]))
 
 
-def _comparisons(known: Bools, encoded: Bools | None, used: Bools, groups: NDArray[np.str_]) -> list[Comparison]:
-    values = {"answered": known, "acted": used} | ({} if encoded is None else {"encoded": encoded})
-    found = []
+def _comparisons(
+    answered: Bools, encoded: Bools | None, used: Bools, groups: NDArray[np.str_]
+) -> list[Comparison]:
+    values = {"answered": answered, "acted": used} | ({} if encoded is None else {"encoded": encoded})
+    comparisons = []
     for first, second in PAIRS:
         if first in values and second in values:
-            here, there = values[first], values[second]
-            ps = mcnemar_p(here, there), flip_p(here, there, groups)
-            found.append(
-                Comparison(first, second, int((here & ~there).sum()), int((~here & there).sum()), *ps, max(ps))
+            mine, theirs = values[first], values[second]
+            ps = mcnemar_p(mine, theirs), flip_p(mine, theirs, groups)
+            comparisons.append(
+                Comparison(first, second, int((mine & ~theirs).sum()), int((~mine & theirs).sum()), *ps, max(ps))
             )
-    return found
+    return comparisons
 
 
 def _kept(sets: Sequence[Bools], encoded: Bools | None) -> dict[str, Any]:
-    """What becomes of items that are answered right and encoded."""
+    """Return counts of items that are answered right and encoded, by what the action does with them."""
     if encoded is None:
         return {}
-    known, _, used = sets
-    both = known & encoded
+    answered, _, used = sets
+    both = answered & encoded
     lost, count = int((both & ~used).sum()), int(both.sum())
     return {
         "answered_and_encoded": count,
         "not_acted_on": lost,
         "share_not_acted_on": lost / count if count else None,
         "share_not_acted_on_ci": clopper_pearson(lost, count),
-        "p_linked": fisher_p(known[encoded], used[encoded]) if encoded.any() else None,
+        "p_linked": fisher_p(answered[encoded], used[encoded]) if encoded.any() else None,
     }
 
 
 def _over_all(items: "pd.DataFrame", rows: Sequence[CategoryCounts], seed: int) -> CategoryCounts:
     signals = {row.has_signal for row in rows}
-    whole = _joined(OVERALL, items, signals.pop() if len(signals) == 1 else None)
-    if whole.encoded is None or whole.has_signal is False:
-        return whole
+    overall = _joined(OVERALL, items, signals.pop() if len(signals) == 1 else None)
+    if overall.encoded is None or overall.has_signal is False:
+        return overall
     items = items[items["category"].isin([row.category for row in rows if row.has_signal])]
-    known, encoded, used = (items[name].to_numpy(bool) for name in ("known", "encoded", "used"))
-    kept = items["category"].to_numpy(str)[encoded]
-    p = overlap_p(known[encoded], used[encoded], kept, derive_seed("overlap", seed)) if encoded.any() else None
-    return replace(whole, **{**_kept([known, encoded, used], encoded), "p_linked": p})
+    answered, encoded, used = (items[name].to_numpy(bool) for name in ("answered", "encoded", "used"))
+    strata = items["category"].to_numpy(str)[encoded]
+    p = (
+        overlap_p(answered[encoded], used[encoded], strata, derive_seed("overlap", seed))
+        if encoded.any()
+        else None
+    )
+    return replace(overall, **{**_kept([answered, encoded, used], encoded), "p_linked": p})
 
 
 # -- what a reader must know -----------------------------------------------------------------------------
 
 
-def _missing(pairs: "pd.DataFrame", asked: RunReader, acted: RunReader) -> list[str]:
+def _missing(pairs: "pd.DataFrame", vlm: RunReader, policy: RunReader) -> list[str]:
     return [
         f"{len(run.episodes) - len(pairs)} episodes of {run.location} have no counterpart and are left out."
-        for run in (asked, acted)
+        for run in (vlm, policy)
         if len(run.episodes) > len(pairs)
     ]
 
 
-def _of_picture(asked: RunReader) -> list[str]:
-    ask = ask_of(asked) or {}
+def _of_picture(vlm: RunReader) -> list[str]:
+    ask = ask_of(vlm) or {}
     notes = []
     if ask.get("picture") != "frame":
         notes.append(f"The VLM was not shown the first frame (--picture {ask.get('picture')}).")

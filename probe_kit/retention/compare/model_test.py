@@ -35,7 +35,7 @@ class ModelTest:
 
     @classmethod
     def of(cls, first: Sequence[float], second: Sequence[float], largest: float = inf) -> "ModelTest | None":
-        """From one value per model; None for two single models, or where one has no value.
+        """Return the test of one value per model; None for two single models, or where one has no value.
 
         largest: the difference that no two groups can exceed, see `welch_interval`.
         """
@@ -72,15 +72,15 @@ def _by_model(
 
     Runs of one model, such as of several seeds, are averaged: they are no further models.
     """
-    if len({len(one) for one in side}) != 1:
+    if len({len(of_category) for of_category in side}) != 1:
         return None
     values: dict[str, list[float]] = {}
     for of_run in zip(*side, strict=True):
-        found = value(of_run)
-        if found is None:
+        of_model = value(of_run)
+        if of_model is None:
             return None
-        values.setdefault(_model(of_run[0]), []).append(found)
-    return {model: float(np.mean(own)) for model, own in values.items()} or None
+        values.setdefault(_model(of_run[0]), []).append(of_model)
+    return {model: float(np.mean(of_runs)) for model, of_runs in values.items()} or None
 
 
 def _by_origin(
@@ -88,27 +88,27 @@ def _by_origin(
 ) -> list[float]:
     """Return a value per origin: the mean of its models, which resemble each other."""
     origin_of: dict[str, str] = {}
-    for one in side[0]:
-        origin_of.setdefault(_model(one), origins.get(one.row.run.location, _model(one)))
+    for row in side[0]:
+        origin_of.setdefault(_model(row), origins.get(row.row.run.location, _model(row)))
     grouped: dict[str, list[float]] = {}
     for model, origin in origin_of.items():
         grouped.setdefault(origin, []).append(values[model])
     return [float(np.mean(models)) for models in grouped.values()]
 
 
-def _model(one: RowWithEstimates) -> str:
+def _model(row: RowWithEstimates) -> str:
     """Return the hash of a run's weights, or its location where that is unknown."""
-    return one.row.run.weights_sha256 or one.row.run.location
+    return row.row.run.weights_sha256 or row.row.run.location
 
 
 def success_of_model(rows: Sequence[RowWithEstimates]) -> float | None:
     """Return the mean success rate of a run over its categories; None where one has none."""
-    rates = [one.row.success.sr for one in rows if one.row.success.sr is not None]
+    rates = [row.row.success.sr for row in rows if row.row.success.sr is not None]
     return float(np.mean(rates)) if len(rates) == len(rows) else None
 
 
 def retention_of_model(rows: Sequence[RowWithEstimates]) -> float | None:
     """Return the retention of a run over its probed categories; None without both streams."""
-    pooled = [None if one.estimates.streams is None else PooledScores.of([one.estimates.streams]) for one in rows]
-    scores = [one.scores for one in pooled if one is not None and one.names == (ACTION, BACKBONE)]
+    pooled = [None if row.estimates.streams is None else PooledScores.of([row.estimates.streams]) for row in rows]
+    scores = [run.scores for run in pooled if run is not None and run.names == (ACTION, BACKBONE)]
     return retention(Scores.mean(scores)).value if scores else None

@@ -1,4 +1,4 @@
-"""Where models come from: checkpoints of one training, and models of one origin, count as one model.
+"""The origins of models: checkpoints of one training, and models of one origin, count as one model.
 
 Sister checkpoints resemble each other. Counted one by one they make p over models too small.
 """
@@ -39,13 +39,13 @@ def origins_of(runs: Sequence[RunReader], declared: Mapping[str, str] | None = N
     UsageError for a declared location that is none of the runs.
     """
     places = {str(run.location): run for run in runs}
-    if strange := [place for place in declared or {} if place not in places]:
+    if strange := [location for location in declared or {} if location not in places]:
         raise UsageError(f"an origin is declared of {strange[0]}; expected one of the runs {', '.join(places)}")
-    return {place: (declared or {}).get(place) or _origin(run) for place, run in places.items()}
+    return {location: (declared or {}).get(location) or _origin(run) for location, run in places.items()}
 
 
 def _origin(run: RunReader) -> str:
-    found = split_checkpoint(checkpoint_of(run))
-    if found is not None and found[0]:
-        return found[0]
+    training = split_checkpoint(checkpoint_of(run))
+    if training is not None and training[0]:
+        return training[0]
     return run.weights_sha256 or str(run.location)

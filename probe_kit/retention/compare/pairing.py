@@ -42,7 +42,7 @@ def compare_runs(
     labels: Mapping[str, str],
     against: str | None = None,
     vlm_vla: bool = False,
-    chosen: Sequence[tuple[str, str]] | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
 ) -> PairedRuns:
     """Return every other run minus the run `against`, by default the first; VLM runs and policy runs apart.
 
@@ -56,20 +56,20 @@ def compare_runs(
     if against is not None and len(runs) < 2:
         raise UsageError(f"--compare {against} needs a second run to compare with it")
     names = dict(zip(map(_place, runs), full_names(runs, labels), strict=True))
-    found: list[Difference] = []
+    differences: list[Difference] = []
     unpaired: list[str] = []
-    for here, there in _pairs(runs, names, against, chosen):
-        both = f"{names[_place(here)]} and {names[_place(there)]}"
-        items = common_items([here, there])
-        if why := _why_not(here, there, items):
+    for minuend, subtrahend in _pairs(runs, names, against, pairs):
+        both = f"{names[_place(minuend)]} and {names[_place(subtrahend)]}"
+        items = common_items([minuend, subtrahend])
+        if why := _why_not(minuend, subtrahend, items):
             unpaired.append(f"{both} are not compared: {why}.")
             continue
         unpaired += _left_out(both, items)
-        first, second = (Side.of(names[_place(run)], run, drawn) for run in (here, there))
-        found += compare(first, second, items=items)
-    if not vlm_vla and chosen is None and len({ask_of(run) is None for run in runs}) == 2:
+        first, second = (Side.of(names[_place(run)], run, drawn) for run in (minuend, subtrahend))
+        differences += compare(first, second, items=items)
+    if not vlm_vla and pairs is None and len({ask_of(run) is None for run in runs}) == 2:
         unpaired.append("VLM runs and policy runs are not compared with each other; --compare vlm-vla does that.")
-    return PairedRuns(with_holm(found), tuple(unpaired))
+    return PairedRuns(with_holm(differences), tuple(unpaired))
 
 
 def compare_groups(
@@ -84,19 +84,24 @@ def compare_groups(
     and then on these items alone. In other categories each group has its own items. origins: see `origins_of`.
     Raises UsageError for a group that is none of them, and a declared origin of no run.
     """
-    found: list[Difference] = []
+    differences: list[Difference] = []
     notes: list[str] = []
     grown = origins_of([run for of_group in groups.values() for run in of_group], origins)
     for names in group_pairs(list(groups), against):
         runs = [run for name in names for run in groups[name]]
-        items = {name: one for name, one in common_items(runs).items() if one.is_many}
+        items = {name: in_common for name, in_common in common_items(runs).items() if in_common.is_many}
         first, second = (
-            Side(name, tuple(groups[name]), tuple(one for one in drawn if one.row.group == name), origins=grown)
+            Side(
+                name,
+                tuple(groups[name]),
+                tuple(row for row in drawn if row.row.group == name),
+                origins=grown,
+            )
             for name in names
         )
         notes += _left_out(" and ".join(names), items)
-        found += compare(first, second, items=items, others_too=True)
-    return PairedRuns(with_holm(found), tuple(notes))
+        differences += compare(first, second, items=items, others_too=True)
+    return PairedRuns(with_holm(differences), tuple(notes))
 
 
 def group_pairs(groups: Sequence[str], against: str | None = None) -> list[tuple[str, str]]:
@@ -115,29 +120,29 @@ def compare_with_vlms(
     runs: Sequence[RunReader],
     drawn: Sequence[RowWithEstimates],
     names: Mapping[str, str],
-    chosen: Sequence[tuple[str, str]] | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
 ) -> list[Difference]:
     """Return every VLM run minus every acting one that it can be compared with, in answers and success alone.
 
     A policy whose network grew from weights that were asked is not compared with VLMs of other weights. names:
     what runs are called, by location. chosen: locations of the VLM runs and policy runs that are compared instead.
     """
-    asked, acted = ([run for run in runs if _asked(run) == kind] for kind in (True, False))
-    related = [(vlm, policy, grew_from(policy, vlm)) for vlm, policy in product(asked, acted)]
+    vlms, policies = ([run for run in runs if _asked(run) == kind] for kind in (True, False))
+    related = [(vlm, policy, grew_from(policy, vlm)) for vlm, policy in product(vlms, policies)]
     grown = {_place(policy) for _, policy, source in related if source == "yes"}
-    found: list[Difference] = []
+    differences: list[Difference] = []
     for vlm, policy, source in related:
         if (
-            (_place(vlm), _place(policy)) not in chosen
-            if chosen is not None
+            (_place(vlm), _place(policy)) not in pairs
+            if pairs is not None
             else (source == "no" and _place(policy) in grown)
         ):
             continue
         items = common_items([vlm, policy]) if wording_of(vlm) == wording_of(policy) else {}
-        items = {name: own for name, own in items.items() if own.n_items}
+        items = {name: in_common for name, in_common in items.items() if in_common.n_items}
         first, second = (Side.of(names[_place(run)], run, drawn) for run in (vlm, policy))
         rows = compare(first, second, "success", items=items, others_too=True)
-        found += [
+        differences += [
             replace(
                 row,
                 source=source,
@@ -146,7 +151,7 @@ def compare_with_vlms(
             )
             for row in rows
         ]
-    return with_holm(found)
+    return with_holm(differences)
 
 
 def _same_frames(
@@ -156,14 +161,14 @@ def _same_frames(
     column = "first_frame_sha256"
     if column not in vlm.episodes or column not in policy.episodes:
         return None
-    found = []
+    are_same = []
     for category in categories:
         first, second = (run.episodes[run.episodes["category"] == category] for run in (vlm, policy))
         if category in items:
             first, second = items[category].select(first), items[category].select(second)
         both = first[["episode_id", column]].merge(second[["episode_id", column]], on="episode_id")
-        found.append(bool(len(both) and (both[f"{column}_x"] == both[f"{column}_y"]).all()))
-    return all(found)
+        are_same.append(bool(len(both) and (both[f"{column}_x"] == both[f"{column}_y"]).all()))
+    return all(are_same)
 
 
 # -- wordings ----------------------------------------------------------------------------------------------------
@@ -192,31 +197,35 @@ def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
     picture shows can act and does not know. runs: those that acted, judged by the rule of the table.
     """
     settings = RowSettings(None, "all", (), DEFAULT_RULE, with_behaviour=False)
-    found: list[Difference] = []
+    differences: list[Difference] = []
     for run in runs:
-        whole = getattr(run, "whole", run)
+        every_wording = getattr(run, "whole", run)
         sides = {}
         for wording in getattr(run, "wordings", ()):
-            own: RunReader = _InWording(whole, wording)
-            if len(own.episodes):
-                sides[wording] = Side(wording, (own,), tuple(run_rows(own, None, settings)), _place(run))
+            in_wording: RunReader = _InWording(every_wording, wording)
+            if len(in_wording.episodes):
+                sides[wording] = Side(
+                    wording, (in_wording,), tuple(run_rows(in_wording, None, settings)), _place(run)
+                )
         for first, second in combinations(sides.values(), 2):
-            found += compare(first, second, "success")
-    return with_holm(found)
+            differences += compare(first, second, "success")
+    return with_holm(differences)
 
 
 def _left_out(both: str, items: Mapping[str, CommonItems]) -> list[str]:
-    """What a comparison leaves out, a sentence or two."""
-    none = [name for name, own in items.items() if not own.n_items]
-    part = {name: own for name, own in items.items() if own.n_items and not own.whole}
-    some = [f"{own.n_items} of {own.of_items} in {name}" for name, own in part.items()]
-    found = [f"{both} are not compared in {', '.join(none)}: no item in common."] if none else []
+    """Return a sentence or two on what a comparison leaves out."""
+    none = [name for name, in_common in items.items() if not in_common.n_items]
+    part = {
+        name: in_common for name, in_common in items.items() if in_common.n_items and not in_common.is_complete
+    }
+    some = [f"{in_common.n_items} of {in_common.of_items} in {name}" for name, in_common in part.items()]
+    sentences = [f"{both} are not compared in {', '.join(none)}: no item in common."] if none else []
     if some:
-        found.append(
+        sentences.append(
             f"{both} are compared on the items in common: {', '.join(some)}. Probes are not compared there: they "
             "were fitted on other items."
         )
-    return found
+    return sentences
 
 
 def _place(run: RunReader) -> str:
@@ -227,21 +236,21 @@ def _pairs(
     runs: Sequence[RunReader],
     names: Mapping[str, str],
     name: str | None,
-    chosen: Sequence[tuple[str, str]] | None,
+    pairs: Sequence[tuple[str, str]] | None,
 ) -> list[tuple[RunReader, RunReader]]:
-    if chosen is not None:
-        there = {_place(run): run for run in runs}
-        if strange := [place for pair in chosen for place in pair if place not in there]:
-            raise UsageError(f"{strange[0]} is none of the runs {', '.join(there)}")
-        return [(there[one], there[other]) for one, other in chosen]
+    if pairs is not None:
+        by_location = {_place(run): run for run in runs}
+        if strange := [location for pair in pairs for location in pair if location not in by_location]:
+            raise UsageError(f"{strange[0]} is none of the runs {', '.join(by_location)}")
+        return [(by_location[minuend], by_location[subtrahend]) for minuend, subtrahend in pairs]
     against = None if name is None else _run_called(name, runs, names)
     if against is not None:
         return [(run, against) for run in runs if run is not against and _asked(run) == _asked(against)]
-    found = []
-    for asked in (True, False):
-        alike = [run for run in runs if _asked(run) == asked]
-        found += [(other, alike[0]) for other in alike[1:]]
-    return found
+    with_first = []
+    for are_vlms in (True, False):
+        alike = [run for run in runs if _asked(run) == are_vlms]
+        with_first += [(subtrahend, alike[0]) for subtrahend in alike[1:]]
+    return with_first
 
 
 def _asked(run: RunReader) -> bool:
@@ -250,25 +259,25 @@ def _asked(run: RunReader) -> bool:
 
 def _run_called(name: str, runs: Sequence[RunReader], names: Mapping[str, str]) -> RunReader:
     for called in (_place, lambda run: names[_place(run)], lambda run: run.location.name, lambda run: run.label):
-        found = [run for run in runs if called(run) == name.rstrip("/")]
-        if len(found) == 1:
-            return found[0]
-    there = ", ".join(f"{run.location.name} ({names[_place(run)]})" for run in runs)
-    raise UsageError(f"--compare {name!r} is {'several' if found else 'none'} of the runs {there}")
+        matches = [run for run in runs if called(run) == name.rstrip("/")]
+        if len(matches) == 1:
+            return matches[0]
+    candidates = ", ".join(f"{run.location.name} ({names[_place(run)]})" for run in runs)
+    raise UsageError(f"--compare {name!r} is {'several' if matches else 'none'} of the runs {candidates}")
 
 
-def _why_not(here: RunReader, there: RunReader, items: Mapping[str, CommonItems]) -> str:
+def _why_not(minuend: RunReader, subtrahend: RunReader, items: Mapping[str, CommonItems]) -> str:
     """Why two runs cannot be paired, in words that follow a colon; empty if they can."""
     for what, read in _SAME.items():
-        one, other = read(here), read(there)
-        if None not in (one, other) and one != other:
-            return f"other {what} ({one} and {other})"
-    if any(own.n_items for own in items.values()):
+        mine, theirs = read(minuend), read(subtrahend)
+        if None not in (mine, theirs) and mine != theirs:
+            return f"other {what} ({mine} and {theirs})"
+    if any(in_common.n_items for in_common in items.values()):
         return ""
-    if here.suite != there.suite:
-        hashed = has_item_content(here) and has_item_content(there)
+    if minuend.suite != subtrahend.suite:
+        hashed = has_item_content(minuend) and has_item_content(subtrahend)
         unknown = "" if hashed else ", without item hashes in both runs to pair items by"
-        return f"other suites ({here.suite} and {there.suite}){unknown}"
+        return f"other suites ({minuend.suite} and {subtrahend.suite}){unknown}"
     return "no item in common in any category" if items else "no category in common"
 
 

@@ -1,4 +1,4 @@
-"""Whether a policy's network grew from the weights that a VLM was asked with."""
+"""The relation of a policy to a VLM: whether its network grew from the weights that were asked."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -14,16 +14,16 @@ def grew_from(policy: RunReader, vlm: RunReader) -> Relation:
     A family's name says which network it is and not which weights: another name is another source, the same name
     is no evidence. A card names its commit behind an @; the source of a family is known by repository only.
     """
-    grown, asked = card_of(policy), card_of(vlm)
-    if grown.get("random_weights") or asked.get("random_weights"):
+    grown, vlm_card = card_of(policy), card_of(vlm)
+    if grown.get("random_weights") or vlm_card.get("random_weights"):
         return "no"
     source = grown.get("source_weights") or {}
     if source.get("sha256"):
-        return "yes" if source["sha256"] == asked.get("weights_sha256") else "no"
-    if source.get("checkpoint") and source["checkpoint"] == str(asked.get("checkpoint")).partition("@")[0]:
+        return "yes" if source["sha256"] == vlm_card.get("weights_sha256") else "no"
+    if source.get("checkpoint") and source["checkpoint"] == str(vlm_card.get("checkpoint")).partition("@")[0]:
         return "yes"
-    sizes = source.get("parameters"), asked.get("parameters")
-    told_apart_by = sizes if None not in sizes else (grown.get("source"), asked.get("family"))
+    sizes = source.get("parameters"), vlm_card.get("parameters")
+    told_apart_by = sizes if None not in sizes else (grown.get("source"), vlm_card.get("family"))
     return "no" if None not in told_apart_by and len(set(told_apart_by)) == 2 else "unknown"
 
 

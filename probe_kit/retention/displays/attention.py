@@ -28,7 +28,7 @@ _LABELS = {CORRECT: "correct picture's tile", OTHER: "other picture's tile", ACT
 
 @dataclass
 class AttentionDisplay(Panelled):
-    """By block of the backbone, the share of attention in percent that lies on one role's tokens.
+    """A curve by block of the backbone: the share of attention in percent that lies on one role's tokens.
 
     blocks: (B,) those that are read. roles: names of R; of tiles by where the answer lies. mean: (R, B) over
     iterations, heads and inferences. iterations: (R, B, I) over heads and inferences. heads: (R, B, H) over
@@ -47,14 +47,14 @@ class AttentionDisplay(Panelled):
 
     @classmethod
     def from_run(cls, run: RunReader, category: str) -> Self:
-        """From the newest attention that is stored of a category. Raises NoInterventionsError if there is none."""
-        found = stored_attention(run).get(category)
-        if found is None:
+        """Read the newest attention that is stored of a category. Raises NoInterventionsError if there is none."""
+        attention = stored_attention(run).get(category)
+        if attention is None:
             raise NoInterventionsError(
                 f"{run.location} has no stored attention of {category!r}. Run `probe-kit intervene {run.location} "
                 "--kind attention`"
             )
-        return cls._of(found, category, ProvenanceLine.of_run(run))
+        return cls._of(attention, category, ProvenanceLine.of_run(run))
 
     @classmethod
     def _of(cls, recorded: AttentionShares, category: str, certificate: ProvenanceLine) -> Self:
@@ -118,12 +118,12 @@ PLACE = 15
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    for one in source.runs:
-        if stored_attention(one.run):
+    for drawn in source.runs:
+        if stored_attention(drawn.run):
             yield ReportFigure(
-                f"{one.stem}-attention", "Attention by layer", "interventions",
+                f"{drawn.stem}-attention", "Attention by layer", "interventions",
                 "How much of the attention that the acting stream pays lies on the pictures, the words and its "
                 "own tokens, by the block whose keys are read. Dots: single heads; bars: from the least to the "
                 "most of any iteration. Descriptive: attended tokens need not be used, and no verdict reads this.",
-                one.position, partial(attention_curve, one.run), is_detail=True,
+                drawn.position, partial(attention_curve, drawn.run), is_detail=True,
             )  # fmt: skip

@@ -79,7 +79,7 @@ class CallCurveDisplay(Display):
         view: str | None = None,
         events: EventCalls | None = None,
     ) -> Self:
-        """From probes by call (`load_results_by_call`). events: from `event_calls` of a run with trajectories.
+        """Read probes by call (`load_results_by_call`). events: from `event_calls` of a run with trajectories.
 
         Raises UnknownSiteError for a view that was not probed, UsageError for fewer than two calls.
         """
@@ -122,8 +122,8 @@ class CallCurveDisplay(Display):
     def plot_aligned(self, event: str, ax: "Axes | None" = None) -> Self:
         """Draw the accuracies counted from an event. Raises UsageError if too few episodes have it."""
         if event not in self.aligned:
-            known = ", ".join(self.aligned) or "none"
-            raise UsageError(f"too few episodes have the event {event!r}, or no trajectories; there are: {known}")
+            events = ", ".join(self.aligned) or "none"
+            raise UsageError(f"too few episodes have the event {event!r}, or no trajectories; there are: {events}")
         axes, figure = axes_for(ax, 6.2, 3.9)
         axes.axhline(100 * self.chance, color="0.45", lw=1, ls="--", label="chance")
         axes.axvline(0, color="0.6", lw=0.8)
@@ -150,10 +150,10 @@ def aligned_curves(
     """The same counted from an event, for every category in which enough episodes have it."""
     names = next(iter(results.values())).settings.categories
     displays = [CallCurveDisplay.from_results(results, name, view, events) for name in names]
-    shown = [display for display in displays if event in display.aligned]
-    if not shown:
+    with_event = [display for display in displays if event in display.aligned]
+    if not with_event:
         raise UsageError(f"too few episodes of any category have the event {event!r}, or no trajectories")
-    return _figure(shown, event)
+    return _figure(with_event, event)
 
 
 def _figure(displays: list[CallCurveDisplay], event: str | None) -> "Figure":
@@ -216,9 +216,9 @@ PLACE = 12
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    for one in source.runs:
-        if one.results is not None:
-            yield from _of_run(one.stem, one.position, one.run, one.results)
+    for drawn in source.runs:
+        if drawn.results is not None:
+            yield from _of_run(drawn.stem, drawn.position, drawn.run, drawn.results)
 
 
 def _of_run(name: str, position: int, run: RunReader, results: ProbeResults) -> Iterator[ReportFigure]:
@@ -237,7 +237,7 @@ def _of_run(name: str, position: int, run: RunReader, results: ProbeResults) -> 
         )  # fmt: skip
     curves = [CallCurves.of(calls, category, views[0], events) for category in results.settings.categories]
     for event in EVENTS:
-        if any(one.aligned(stream, event) is not None for one in curves for stream in one.streams):
+        if any(curve.aligned(stream, event) is not None for curve in curves for stream in curve.streams):
             yield ReportFigure(
                 f"{name}-calls-{event.replace(' ', '-')}", f"Around an event: {event}", "probes",
                 "The same, with every episode's inferences counted from its own event: 0 is the last one "

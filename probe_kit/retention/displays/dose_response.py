@@ -27,23 +27,22 @@ Percent = NDArray[np.float64]
 
 @dataclass
 class DoseResponseDisplay(Panelled):
-    """By coefficient, the share of episodes that turn to the target side, minus those that turn from it.
+    """A curve by coefficient: the share of episodes that turn to the target side, minus those that turn from it.
 
-    coefficients: (K,) in half class-mean differences, ascending, 0 among them. net, left, right: (K,) percent, of
-    all episodes and of those that are pushed to either side, one of which may be saturated. controls: (C, K)
-    percent of random directions of the same norm, NaN at a coefficient at which none was played. relative_change:
-    (K,) how far tokens were moved, in their own norms; beyond about two norms an effect is little
-    evidence.
+    coefficients: (K,) in half class-mean differences, ascending, 0 among them. net, net_left, net_right: (K,)
+    percent, of all episodes and of those that are pushed to either side, one of which may be saturated.
+    controls: (C, K) percent of random directions of the same norm, NaN at a coefficient at which none was played.
+    relative_change: (K,) how far tokens were moved, in their own norms; beyond two, an effect is little evidence.
     significant: (K,) beyond the controls, family-wise.
     """
 
     measure: ClassVar[str] = "% of episodes that turn"
     category: str
-    place: str
+    position: str
     coefficients: NDArray[np.float64]
     net: Percent
-    left: Percent
-    right: Percent
+    net_left: Percent
+    net_right: Percent
     controls: Percent
     relative_change: NDArray[np.float64]
     significant: NDArray[np.bool_]
@@ -51,46 +50,47 @@ class DoseResponseDisplay(Panelled):
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
-    def from_run(cls, run: RunReader, category: str, place: str | None = None) -> Self:
-        """From the steering that is stored of a category. place: one of several, as `backbone.02 image`.
+    def from_run(cls, run: RunReader, category: str, position: str | None = None) -> Self:
+        """Read the steering that is stored of a category. position: one of several, as `backbone.02 image`.
 
         Raises NoInterventionsError if there is none.
         """
-        found = stored_steering(run).get(category, {})
-        if not found or (place is not None and place not in found):
-            there = f"; it has it at {', '.join(found)}" if found else ""
+        by_position = stored_steering(run).get(category, {})
+        if not by_position or (position is not None and position not in by_position):
+            alternatives = f"; it has it at {', '.join(by_position)}" if by_position else ""
             raise NoInterventionsError(
-                f"{run.location} has no stored steering of {category!r}{f' at {place}' if place else ''}{there}. "
+                f"{run.location} has no stored steering of {category!r}"
+                f"{f' at {position}' if position else ''}{alternatives}. "
                 f"Run `probe-kit intervene {run.location} --kind steer --sites backbone.NN --roles image`"
             )
-        chosen = place or next(iter(found))
-        return cls._of(found[chosen], category, chosen, ProvenanceLine.of_run(run))
+        steered_at = position or next(iter(by_position))
+        return cls._of(by_position[steered_at], category, steered_at, ProvenanceLine.of_run(run))
 
     @classmethod
-    def _of(cls, rows: Sequence[PatchEffect], category: str, place: str, certificate: ProvenanceLine) -> Self:
-        own = sorted((row for row in rows if not row.is_control), key=lambda row: float(row.coefficient))
-        coefficients = np.array([float(row.coefficient) for row in own])
+    def _of(cls, rows: Sequence[PatchEffect], category: str, position: str, certificate: ProvenanceLine) -> Self:
+        steered = sorted((row for row in rows if not row.is_control), key=lambda row: float(row.coefficient))
+        coefficients = np.array([float(row.coefficient) for row in steered])
         names = dict.fromkeys(row.direction for row in rows if row.is_control)
         nets = {(row.direction, float(row.coefficient)): 100 * row.net for row in rows}
         return cls(
             category=category,
-            place=place,
+            position=position,
             coefficients=coefficients,
-            net=np.array([100 * row.net for row in own]),
-            left=np.array([100 * row.net_left for row in own]),
-            right=np.array([100 * row.net_right for row in own]),
+            net=np.array([100 * row.net for row in steered]),
+            net_left=np.array([100 * row.net_left for row in steered]),
+            net_right=np.array([100 * row.net_right for row in steered]),
             controls=np.array(
                 [[nets.get((name, coefficient), np.nan) for coefficient in coefficients] for name in names]
             ).reshape(len(names), len(coefficients)),
-            relative_change=np.array([row.relative_change for row in own]),
-            significant=np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in own]),
+            relative_change=np.array([row.relative_change for row in steered]),
+            significant=np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in steered]),
             certificate=certificate,
         )
 
     @property
     def title(self) -> str:
         """The category, and where."""
-        return "\n".join([spell(self.category), *self.place.split(", ")])
+        return "\n".join([spell(self.category), *self.position.split(", ")])
 
     def draw(self, axes: "Axes") -> None:
         """A line for all episodes and one for either side, over the band of the controls."""
@@ -102,7 +102,11 @@ class DoseResponseDisplay(Panelled):
                 self.coefficients, played.min(axis=0), played.max(axis=0), color=GREY, alpha=0.35, lw=0,
                 label="random directions of the same norm",
             )  # fmt: skip
-        lines = {"all episodes": self.net, "pushed to the left": self.left, "pushed to the right": self.right}
+        lines = {
+            "all episodes": self.net,
+            "pushed to the left": self.net_left,
+            "pushed to the right": self.net_right,
+        }
         for position, (label, percent) in enumerate(lines.items()):
             filled = self.significant if position == 0 else np.zeros(self.coefficients.size, bool)
             draw_series(axes, series(position), self.coefficients, percent, filled, label, 3.0 - 0.1 * position)
@@ -122,9 +126,9 @@ def _share(ratio: float) -> str:
 def dose_response(run: RunReader) -> "Figure":
     """A panel per category and place that was steered. Raises NoInterventionsError if none is stored."""
     displays = [
-        DoseResponseDisplay._of(rows, category, place, ProvenanceLine.of_run(run))
+        DoseResponseDisplay._of(rows, category, position, ProvenanceLine.of_run(run))
         for category, every in stored_steering(run).items()
-        for place, rows in every.items()
+        for position, rows in every.items()
     ]
     if not displays:
         DoseResponseDisplay.from_run(run, "any")
@@ -137,12 +141,12 @@ PLACE = 14
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    for one in source.runs:
-        if stored_steering(one.run):
+    for drawn in source.runs:
+        if stored_steering(drawn.run):
             yield ReportFigure(
-                f"{one.stem}-doses", "How much of a direction turns the action", "interventions",
+                f"{drawn.stem}-doses", "How much of a direction turns the action", "interventions",
                 "Episodes that turn to the side they are pushed to, minus those that turn from it, by how much of "
                 "the direction is added; filled: beyond random directions of the same norm (the band). One side "
                 "may be saturated, and beyond about two norms of the tokens any direction breaks the hand.",
-                one.position, partial(dose_response, one.run),
+                drawn.position, partial(dose_response, drawn.run),
             )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Where the cube ended, over the tiles, seen from above."""
+"""A map of where the cube ended, over the tiles, seen from above."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -51,7 +51,7 @@ class FinalPositionsDisplay(Display):
 
     @classmethod
     def from_run(cls, run: RunReader, category: str | None = None, scene: Mapping[str, Any] | None = None) -> Self:
-        """From the episodes of a run, all of them or those of one category.
+        """Read the episodes of a run, all of them or those of one category.
 
         scene: `SceneSpec.to_json()`; that of the run by default. Raises UsageError if the run has no scene or no
         positions, or no such category.
@@ -90,10 +90,10 @@ class FinalPositionsDisplay(Display):
         _draw_table(axes, self.scene, rule)
         inside = ((self.xy >= low) & (self.xy <= high)).all(axis=1)
         for name, (label, colour, marker) in _OUTCOMES.items():
-            chosen = (self.outcome == name) & inside
+            of_outcome = (self.outcome == name) & inside
             axes.scatter(
-                -self.xy[chosen, 1], self.xy[chosen, 0], c=colour, marker=marker, label=label, s=18, alpha=0.65,
-                linewidths=0, zorder=3, rasterized=bool(chosen.sum() > _MANY),
+                -self.xy[of_outcome, 1], self.xy[of_outcome, 0], c=colour, marker=marker, label=label, s=18,
+                alpha=0.65, linewidths=0, zorder=3, rasterized=bool(of_outcome.sum() > _MANY),
             )  # fmt: skip
         _set_window(axes, low, high, int((~inside).sum()))
         title = spell(self.category or "all categories")
@@ -124,7 +124,7 @@ def final_positions(run: RunReader) -> "Figure":
 
 
 def _reach(rule: OutcomeRule) -> float:
-    """How far a zone reaches from the middle of its picture, metres."""
+    """Return how far a zone reaches from the middle of its picture, in metres."""
     if isinstance(rule, Disc):
         return rule.radius
     assert isinstance(rule, Box | ReleasedOnTile)
@@ -177,9 +177,9 @@ def _set_window(axes: "Axes", low: NDArray[np.float64], high: NDArray[np.float64
     axes.set_xticks([])
     axes.set_yticks([])
     axes.spines[:].set_color("0.8")
-    left, bottom = -high[1] + 0.012, low[0] + 0.012
-    axes.plot([left, left + 0.1], [bottom, bottom], color="0.25", lw=1.5)
-    axes.text(left + 0.05, bottom + 0.005, "10 cm", ha="center", va="bottom", fontsize=6.5, color="0.25")
+    start, bottom = -high[1] + 0.012, low[0] + 0.012
+    axes.plot([start, start + 0.1], [bottom, bottom], color="0.25", lw=1.5)
+    axes.text(start + 0.05, bottom + 0.005, "10 cm", ha="center", va="bottom", fontsize=6.5, color="0.25")
     if outside:
         axes.text(-low[1] - 0.008, bottom, f"{outside} beyond the frame", ha="right", fontsize=6.5, color="0.25")
 
@@ -198,14 +198,14 @@ PLACE = 8
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    for one in source.runs:
-        run = one.judged(source.table)
+    for drawn in source.runs:
+        run = drawn.judged(source.table)
         if run is None or capture_only(run.episodes):
             continue
         if {"cube_x", "cube_y"} <= set(run.episodes) and getattr(run, "settings", {}).get("scene"):
             yield ReportFigure(
-                f"{one.stem}-final-positions", "Where the cube ended", "behaviour",
+                f"{drawn.stem}-final-positions", "Where the cube ended", "behaviour",
                 "The table from above, the robot below the picture. An episode counts as an answer if the middle "
                 "of the cube ends inside a dashed line; “unmoved” means that the cube was never carried anywhere.",
-                one.position, partial(final_positions, run), is_detail=True,
+                drawn.position, partial(final_positions, run), is_detail=True,
             )  # fmt: skip

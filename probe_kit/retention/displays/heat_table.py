@@ -60,15 +60,15 @@ class HeatTableDisplay(Display):
 
     @classmethod
     def _of_behaviour(cls, table: RetentionTable, cell: Callable[[RetentionRow], Cell]) -> Self:
-        """Of success rates, which belong to an outcome rule."""
+        """Return a display of success rates, which belong to an outcome rule."""
         rows = once_per_category(table.all_rows)
-        found = cls._of(rows, cell)
+        display = cls._of(rows, cell)
         modes, acted = modes_of(rows), [row for row in rows if row.run.mode == "acts"]
-        found.title = cls.title.replace(RATE["acts"], RATE[modes])
-        found.note = cls.notes.get(modes, cls.note)
+        display.title = cls.title.replace(RATE["acts"], RATE[modes])
+        display.note = cls.notes.get(modes, cls.note)
         rules = ", ".join(dict.fromkeys(row.rules.rule for row in acted))
-        found.rule_words = f", outcome rule {rules}" if acted else ""
-        return found
+        display.rule_words = f", outcome rule {rules}" if acted else ""
+        return display
 
     @classmethod
     def _of(cls, rows: Sequence[RetentionRow], cell: Callable[[RetentionRow], Cell]) -> Self:
@@ -112,12 +112,12 @@ class HeatTableDisplay(Display):
 
         share = 1 / len(cell.values)
         for part, value in enumerate(cell.values):
-            left = column + part * share
+            start = column + part * share
             fill_with = _EMPTY if value is None else heat_colour(value)
-            axes.add_patch(Rectangle((left, number), share, 1, fc=fill_with, ec="white", lw=0.6))
+            axes.add_patch(Rectangle((start, number), share, 1, fc=fill_with, ec="white", lw=0.6))
             text = "–" if value is None else f"{self.scale * value:.{self.digits}f}"
             weight = "bold" if cell.bold else "normal"
-            axes.text(left + share / 2, number + 0.52, text, ha="center", va="center", fontsize=8, weight=weight)
+            axes.text(start + share / 2, number + 0.52, text, ha="center", va="center", fontsize=8, weight=weight)
         axes.add_patch(Rectangle((column, number), 1, 1, fill=False, ec="white", lw=2.2))
 
     def _draw_names(self, axes: "Axes") -> None:
@@ -150,7 +150,7 @@ class SuccessTableDisplay(HeatTableDisplay):
 
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
-        """From the retention table of any runs. Raises UsageError if it is empty."""
+        """Read the retention table of any runs. Raises UsageError if it is empty."""
         return cls._of_behaviour(
             table, lambda row: Cell((row.success.sr,), row.success.regime == Regime.KNOWLEDGE)
         )
@@ -170,7 +170,7 @@ class SideTableDisplay(HeatTableDisplay):
 
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
-        """From the retention table of any runs. Raises UsageError if it is empty."""
+        """Read the retention table of any runs. Raises UsageError if it is empty."""
         return cls._of_behaviour(table, lambda row: Cell((row.success.sr_left, row.success.sr_right)))
 
 
@@ -184,7 +184,7 @@ class RetentionTableDisplay(HeatTableDisplay):
 
     @classmethod
     def from_table(cls, table: RetentionTable) -> Self:
-        """From a retention table with probes. Raises UsageError if no run was probed."""
+        """Read a retention table with probes. Raises UsageError if no run was probed."""
 
         def cell(row: RetentionRow) -> Cell:
             values = (row.retention.value, row.retention.published) if row.retention.defined else (None, None)
@@ -208,13 +208,13 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     table = source.table
     acted = [row for row in table.rows if row.success.sr is not None]
     modes = modes_of(acted)
-    shown: list[tuple[type[SuccessTableDisplay | SideTableDisplay | RetentionTableDisplay], str, str, str]] = []
+    displays: list[tuple[type[SuccessTableDisplay | SideTableDisplay | RetentionTableDisplay], str, str, str]] = []
     if acted:
-        shown.append((SuccessTableDisplay, "success", RATE[modes], "behaviour"))
-        shown.append((SideTableDisplay, "sides", f"{RATE[modes]} by side", "behaviour"))
+        displays.append((SuccessTableDisplay, "success", RATE[modes], "behaviour"))
+        displays.append((SideTableDisplay, "sides", f"{RATE[modes]} by side", "behaviour"))
     if any(row.retention.published is not None for row in table.rows):
-        shown.append((RetentionTableDisplay, "retention", "Retention", "retention"))
-    for display, name, title, subject in shown:
+        displays.append((RetentionTableDisplay, "retention", "Retention", "retention"))
+    for display, name, title, subject in displays:
         note = display.notes.get(modes, display.note)
         yield ReportFigure(
             name, title, subject, note, None, partial(_drawn, display, table), is_table=True,

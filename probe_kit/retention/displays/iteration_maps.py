@@ -51,7 +51,7 @@ class IterationMapDisplay(Display):
     def from_results(
         cls, results: ProbeResults, category: str, view: str | None = None, stream: str | None = None
     ) -> Self:
-        """From stored probes; view: the first probed one by default; stream: where the action is made.
+        """Read stored probes; view: the first probed one by default; stream: where the action is made.
 
         Raises UnknownSiteError for a view that was not probed or a stream without iterations,
         UnknownCategoryError for a category that was not probed.
@@ -134,8 +134,8 @@ def draw_map(axes: "Axes", display: IterationMapDisplay) -> "ScalarMappable":
         (layers, display.layers, axes.xaxis),
         (iterations, display.iterations, axes.yaxis),
     ):
-        shown = range(0, ticks, max(1, -(-ticks // 7)))
-        axis.set_ticks(list(shown), [str(numbers[at]) for at in shown])
+        labelled = range(0, ticks, max(1, -(-ticks // 7)))
+        axis.set_ticks(list(labelled), [str(numbers[at]) for at in labelled])
     axes.set_xlabel("layer", fontsize=8.5)
     axes.tick_params(labelsize=8)
     axes.set_title(spell(display.category), fontsize=10, loc="left")
@@ -152,7 +152,7 @@ def _colours(part: str) -> "Colormap":
 
 
 def draw_legend(figure: "Figure") -> None:
-    """What dots, frames and grey cells are."""
+    """Draw the legend of dots, frames and grey cells."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -198,19 +198,19 @@ PLACE = 10
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    for one in source.runs:
-        if one.results is None:
+    for drawn in source.runs:
+        if drawn.results is None:
             continue
-        views, scores = one.results.settings.views, one.results.scores
+        views, scores = drawn.results.settings.views, drawn.results.scores
         for view in views:
             for stream in scores.loc[scores["part"] == "action", "stream"].unique():
                 of_stream = (scores["view"] == view) & (scores["stream"] == stream)
                 if (of_stream & scores["iteration"].notna()).any():
                     yield ReportFigure(
-                        f"{one.stem}-iteration-maps{view_suffix(view, views)}",
+                        f"{drawn.stem}-iteration-maps{view_suffix(view, views)}",
                         in_view("Layer × iteration", view, views), "probes",
                         "The action is made in several iterations (flow-matching steps or action tokens). The "
                         "further a cell's colour is from that of chance, the better the answer can be read "
                         f"there. {DOTS}.",
-                        one.position, partial(iteration_maps, one.results, view, stream), is_detail=True,
+                        drawn.position, partial(iteration_maps, drawn.results, view, stream), is_detail=True,
                     )  # fmt: skip

@@ -61,14 +61,14 @@ class KnowledgeActionDisplay(Display):
     def from_table(
         cls, table: RetentionTable, stream: Literal["backbone", "expert"] = "backbone", view: str | None = None
     ) -> Self:
-        """From a retention table; view: the first one of each run by default.
+        """Read a retention table; view: the first one of each run by default.
 
         Raises UsageError if no run was probed in that stream and view.
         """
-        shown: dict[tuple[str | None, str], str | None] = {}
+        view_of: dict[tuple[str | None, str], str | None] = {}
         points, drawn = [], []
         for row in table.rows:
-            if row.view is None or shown.setdefault((row.group, row.run.location), view or row.view) != row.view:
+            if row.view is None or view_of.setdefault((row.group, row.run.location), view or row.view) != row.view:
                 continue
             if (point := _point(row, stream)) is not None:
                 points.append(point)
@@ -78,7 +78,7 @@ class KnowledgeActionDisplay(Display):
                 f"no run that acted has probes of stream {stream!r}" + (f" in view {view!r}" if view else "")
             )
         means = (
-            mean for mean in table.means if shown.get((mean.group, mean.run.location)) == mean.view is not None
+            mean for mean in table.means if view_of.get((mean.group, mean.run.location)) == mean.view is not None
         )
         certificates = tuple(ProvenanceLine.of_row(mean) for mean in means)
         return cls(stream, tuple(points), certificates, modes_of(drawn))
@@ -91,9 +91,9 @@ class KnowledgeActionDisplay(Display):
         for position, model in enumerate(models):
             _draw_model(axes, [point for point in self.points if point.model == model], position, model)
         plain(axes)
-        made = "answer" if self.modes == "answers" else "action"
-        place = "in the backbone" if self.stream == "backbone" else f"where the {made} is made"
-        axes.set_xlabel(f"best held-out probe {place} (%)", fontsize=9)
+        output = "answer" if self.modes == "answers" else "action"
+        where = "in the backbone" if self.stream == "backbone" else f"where the {output} is made"
+        axes.set_xlabel(f"best held-out probe {where} (%)", fontsize=9)
         axes.set_ylabel(f"{RATE[self.modes].lower()} (%)", fontsize=9)
         if figure is not None:
             legend_above(figure, [*axes.get_legend_handles_labels()[0], *significance_handles()])
@@ -157,9 +157,9 @@ def _draw_model(axes: "Axes", points: Sequence[GapPoint], position: int, model: 
             elinewidth=0.7, alpha=0.28, zorder=2,
         )  # fmt: skip
     for filled in (True, False):
-        chosen = [point for point in points if point.significant == filled]
+        of_marker = [point for point in points if point.significant == filled]
         axes.plot(
-            [100 * point.accuracy for point in chosen], [100 * point.sr for point in chosen], ls="none",
+            [100 * point.accuracy for point in of_marker], [100 * point.sr for point in of_marker], ls="none",
             marker=line.marker, ms=6, color=line.colour, mfc=line.colour if filled else "white",
             label=model if filled else None, zorder=3,
         )  # fmt: skip

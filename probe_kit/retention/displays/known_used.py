@@ -61,19 +61,19 @@ class KnownUsedDisplay(Display):
 
     @classmethod
     def from_join(cls, joined: KnownUsedTable) -> Self:
-        """From what `probe_kit.retention.compare.known_used.join` gives."""
-        seen = f"probes in view {joined.view}" if joined.view else "no probes"
+        """Read a table of `probe_kit.retention.compare.known_used.match_runs`."""
+        probes = f"probes in view {joined.view}" if joined.view else "no probes"
         return cls(
             title=f"{joined.asked} (by {joined.score}) · {joined.acted}",
             counts={row.category: row.counts for row in joined.rows},
-            note=f"{joined.asked} · {joined.acted} · items right in both layouts, a coin: 25 % · {seen}",
+            note=f"{joined.asked} · {joined.acted} · items right in both layouts, a coin: 25 % · {probes}",
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and caption."""
         axes, figure = axes_for(ax, 7.2, 0.36 * len(self.counts) + 2.0)
-        for place, counts in enumerate(self.counts.values()):
-            _draw_bar(axes, place, counts)
+        for height, counts in enumerate(self.counts.values()):
+            _draw_bar(axes, height, counts)
         axes.set_yticks(range(len(self.counts)), [spell(name) for name in self.counts], fontsize=8)
         axes.set_ylim(len(self.counts) - 0.4, -0.6)
         axes.set_xlim(0, 100)
@@ -97,20 +97,20 @@ def words_of(code: str) -> str:
     return ", ".join(right if mark == "1" else wrong for (right, wrong), mark in parts if mark != "-")
 
 
-def _draw_bar(axes: "Axes", place: int, counts: Mapping[str, int]) -> None:
-    total, left = sum(counts.values()), 0.0
+def _draw_bar(axes: "Axes", height: int, counts: Mapping[str, int]) -> None:
+    total, start = sum(counts.values()), 0.0
     for code, (colour, hatch) in _LOOKS.items():
         if code not in counts:
             continue
         width = 100 * counts[code] / total if total else 0.0
-        axes.barh(place, width, 0.72, left, color=colour, hatch=hatch, ec="white", lw=0.5, label=words_of(code))
+        axes.barh(height, width, 0.72, start, color=colour, hatch=hatch, ec="white", lw=0.5, label=words_of(code))
         if width >= _LEAST:
             ground = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.85}
             axes.text(
-                left + width / 2, place, str(counts[code]), ha="center", va="center", fontsize=8, bbox=ground
+                start + width / 2, height, str(counts[code]), ha="center", va="center", fontsize=8, bbox=ground
             )
-        left += width
-    axes.text(101, place, f"n {total}", va="center", fontsize=7.5, color=GREY, clip_on=False)
+        start += width
+    axes.text(101, height, f"n {total}", va="center", fontsize=7.5, color=GREY, clip_on=False)
 
 
 PLACE = 6
@@ -119,7 +119,7 @@ PLACE = 6
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    yield from known_used_figures(joins_of([one.run for one in source.runs], source.table).found)
+    yield from known_used_figures(joins_of([drawn.run for drawn in source.runs], source.table).tables)
 
 
 def known_used_figures(joins: Sequence[KnownUsedTable]) -> Iterator[ReportFigure]:

@@ -69,7 +69,7 @@ class LayerCurveDisplay(Display):
     def from_results(
         cls, results: ProbeResults, category: str, view: str | None = None, iterations: Iterations = "all"
     ) -> Self:
-        """From stored probes; view: the first probed one by default.
+        """Read stored probes; view: the first probed one by default.
 
         iterations: a line for each of `all`, for the `best` of every layer, for the `last` one or one by number.
         Raises UnknownSiteError for a view, and UnknownCategoryError for a category, that was not probed, and
@@ -97,7 +97,7 @@ class LayerCurveDisplay(Display):
             _finish(ax, max(curve.layers.max() for curve in self.streams) + 1, spell(self.category))
             self.ax_ = ax
             return self
-        figure, grid = _pairs([self], own=True)
+        figure, grid = _pairs([self], in_pyplot=True)
         self.ax_ = grid[0][0]
         _complete(figure, grid, [self])
         return self
@@ -135,10 +135,10 @@ def layer_curve(results: ProbeResults, view: str | None = None, iterations: Iter
     return figure
 
 
-def _pairs(displays: Sequence[LayerCurveDisplay], own: bool = False) -> "tuple[Figure, list[list[Axes]]]":
+def _pairs(displays: Sequence[LayerCurveDisplay], in_pyplot: bool = False) -> "tuple[Figure, list[list[Axes]]]":
     """Axes for every stream of every display, those of one display side by side.
 
-    own: whether pyplot shall know the figure, so that it is shown where displays are.
+    in_pyplot: whether pyplot shall know the figure, so that it is shown where displays are.
     """
     from matplotlib import pyplot as plt
 
@@ -149,7 +149,7 @@ def _pairs(displays: Sequence[LayerCurveDisplay], own: bool = False) -> "tuple[F
     rows = ceil(len(displays) / across)
     size = (max(6.2, 2.75 * streams * across + 0.7), (2.9 if rows == 1 else 2.3) * rows + 1.0)
     figure: Figure
-    if own:
+    if in_pyplot:
         figure = plt.figure(figsize=size, layout="constrained", dpi=DPI, FigureClass=ShownFigure)
     else:
         figure = ShownFigure(figsize=size, layout="constrained", dpi=DPI)
@@ -198,7 +198,7 @@ def _few(steps: Sequence[int]) -> list[int]:
 
 
 def _colours() -> "Colormap":
-    """From pale to dark through the action's colour: lightness alone orders the iterations."""
+    """Return colours from pale to dark through the action's: lightness alone orders the iterations."""
     from matplotlib.colors import LinearSegmentedColormap
 
     return LinearSegmentedColormap.from_list("iterations", ["#F7C79B", PARTS["action"].colour, "#3B1200"])
@@ -218,9 +218,9 @@ def _draw_stream(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0) -> Non
         draw_line(axes, curve.lines[0], line, curve.label, sidestep, bars=_has_bars(curve))
     else:
         colours = _colours()
-        for number, one in enumerate(curve.lines):
+        for number, layers in enumerate(curve.lines):
             shade = Line(colours(number / (len(curve.lines) - 1)), line.marker)  # type: ignore[arg-type]
-            draw_line(axes, one, shade, f"iteration {one.iteration}", sidestep, bars=False)
+            draw_line(axes, layers, shade, f"iteration {layers.iteration}", sidestep, bars=False)
         axes.plot([], [], color=line.colour, marker=line.marker, ms=4, lw=1.3, label=f"{curve.name}, by iteration")
     mark_peaks(axes, curve, sidestep)
 
@@ -292,17 +292,17 @@ PLACE = 9
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    for one in source.runs:
-        views = () if one.results is None else one.results.settings.views
+    for drawn in source.runs:
+        views = () if drawn.results is None else drawn.results.settings.views
         for view in views:
-            assert one.results is not None
+            assert drawn.results is not None
             yield ReportFigure(
-                f"{one.stem}-layer-curves{view_suffix(view, views)}", in_view("Layer curves", view, views),
+                f"{drawn.stem}-layer-curves{view_suffix(view, views)}", in_view("Layer curves", view, views),
                 "probes",
                 "How often a linear probe names the side of the correct picture in episodes it has not seen, "
                 f"layer by layer; the part that makes the action has a line per iteration. {ONLY_FILLED}, against "
                 "the best layer of permuted labels. The grey band is what no knowledge looks like; a caret "
                 "marks the best layer, or all that tie.",
-                one.position, partial(layer_curve, one.results, view, source.table.iterations),
+                drawn.position, partial(layer_curve, drawn.results, view, source.table.iterations),
                 is_detail=view != views[0],
             )  # fmt: skip

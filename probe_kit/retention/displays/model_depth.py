@@ -66,21 +66,25 @@ class ModelDepthDisplay(Display):
         iterations: Iterations = "best",
         names: Sequence[str] | None = None,
     ) -> Self:
-        """From the stored probes of several runs; view: the first probed one of each by default.
+        """Read the stored probes of several runs; view: the first probed one of each by default.
 
         names: what runs are called, in order; by default as when they were probed.
 
         Raises UnknownSiteError for a view that was not probed, UsageError if no run has that stream.
         """
-        called = [_name(one) for one in results] if names is None else names
-        found = [(one, known_view(one, view), name) for one, name in zip(results, called, strict=True)]
-        kept = [one for one in found if (one[0].scores["stream"] == stream).any()]
-        if not kept:
+        called = [_name(probes) for probes in results] if names is None else names
+        every = [(probes, known_view(probes, view), name) for probes, name in zip(results, called, strict=True)]
+        with_stream = [entry for entry in every if (entry[0].scores["stream"] == stream).any()]
+        if not with_stream:
             raise UsageError(f"none of the {len(results)} runs has probes of stream {stream!r}")
         return cls(
             stream=stream,
-            models=tuple(_curve(one, stream, shown, iterations, name) for one, shown, name in kept),
-            certificates=tuple(ProvenanceLine.of_results(one, shown) for one, shown, _ in kept),
+            models=tuple(
+                _curve(probes, stream, probed_view, iterations, name) for probes, probed_view, name in with_stream
+            ),
+            certificates=tuple(
+                ProvenanceLine.of_results(probes, probed_view) for probes, probed_view, _ in with_stream
+            ),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -118,12 +122,12 @@ def model_depths(
     """Backbones, and where actions are made, on one scale. Raises UsageError if no run has either."""
     from probe_kit.retention.displays.base.shown_figure import ShownFigure
 
-    found = {
+    parts = {
         (str(part), str(name))
-        for one in results
-        for part, name in zip(one.scores["part"], one.scores["stream"], strict=True)
+        for probes in results
+        for part, name in zip(probes.scores["part"], probes.scores["stream"], strict=True)
     }
-    streams = [name for part in ("backbone", "action") for own, name in sorted(found) if own == part]
+    streams = [name for part in ("backbone", "action") for part_of, name in sorted(parts) if part_of == part]
     displays = [ModelDepthDisplay.from_results(results, stream, view, iterations, names) for stream in streams]
     if not displays:
         raise UsageError("no run has probes of a backbone or an action expert")

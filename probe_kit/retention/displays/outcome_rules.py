@@ -62,8 +62,8 @@ class OutcomeRulesDisplay(Display):
         runs = list(dict.fromkeys(bar.run for bar in self.bars))
         axes, figure = axes_for(ax, 6.2, 0.3 * len(self.bars) + 0.15 * len(runs) + 1.35)
         places = [at + 0.5 * runs.index(bar.run) for at, bar in enumerate(self.bars)]
-        for place, bar in zip(places, self.bars, strict=True):
-            _draw_bar(axes, place, bar)
+        for height, bar in zip(places, self.bars, strict=True):
+            _draw_bar(axes, height, bar)
         names = [f"{bar.run}  {bar.rule}" if len(runs) > 1 else bar.rule for bar in self.bars]
         axes.set_yticks(places, names, fontsize=8)
         axes.set_ylim(places[-1] + 0.6, -0.6)
@@ -103,19 +103,19 @@ def _over_categories(run: RunReader, shares: "ArrayLike") -> float:
     return float(np.mean([values[categories == name].mean() for name in np.unique(categories)]))
 
 
-def _draw_bar(axes: "Axes", place: float, bar: RuleBar) -> None:
+def _draw_bar(axes: "Axes", height: float, bar: RuleBar) -> None:
     if bar.shares is None:
-        axes.text(1, place, "n/a: the run keeps no trajectories", va="center", fontsize=7.5, color="0.35")
+        axes.text(1, height, "n/a: the run keeps no trajectories", va="center", fontsize=7.5, color="0.35")
         return
-    left = 0.0
+    start = 0.0
     for name, label, colour, hatch in _PARTS:
         width = 100 * bar.shares[name]
-        axes.barh(place, width, 0.72, left, color=colour, hatch=hatch, ec="white", lw=0.5, label=label)
-        left += width
-    axes.text(101, place, f"{100 * bar.shares['correct']:.1f}", va="center", fontsize=8)
+        axes.barh(height, width, 0.72, start, color=colour, hatch=hatch, ec="white", lw=0.5, label=label)
+        start += width
+    axes.text(101, height, f"{100 * bar.shares['correct']:.1f}", va="center", fontsize=8)
     if bar.idle:
         axes.plot(
-            [100 * bar.idle] * 2, [place - 0.44, place + 0.44], color="black", lw=2, label="doing nothing scores"
+            [100 * bar.idle] * 2, [height - 0.44, height + 0.44], color="black", lw=2, label="doing nothing scores"
         )
 
 
@@ -125,8 +125,8 @@ PLACE = 4
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    kept = [one.run for one in source.runs if getattr(one.run, "has_trajectories", False)]
-    runs = [run for run in kept if not run.episodes.empty]
+    with_trajectories = [drawn.run for drawn in source.runs if getattr(drawn.run, "has_trajectories", False)]
+    runs = [run for run in with_trajectories if not run.episodes.empty]
     if runs:
         yield ReportFigure(
             "outcome-rules", "The same episodes by every outcome rule", "behaviour",

@@ -41,7 +41,7 @@ class PairedLayoutsDisplay(Display):
 
     @classmethod
     def from_run(cls, run: RunReader) -> Self:
-        """From the episodes of a run; items that ran in one layout are left out."""
+        """Read the episodes of a run; items that ran in one layout are left out."""
         by_category = run.episodes.groupby("category", sort=False)
         items = {str(category): paired_items(episodes) for category, episodes in by_category}
         return cls(items, ProvenanceLine.of_run(run))
@@ -68,18 +68,20 @@ class PairedLayoutsDisplay(Display):
 def _draw_bar(axes: "Axes", row: int, paired: PairedItems) -> None:
     counts = (paired.both, paired.one, paired.both_wrong, paired.none - paired.both_wrong)
     total = sum(counts)
-    left = 0.0
+    start = 0.0
     for (label, colour, hatch), count in zip(_PARTS, counts, strict=True):
         width = 100 * count / max(1, total)
         axes.barh(
-            row, width, left=left, height=0.72, color=colour, hatch=hatch, edgecolor="white", lw=0.8,
+            row, width, left=start, height=0.72, color=colour, hatch=hatch, edgecolor="white", lw=0.8,
             label=label if row == 0 else None,
         )  # fmt: skip
         if width >= 5:
             box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85} if hatch else None
             ink = "white" if colour == GREEN else "black"
-            axes.text(left + width / 2, row, str(count), ha="center", va="center", fontsize=8, color=ink, bbox=box)
-        left += width
+            axes.text(
+                start + width / 2, row, str(count), ha="center", va="center", fontsize=8, color=ink, bbox=box
+            )
+        start += width
     weight = "bold" if paired.p < SIGNIFICANCE else "normal"
     axes.text(101, row, f"p {_p(paired.p)}  n {total}", va="center", fontsize=7.5, weight=weight)
 
@@ -94,15 +96,15 @@ PLACE = 7
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    for one in source.runs:
-        run = one.judged(source.table)
+    for drawn in source.runs:
+        run = drawn.judged(source.table)
         if run is not None and not capture_only(run.episodes):
             yield ReportFigure(
-                f"{one.stem}-paired-layouts", "The same question, pictures swapped", "behaviour",
+                f"{drawn.stem}-paired-layouts", "The same question, pictures swapped", "behaviour",
                 "Every question is asked twice, with the two images swapped. Knowing the answer means right "
                 "both times; always choosing one side means right once. Bold p: more items are right twice than "
                 "wrong twice, beyond luck.",
-                one.position, partial(_drawn, run), is_detail=True,
+                drawn.position, partial(_drawn, run), is_detail=True,
             )  # fmt: skip
 
 

@@ -40,10 +40,10 @@ def collect_figures(runs: Sequence[RunReader], table: RetentionTable) -> list[Re
 
 def _makers() -> list[Callable[[FigureSource], Iterator[ReportFigure]]]:
     """The functions `report_figures` of the modules of this folder, in the order of their `PLACE`."""
-    names = [found.name for found in iter_modules(import_module(__package__).__path__) if not found.ispkg]
+    names = [file.name for file in iter_modules(import_module(__package__).__path__) if not file.ispkg]
     modules = [import_module(f"{__package__}.{name}") for name in names]
     places = [(module.PLACE, module.report_figures) for module in modules if hasattr(module, "PLACE")]
-    return [make for _, make in sorted(places, key=lambda one: one[0])]
+    return [make for _, make in sorted(places, key=lambda placed: placed[0])]
 
 
 def save_figures(exhibits: Sequence[ReportFigure], folder: Path) -> Iterator[Path]:
@@ -58,7 +58,7 @@ def save_figures(exhibits: Sequence[ReportFigure], folder: Path) -> Iterator[Pat
 
 
 def caption_of(figure: "Figure") -> str:
-    """What the figure is about, in full; its footer holds the beginning."""
+    """Return the whole line under a figure; its footer holds the beginning."""
     return str(getattr(figure, "caption", ""))
 
 

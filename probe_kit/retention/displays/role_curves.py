@@ -57,27 +57,27 @@ class RoleCurvesDisplay(Display):
         views: Sequence[str] | None = None,
         iterations: Iterations = "best",
     ) -> Self:
-        """From stored probes; views: all probed ones of the stream by default. iterations: which take part.
+        """Read stored probes; views: all probed ones of the stream by default. iterations: which take part.
 
         Raises UnknownSiteError if none of them was probed there, UnknownCategoryError for a category.
         """
-        asked = tuple(views or results.settings.views)
+        candidates = tuple(views or results.settings.views)
         curve_of(results, category, results.settings.views[0])
-        found = {}
-        for view in asked:
+        curves = {}
+        for view in candidates:
             scores = scores_of(results, category, view)
             rows = scores[scores["stream"] == stream]
             if not rows.empty:
-                found[view] = StreamCurve.of(rows, "best" if iterations == "all" else iterations)
-        if not found:
-            raise UnknownSiteError(f"none of the views {', '.join(asked)} was probed in stream {stream!r}")
-        shown = next(iter(found))
+                curves[view] = StreamCurve.of(rows, "best" if iterations == "all" else iterations)
+        if not curves:
+            raise UnknownSiteError(f"none of the views {', '.join(candidates)} was probed in stream {stream!r}")
+        first = next(iter(curves))
         return cls(
             category=category,
             stream=stream,
             chance=CHANCE,
-            curves=found,
-            certificate=ProvenanceLine.of_results(results, shown),
+            curves=curves,
+            certificate=ProvenanceLine.of_results(results, first),
         )
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -133,15 +133,15 @@ PLACE = 11
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    for one in source.runs:
-        if one.results is None:
+    for drawn in source.runs:
+        if drawn.results is None:
             continue
-        for stream, rows in one.results.scores.groupby("stream", sort=False):
+        for stream, rows in drawn.results.scores.groupby("stream", sort=False):
             if rows["view"].nunique() > 1:
                 yield ReportFigure(
-                    f"{one.stem}-roles-{stream}", f"Whose tokens carry the answer: {stream}", "probes",
+                    f"{drawn.stem}-roles-{stream}", f"Whose tokens carry the answer: {stream}", "probes",
                     "The same probes on the mean of one kind of token at a time.",
-                    one.position,
-                    partial(role_curves, one.results, str(stream), iterations=source.table.iterations),
+                    drawn.position,
+                    partial(role_curves, drawn.results, str(stream), iterations=source.table.iterations),
                     is_detail=True,
                 )  # fmt: skip

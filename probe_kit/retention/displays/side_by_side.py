@@ -61,20 +61,20 @@ def curves_side_by_side(
     number. names: of the runs, in order. view: one that some of them were probed in. categories: that are shown,
     all by default. Raises UsageError if none was.
     """
-    known = [(at, one) for at, one in enumerate(results) if view in one.settings.views]
+    with_view = [(at, probes) for at, probes in enumerate(results) if view in probes.settings.views]
     panels_of = [
         (category, part)
-        for category in _categories([one for _, one in known])
+        for category in _categories([probes for _, probes in with_view])
         if categories is None or category in categories
         for part in PARTS
-        if any(_curve(one, category, view, part, iterations) is not None for _, one in known)
+        if any(_curve(probes, category, view, part, iterations) is not None for _, probes in with_view)
     ]
     if not panels_of:
         raise UsageError(f"no run has probes of a backbone or where the action is made in view {view!r}")
     figure, grid = panels(len(panels_of), width=3.6, height=2.3, columns=2, share=False)
     for (category, part), axes in zip(panels_of, grid, strict=True):
-        found = [(at, _curve(one, category, view, part, iterations)) for at, one in known]
-        curves = [(at, curve) for at, curve in found if curve is not None]
+        every = [(at, _curve(probes, category, view, part, iterations)) for at, probes in with_view]
+        curves = [(at, curve) for at, curve in every if curve is not None]
         _draw_panel(axes, curves, names)
         axes.set_title(f"{spell(category)}: {PARTS[part]}", fontsize=9, loc="left")
     handles: dict[str, Artist] = {}
@@ -83,12 +83,12 @@ def curves_side_by_side(
     order = {name: at for at, name in enumerate(["chance", *names])}
     legend_above(figure, [*(handles[n] for n in sorted(handles, key=order.__getitem__)), *significance_handles()])
     figure.supylabel("held-out accuracy (%)", fontsize=9)
-    caption(figure, *(ProvenanceLine.of_results(one, view) for _, one in known))
+    caption(figure, *(ProvenanceLine.of_results(probes, view) for _, probes in with_view))
     return figure
 
 
 def _categories(results: Sequence[ProbeResults]) -> list[str]:
-    return list(dict.fromkeys(name for one in results for name in one.settings.categories))
+    return list(dict.fromkeys(name for probes in results for name in probes.settings.categories))
 
 
 def _curve(
@@ -98,17 +98,17 @@ def _curve(
     scores = scores[scores["part"] == part]
     if scores.empty:
         return None
-    own = scores[scores["stream"] == scores["stream"].iloc[0]]
-    return StreamCurve.of(own, "best" if iterations == "all" else iterations)
+    of_stream = scores[scores["stream"] == scores["stream"].iloc[0]]
+    return StreamCurve.of(of_stream, "best" if iterations == "all" else iterations)
 
 
 def _draw_panel(axes: "Axes", curves: Sequence[tuple[int, StreamCurve]], names: Sequence[str]) -> None:
     """curves: with the position of their run, which decides the line's looks whatever else is shown."""
     axes.axhline(100 * CHANCE, color="0.45", lw=1, ls="--", label="chance")
     depths = {int(curve.layers.max()) for _, curve in curves}
-    for place, (at, curve) in enumerate(curves):
+    for rank, (at, curve) in enumerate(curves):
         line = _at_depths(curve.lines[0], curve) if len(depths) > 1 else curve.lines[0]
-        step = _SIDESTEP * (place - (len(curves) - 1) / 2) * (1 if len(depths) == 1 else 1 / max(depths))
+        step = _SIDESTEP * (rank - (len(curves) - 1) / 2) * (1 if len(depths) == 1 else 1 / max(depths))
         draw_line(axes, line, series(at), names[at], step, bars=False)
     plain(axes)
     accuracy_axis(axes)
@@ -130,29 +130,29 @@ def maps_side_by_side(results: Sequence[ProbeResults], names: Sequence[str], vie
 
     names: of the runs, in order. Raises UsageError if fewer than two runs have iterations in that view.
     """
-    shown = [(name, one) for name, one in zip(names, results, strict=True) if has_maps(one, view)]
-    if len(shown) < 2:
+    with_maps = [(name, probes) for name, probes in zip(names, results, strict=True) if has_maps(probes, view)]
+    if len(with_maps) < 2:
         raise UsageError(f"fewer than two runs have iterations in view {view!r}; `iteration_maps` draws one")
-    across = min(_IN_A_ROW, len(shown))
-    rows = ceil(len(shown) / across)
-    categories = _categories([one for _, one in shown])
+    across = min(_IN_A_ROW, len(with_maps))
+    rows = ceil(len(with_maps) / across)
+    categories = _categories([probes for _, probes in with_maps])
     figure, grid = panels(across * rows * len(categories), width=2.7, height=2.1, columns=across, share=False)
     displays = []
     for number, category in enumerate(categories):
-        own = grid[number * across * rows :][: across * rows]
-        for axes, place in zip(own, range(across * rows), strict=True):
-            if place >= len(shown) or category not in shown[place][1].settings.categories:
+        panels_of = grid[number * across * rows :][: across * rows]
+        for axes, at in zip(panels_of, range(across * rows), strict=True):
+            if at >= len(with_maps) or category not in with_maps[at][1].settings.categories:
                 axes.set_visible(False)
                 continue
-            name, one = shown[place]
-            display = IterationMapDisplay.from_results(one, category, view)
+            name, probes = with_maps[at]
+            display = IterationMapDisplay.from_results(probes, category, view)
             drawn = draw_map(axes, display)
             axes.set_title(fill(f"{spell(category)}: {name}", _TITLE_LETTERS), fontsize=8, loc="left")
             displays.append(display)
     figure.supylabel("iteration", fontsize=9)
     draw_scale(figure, grid, drawn, displays)
     draw_legend(figure)
-    caption(figure, *(ProvenanceLine.of_results(one, view) for _, one in shown))
+    caption(figure, *(ProvenanceLine.of_results(probes, view) for _, probes in with_maps))
     return figure
 
 
@@ -169,26 +169,26 @@ PLACE = 5
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
     probed = [(run.results, run.name) for run in source.runs if run.results is not None]
-    views = list(dict.fromkeys(view for one, _ in probed for view in one.settings.views))
+    views = list(dict.fromkeys(view for results, _ in probed for view in results.settings.views))
     for view in views:
-        own = [(one, name) for one, name in probed if view in one.settings.views]
-        if len(own) < 2:
+        named_results = [(results, name) for results, name in probed if view in results.settings.views]
+        if len(named_results) < 2:
             continue
-        known, called = [one for one, _ in own], [name for _, name in own]
+        of_view, called = [results for results, _ in named_results], [name for _, name in named_results]
         yield ReportFigure(
             f"curves-side-by-side{view_suffix(view, views)}", in_view("Layer curves side by side", view, views),
             "probes",
             "How often a linear probe names the side of the correct picture, layer by layer, a line per run "
             f"on one scale; of several iterations the best of every layer. {ONLY_FILLED}. "
             "The table says whether two runs differ.",
-            None, partial(curves_side_by_side, known, called, view, source.table.iterations),
+            None, partial(curves_side_by_side, of_view, called, view, source.table.iterations),
             is_detail=view != views[0],
         )  # fmt: skip
-        if sum(has_maps(one, view) for one in known) > 1:
+        if sum(has_maps(results, view) for results in of_view) > 1:
             yield ReportFigure(
                 f"maps-side-by-side{view_suffix(view, views)}",
                 in_view("Layer × iteration side by side", view, views), "probes",
                 "Where and when the answer can be read while the action is made, a column per run. Colours "
                 f"run from chance to 100 % in every map. {DOTS}.",
-                None, partial(maps_side_by_side, known, called, view), is_detail=True,
+                None, partial(maps_side_by_side, of_view, called, view), is_detail=True,
             )  # fmt: skip

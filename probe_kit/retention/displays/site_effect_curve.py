@@ -39,7 +39,7 @@ class Points:
 
 @dataclass
 class SiteEffectDisplay(Panelled):
-    """By backbone layer: held-out accuracy of probes, and how many episodes turn when its tokens are exchanged.
+    """Curves by backbone layer: held-out accuracy of probes, and the episodes that turn when tokens are exchanged.
 
     readable: accuracy in percent. passes: by role, share of episodes in percent whose action turns to the side of
     the swapped images, minus those that turn from it. read: the same for the keys and values that the acting
@@ -57,7 +57,7 @@ class SiteEffectDisplay(Panelled):
 
     @classmethod
     def from_run(cls, run: RunReader, results: ProbeResults, category: str, view: str = "mean") -> Self:
-        """From the stored interchange and probes of a run.
+        """Read the stored interchange and probes of a run.
 
         Raises NoInterventionsError if none is stored of the category, UnknownCategoryError, UnknownSiteError.
         """
@@ -86,7 +86,7 @@ class SiteEffectDisplay(Panelled):
                 scores["layer"].to_numpy(int), 100 * scores["accuracy"].to_numpy(float),
                 (scores["p_fwe"] < SIGNIFICANCE).to_numpy(bool),
             ),
-            passes={role: _points(own) for role, own in by_role.items()},
+            passes={role: _points(of_role) for role, of_role in by_role.items()},
             read=_points(read) if read else None,
             certificate=ProvenanceLine.of_results(results, view),
         )  # fmt: skip
@@ -101,7 +101,7 @@ class SiteEffectDisplay(Panelled):
         axes.axhline(100 * self.chance, color="0.45", lw=1, ls=(0, (1, 1)), label="chance of probes")
         lines = {
             "readable (probe)": self.readable,
-            **{f"passes: {role}": own for role, own in self.passes.items()},
+            **{f"passes: {role}": passing for role, passing in self.passes.items()},
         }
         if self.read is not None:
             lines["read (keys and values)"] = self.read
@@ -113,11 +113,11 @@ class SiteEffectDisplay(Panelled):
 
 
 def shown_passing(run: RunReader) -> dict[str, list[PatchEffect]]:
-    """By category, what a figure by layers shows of the maps: the backbone at every role, `kv` as a whole.
+    """Return by category what a figure by layers shows: the backbone at every role, `kv` as a whole.
 
     Categories of which nothing of the two is stored are not there. Raises RunDamagedError.
     """
-    found = {
+    by_category = {
         category: [
             row
             for row in rows
@@ -126,14 +126,14 @@ def shown_passing(run: RunReader) -> dict[str, list[PatchEffect]]:
         ]
         for category, rows in stored_site_effects(run).items()
     }
-    return {category: rows for category, rows in found.items() if rows}
+    return {category: rows for category, rows in by_category.items() if rows}
 
 
 def site_effect_curve(run: RunReader, results: ProbeResults, view: str = "mean") -> "Figure":
     """A panel per category of which an interchange is stored. Raises NoInterventionsError if there is none."""
-    found = shown_passing(run)
-    names = [name for name in results.settings.categories if name in found] or ["any"]
-    return in_panels([SiteEffectDisplay._of(run, results, name, view, found.get(name, [])) for name in names])
+    passing = shown_passing(run)
+    names = [name for name in results.settings.categories if name in passing] or ["any"]
+    return in_panels([SiteEffectDisplay._of(run, results, name, view, passing.get(name, [])) for name in names])
 
 
 def _points(rows: Sequence[PatchEffect]) -> Points:
@@ -158,13 +158,13 @@ PLACE = 13
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    for one in source.runs:
-        if one.results is None or not set(shown_passing(one.run)) & set(one.results.settings.categories):
+    for drawn in source.runs:
+        if drawn.results is None or not set(shown_passing(drawn.run)) & set(drawn.results.settings.categories):
             continue
         yield ReportFigure(
-            f"{one.stem}-causes", "Readable and used", "interventions",
+            f"{drawn.stem}-causes", "Readable and used", "interventions",
             "Where a probe reads the answer, and how many episodes turn to the other side when the tokens of one "
             "layer are taken from the same inference with swapped images. A layer that is readable and "
             "turns nothing is read by nothing behind it.",
-            one.position, partial(site_effect_curve, one.run, one.results, one.results.settings.views[0]),
+            drawn.position, partial(site_effect_curve, drawn.run, drawn.results, drawn.results.settings.views[0]),
         )  # fmt: skip

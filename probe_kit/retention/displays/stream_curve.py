@@ -33,7 +33,7 @@ class LayerLine:
 
     @classmethod
     def of(cls, rows: "pd.DataFrame", iteration: int | None = None) -> Self:
-        """From rows of `ProbeResults.scores`, one per layer."""
+        """Read rows of `ProbeResults.scores`, one per layer."""
         rows = rows.sort_values("layer")
         accuracy, low, high = (rows[name].to_numpy(dtype=float) for name in ("accuracy", "ci_low", "ci_high"))
         significant = rows["signal"].to_numpy(dtype=bool)
@@ -69,7 +69,7 @@ class StreamCurve:
 
     @classmethod
     def of(cls, scores: "pd.DataFrame", iterations: Iterations = "best") -> Self:
-        """From the rows of one category, view and stream of `ProbeResults.scores`.
+        """Read the rows of one category, view and stream of `ProbeResults.scores`.
 
         Raises UsageError if the stream has no such iteration.
         """
@@ -101,7 +101,7 @@ class StreamCurve:
 
     @property
     def name(self) -> str:
-        """What people call the stream."""
+        """Return the name that people call the stream."""
         return label_of(self.stream)
 
     @property

@@ -39,20 +39,22 @@ def training_step_figure(table: Table, lines: Sequence[ProvenanceLine]) -> Repor
 
 def draw_training_steps(table: Table, lines: Sequence[ProvenanceLine]) -> "Figure":
     """Return a figure with a panel per number and a line per category; a number without a value has a gap."""
-    names = [name for name in dict.fromkeys(one["category"] for one in table.numbers) if name != MEAN]
-    chosen = [panel for panel in _PANELS if any(one[panel[0]] is not None for one in table.numbers)]
-    figure, grid = panels(len(chosen), width=3.6, height=2.5, columns=2, share=False)
-    steps = {one["step"] for one in table.numbers}
+    names = [name for name in dict.fromkeys(numbers["category"] for numbers in table.numbers) if name != MEAN]
+    with_numbers = [panel for panel in _PANELS if any(numbers[panel[0]] is not None for numbers in table.numbers)]
+    figure, grid = panels(len(with_numbers), width=3.6, height=2.5, columns=2, share=False)
+    steps = {numbers["step"] for numbers in table.numbers}
     # Categories stand side by side, so that their intervals do not hide each other.
     apart = _SIDESTEP * (max(steps) - min(steps))
     shifts = [apart * (at - (len(names) - 1) / 2) for at in range(len(names))]
-    for (key, label, factor, line), axes in zip(chosen, grid, strict=True):
+    for (key, label, factor, line), axes in zip(with_numbers, grid, strict=True):
         if axes is not grid[0]:
             axes.sharex(grid[0])
         if line is not None:
             axes.axhline(line, color="0.45", lw=0.8, ls="--", zorder=0)
         for at, (name, shift) in enumerate(zip(names, shifts, strict=True)):
-            _draw_line(axes, [one for one in table.numbers if one["category"] == name], key, factor, at, shift)
+            _draw_line(
+                axes, [numbers for numbers in table.numbers if numbers["category"] == name], key, factor, at, shift
+            )
         plain(axes)
         axes.set_xlabel("training step", fontsize=8.5)
         axes.set_ylabel(label, fontsize=8.5)

@@ -1,4 +1,4 @@
-"""What can be read at each captured inference of an episode, counted from its beginning or from an event."""
+"""Accuracies of probes at each captured inference of an episode, counted from its beginning or from an event."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -87,7 +87,7 @@ class CallCurves:
     def of(
         cls, results: Mapping[int, ProbeResults], category: str, view: str, events: EventCalls | None = None
     ) -> Self:
-        """From probes by call, as `load_results_by_call` gives them. events: as `event_calls` gives them.
+        """Read probes by call, as `load_results_by_call` gives them. events: as `event_calls` gives them.
 
         Raises UsageError for probes of a single call, or without that category and view.
         """
@@ -96,13 +96,13 @@ class CallCurves:
                 f"probes of call {', '.join(map(str, results))} make no curve over calls; extract with "
                 "--captured-calls N and fit them with `probe-kit train --call all`"
             )
-        if lacking := [call for call, one in results.items() if (category, view) not in one.curves]:
+        if lacking := [call for call, probes in results.items() if (category, view) not in probes.curves]:
             raise UsageError(f"call {lacking[0]} has no probes of category {category!r} in view {view!r}")
         return cls(results, category, view, events or {})
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """Those that were probed at every call, in order."""
+        """Return the streams that were probed at every call, in order."""
         curves = list(self._curves.values())
         first = dict.fromkeys(site.stream for site in curves[0].sites)
         return tuple(name for name in first if all(curve.stream(name).size for curve in curves))
@@ -123,28 +123,28 @@ class CallCurves:
                 due = self.events.get(event, {}).get(str(episode))
                 if due is not None:
                     pools.setdefault(call - due, []).append(bool(hit))
-        kept = {offset: pools[offset] for offset in sorted(pools) if len(pools[offset]) >= FEWEST}
-        if not kept:
+        large = {offset: pools[offset] for offset in sorted(pools) if len(pools[offset]) >= FEWEST}
+        if not large:
             return None
-        accuracy = np.array([np.mean(pool) for pool in kept.values()])
-        sizes = np.array([len(pool) for pool in kept.values()], np.int64)
-        offsets = np.array(list(kept), np.int64)
+        accuracy = np.array([np.mean(pool) for pool in large.values()])
+        sizes = np.array([len(pool) for pool in large.values()], np.int64)
+        offsets = np.array(list(large), np.int64)
         return AlignedLine(stream, self._part(stream), offsets, accuracy, sizes)
 
     def event_times(self) -> list[EventTimes]:
-        """When the events of this category's episodes fell due; those that no episode has are left out."""
-        own = self._curves[min(self._curves)].episodes
-        found = []
+        """Return when the events of this category's episodes fell due; those that no episode has are left out."""
+        episodes = self._curves[min(self._curves)].episodes
+        times = []
         for event, calls in self.events.items():
-            due = [calls[str(episode)] for episode in own if str(episode) in calls]
+            due = [calls[str(episode)] for episode in episodes if str(episode) in calls]
             if due:
                 low, median, high = np.percentile(due, [25, 50, 75])
-                found.append(EventTimes(event, float(median), float(low), float(high), len(due) / len(own)))
-        return found
+                times.append(EventTimes(event, float(median), float(low), float(high), len(due) / len(episodes)))
+        return times
 
     @property
     def _curves(self) -> dict[int, ProbeCurve]:
-        return {call: one.curves[self.category, self.view] for call, one in self.results.items()}
+        return {call: probes.curves[self.category, self.view] for call, probes in self.results.items()}
 
     def _part(self, stream: str) -> str:
         curve = next(iter(self._curves.values()))
@@ -153,12 +153,12 @@ class CallCurves:
     def _accuracy(self, curve: ProbeCurve, stream: str) -> tuple[float, float, float]:
         seed_text = next(iter(self.results.values())).settings.seed_text
         try:
-            found = score_streams(curve, {stream: curve.stream(stream)}, seed_text)
+            scores = score_streams(curve, {stream: curve.stream(stream)}, seed_text)
         except TooFewGroupsError:
             return float(curve.sums.only(curve.stream(stream)).accuracies.max()), np.nan, np.nan
-        assert found is not None, "one stream was given"
-        interval = found.interval(stream)
-        return found.accuracy(stream), interval.low, interval.high
+        assert scores is not None, "one stream was given"
+        interval = scores.interval(stream)
+        return scores.accuracy(stream), interval.low, interval.high
 
     def _point(self, call: int, curve: ProbeCurve, stream: str) -> tuple[float, float, float, bool, float, int]:
         peak = best_site(curve, stream)
@@ -183,11 +183,11 @@ def event_calls(run: Any) -> EventCalls:
     if not getattr(run, "has_trajectories", False):
         return {}
     executed = int(run.settings["execute"])
-    found: dict[str, dict[str, int]] = {event: {} for event in EVENTS}
+    by_event: dict[str, dict[str, int]] = {event: {} for event in EVENTS}
     for episode, trajectory in zip(run.episodes["episode_id"], run.trajectories, strict=True):
         events = Events.of(trajectory)
         for event in EVENTS:
             frame = events.frame(event)
             if frame is not None and frame > 0:
-                found[event][str(episode)] = (frame - 1) // executed
-    return found
+                by_event[event][str(episode)] = (frame - 1) // executed
+    return by_event

@@ -96,10 +96,10 @@ def stream_peaks(curve: ProbeCurve, iterations: Iterations = "all") -> dict[str,
 
     Raises UsageError if the action's stream has no such iteration.
     """
-    found = {BACKBONE: best_site(curve, BACKBONE)}
+    peaks = {BACKBONE: best_site(curve, BACKBONE)}
     if curve.action_stream is not None:
-        found[ACTION] = best_site(curve, curve.action_stream, iterations)
-    return {name: peak for name, peak in found.items() if peak is not None}
+        peaks[ACTION] = best_site(curve, curve.action_stream, iterations)
+    return {name: peak for name, peak in peaks.items() if peak is not None}
 
 
 def curve_scores(curve: ProbeCurve, iterations: Iterations = "all", seed_text: str = "") -> StreamScores | None:
@@ -109,7 +109,9 @@ def curve_scores(curve: ProbeCurve, iterations: Iterations = "all", seed_text: s
     """
     rows = {ACTION: _action_rows(curve, iterations), BACKBONE: curve.stream(BACKBONE)}
     try:
-        return score_streams(curve, {name: found for name, found in rows.items() if found.size}, seed_text)
+        return score_streams(
+            curve, {name: of_stream for name, of_stream in rows.items() if of_stream.size}, seed_text
+        )
     except (TooFewGroupsError, UnbalancedEpisodesError):
         return None
 
@@ -129,8 +131,8 @@ def measure_retention(
     backbone = peaks[BACKBONE]
     exceeds = exceeds or Controls().exceeds("", "", str(backbone.site), backbone.p_fwe)
     streams = curve_scores(curve, iterations, seed_text)
-    found = estimate_retention(peaks, streams, exceeds)
-    return Retention(backbone=backbone, action=peaks[ACTION], streams=streams, **vars(found))
+    estimate = estimate_retention(peaks, streams, exceeds)
+    return Retention(backbone=backbone, action=peaks[ACTION], streams=streams, **vars(estimate))
 
 
 def estimate_retention(
@@ -143,10 +145,10 @@ def estimate_retention(
     if streams is None:
         published = _published(peaks[ACTION].accuracy, peaks[BACKBONE].accuracy)
         return RetentionEstimate(value=nan, interval=NO_LIMITS, published=published, defined=False, note=NO_SCORES)
-    found: Ratio = retention(streams.scores)
+    ratio: Ratio = retention(streams.scores)
     return RetentionEstimate(
-        value=found.value,
-        interval=found.interval,
+        value=ratio.value,
+        interval=ratio.interval,
         published=_published(streams.peak(ACTION), streams.peak(BACKBONE)),
         defined=has_signal(exceeds),
         note=_missing_signal(exceeds, streams, absent_below),

@@ -68,7 +68,7 @@ def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], seed_
     """
     if not rows:
         return None
-    streams = {name: curve.fit_stream(found) for name, found in rows.items()}
+    streams = {name: curve.fit_stream(of_stream) for name, of_stream in rows.items()}
     fit = crossfit(list(streams.values()), curve.group_names, seed_text)
     return StreamScores(
         tuple(rows),
@@ -104,8 +104,8 @@ class Rate:
     def pooled(cls, shares: Sequence[Share]) -> "Rate":
         """The mean of several runs' shares; of runs on the same groups their common group means count."""
         first = shares[0]
-        if all(np.array_equal(first.groups, one.groups) for one in shares):
-            sums, sizes = ([getattr(one, name) for one in shares] for name in ("sums", "sizes"))
+        if all(np.array_equal(first.groups, of_run.groups) for of_run in shares):
+            sums, sizes = ([getattr(of_run, name) for of_run in shares] for name in ("sums", "sizes"))
             both = Share(first.groups, np.mean(sums, axis=0), np.mean(sizes, axis=0))
             return cls(both.value, both.interval(), both)
         return cls.mean([cls(share.value, share.interval()) for share in shares])
@@ -184,12 +184,12 @@ class PooledScores:
 
     def accuracy_difference(self, other: "PooledScores", name: str) -> Rate:
         """Accuracy of a stream here minus there."""
-        here, there = self.accuracy(name), other.accuracy(name)
+        mine, theirs = self.accuracy(name), other.accuracy(name)
         row, column = self.names.index(name), other.names.index(name)
         variances = float(self.scores.covariance[row, row]), float(other.scores.covariance[column, column])
         related = correlation_of(float(self.covariance_with(other)[row, column]), variances)
-        gap = difference_interval(here.value, here.interval, there.value, there.interval, related)
-        return Rate(here.value - there.value, gap)
+        gap = difference_interval(mine.value, mine.interval, theirs.value, theirs.interval, related)
+        return Rate(mine.value - theirs.value, gap)
 
 
 def _rates(fit: CrossFit) -> tuple[Rate, ...]:

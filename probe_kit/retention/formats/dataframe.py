@@ -29,8 +29,8 @@ def part_frame(rows: Sequence[RetentionRow], part: str, by_view: bool = True) ->
 
     part: its name in `RetentionRow`. by_view: whether it depends on the view; else every category stands once.
     """
-    chosen = [row for row in rows if row.view is not None] if by_view else once_per_category(rows)
-    return _frame([_key(row, by_view) | _flat(getattr(_defined(row), part)) for row in chosen])
+    of_views = [row for row in rows if row.view is not None] if by_view else once_per_category(rows)
+    return _frame([_key(row, by_view) | _flat(getattr(_defined(row), part)) for row in of_views])
 
 
 def peak_frame(rows: Sequence[RetentionRow]) -> "pd.DataFrame":
@@ -79,12 +79,12 @@ def _flat(part: Any, before: str = "") -> _Flat:
     """The fields of a dataclass by their path; those of its own parts and names behind a dot."""
     hints = get_type_hints(type(part))
     flat: _Flat = {}
-    for one in fields(part):
-        name, value, hint = f"{before}{one.name}", getattr(part, one.name), hints[one.name]
+    for declared in fields(part):
+        name, value, hint = f"{before}{declared.name}", getattr(part, declared.name), hints[declared.name]
         inner = next((kind for kind in (hint, *get_args(hint)) if is_dataclass(kind)), None)
         if inner is not None:
             flat |= _flat(value, f"{name}.") if value is not None else _empty(inner, f"{name}.")
-        elif _is_interval(one.name):
+        elif _is_interval(declared.name):
             flat |= _limits(name, value)
         elif isinstance(value, dict):
             flat |= {f"{name}.{key}": _named(number) for key, number in value.items()}
@@ -97,9 +97,11 @@ def _flat(part: Any, before: str = "") -> _Flat:
 
 def _empty(kind: Any, before: str) -> _Flat:
     hints, flat = get_type_hints(kind), _Flat()
-    for one in fields(kind):
-        name = f"{before}{one.name}"
-        flat |= _limits(name, None) if _is_interval(one.name) else {name: (_dtype(hints[one.name]), None)}
+    for declared in fields(kind):
+        name = f"{before}{declared.name}"
+        flat |= (
+            _limits(name, None) if _is_interval(declared.name) else {name: (_dtype(hints[declared.name]), None)}
+        )
     return flat
 
 

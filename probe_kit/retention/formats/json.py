@@ -18,8 +18,8 @@ def table_json(
     vlm_vla: Sequence[Difference],
 ) -> str:
     """See `RetentionTable.to_json`."""
-    between_runs = [one for one in differences if one.run is not None]
-    between_groups = [one for one in differences if one.run is None]
+    between_runs = [difference for difference in differences if difference.run is not None]
+    between_groups = [difference for difference in differences if difference.run is None]
     several = len({row.run.location for row in rows}) > 1 and not any(row.group for row in rows)
     lines = [asdict(row) | _in_words(row) | (_own(row, between_runs) if several else {}) for row in rows]
     records = {
@@ -27,8 +27,8 @@ def table_json(
         "wordings": list(map(_of_wordings, wordings)),
         "vlm_vla": list(map(_of_vlm_and_policy, vlm_vla)),
     }
-    shown = {name: found for name, found in records.items() if found}
-    content = {"rows": lines, **shown} if shown else lines
+    filled = {name: lines_of for name, lines_of in records.items() if lines_of}
+    content = {"rows": lines, **filled} if filled else lines
     return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
 
 
@@ -40,13 +40,14 @@ def _in_words(row: RetentionRow) -> dict[str, Any]:
 
 
 def _own(row: RetentionRow, differences: Sequence[Difference]) -> dict[str, Any]:
-    """What a row of one of several runs says of the others; a difference of behaviour stands in every view."""
-    found = [
-        asdict(one)
-        for one in differences
-        if (one.run, one.category) == (row.run.location, row.category) and one.view in (row.view, None)
+    """Return the differences of a row's run from the others; a difference of behaviour stands in every view."""
+    differences_of = [
+        asdict(difference)
+        for difference in differences
+        if (difference.run, difference.category) == (row.run.location, row.category)
+        and difference.view in (row.view, None)
     ]
-    return {"differences": found}
+    return {"differences": differences_of}
 
 
 def _of_wordings(row: Difference) -> dict[str, Any]:

@@ -44,7 +44,7 @@ class LabelPeak:
 
     @property
     def missed(self) -> tuple[str, ...]:
-        """What the site is not shown to exceed: chance and controls, by name."""
+        """The names of chance and controls that the site is not shown to exceed."""
         below = ("chance",) * (not self.p_fwe < SIGNIFICANCE)
         return (*below, *(name for name, exceeded in self.exceeds.items() if not exceeded))
 
@@ -102,25 +102,25 @@ def measure_label_retention(
     was not probed, NoProbesError for a run without backbone or action, and UsageError for an iteration that the
     action does not have.
     """
-    own = results.settings
-    view, category = view or own.views[0], category or own.categories[0]
+    settings = results.settings
+    view, category = view or settings.views[0], category or settings.categories[0]
     if (category, view) not in results.curves:
-        raise UnknownSiteError(f"view {view!r} was not probed; probed: {', '.join(own.views)}")
+        raise UnknownSiteError(f"view {view!r} was not probed; probed: {', '.join(settings.views)}")
     curve = results.curves[category, view]
     rows = {ACTION: _rows(curve, ACTION, iterations), BACKBONE: _rows(curve, BACKBONE, "all")}
     above = [curve.fit_stream(of_part) for of_part in rows.values()]
-    scores = Scores.of(crossfit(above, list(curve.group_names), own.seed_text, chance=0.0))
+    scores = Scores.of(crossfit(above, list(curve.group_names), settings.seed_text, chance=0.0))
     action, backbone = (
-        _peak(results, (category, view), of_part, scores, place) for place, of_part in enumerate(rows.values())
+        _peak(results, (category, view), of_part, scores, number) for number, of_part in enumerate(rows.values())
     )
     ratio: Ratio = retention(scores)
     note, reason = _refusal(results, category, backbone)
     return LabelRetention(
         view=view,
         category=category,
-        target=own.target,
-        task=own.task,
-        metric=METRICS[own.task],
+        target=settings.target,
+        task=settings.task,
+        metric=METRICS[settings.task],
         backbone=backbone,
         action=action,
         value=ratio.value,
@@ -133,15 +133,15 @@ def measure_label_retention(
 
 
 def with_corrected_p(
-    found: LabelRetention, results: ProbeResults, backbone: float | None, action: float | None
+    estimate: LabelRetention, results: ProbeResults, backbone: float | None, action: float | None
 ) -> LabelRetention:
     """The same with p of both streams corrected for further tests; None for no p. results: what it is made of."""
     peaks = [
-        one if p is None else replace(one, p_fwe=p)
-        for one, p in ((found.backbone, backbone), (found.action, action))
+        peak if p is None else replace(peak, p_fwe=p)
+        for peak, p in ((estimate.backbone, backbone), (estimate.action, action))
     ]
-    note, reason = _refusal(results, found.category, peaks[0])
-    return replace(found, backbone=peaks[0], action=peaks[1], note=note, reason=reason)
+    note, reason = _refusal(results, estimate.category, peaks[0])
+    return replace(estimate, backbone=peaks[0], action=peaks[1], note=note, reason=reason)
 
 
 def _rows(curve: ProbeCurve, part: str, iterations: Iterations) -> NDArray[np.intp]:
@@ -157,12 +157,12 @@ def _rows(curve: ProbeCurve, part: str, iterations: Iterations) -> NDArray[np.in
 
 
 def _peak(
-    results: ProbeResults, curve_of: tuple[str, str], rows: NDArray[np.intp], scores: Scores, place: int
+    results: ProbeResults, curve_of: tuple[str, str], rows: NDArray[np.intp], scores: Scores, number: int
 ) -> LabelPeak:
     curve = results.curves[curve_of]
     best = curve.largest_excess(rows)
-    above = float(scores.above[place])
-    spread = t_quantile(scores.df) * sqrt(scores.covariance[place, place])
+    above = float(scores.above[number])
+    spread = t_quantile(scores.df) * sqrt(scores.covariance[number, number])
     site = curve.sites[best]
     return LabelPeak(
         stream=site.stream,
@@ -178,50 +178,50 @@ def _peak(
 
 def _refusal(results: ProbeResults, category: str, backbone: LabelPeak) -> tuple[str, str]:
     """Why there is nothing to retain, in few words and in full; two empty texts where there is."""
-    own, score = results.settings, METRICS[results.settings.task]
-    found = f"the backbone's best site {backbone.site} has {score} {backbone.score:.2f}"
+    settings, score = results.settings, METRICS[results.settings.task]
+    best = f"the backbone's best site {backbone.site} has {score} {backbone.score:.2f}"
     if backbone.p_fwe != backbone.p_fwe:
         return "n/a (no permutations)", (
-            f"{found}, and no permuted labels say what chance is. Train with --permutations 200, on groups that "
+            f"{best}, and no permuted labels say what chance is. Train with --permutations 200, on groups that "
             "can exchange labels"
         )
-    if own.window > 1 and STEP not in results.controls.names:
+    if settings.window > 1 and STEP not in results.controls.names:
         return "n/a (control step was not run)", (
-            f"{found}, and labels change within episodes, so their step may say as much. Train with the control "
+            f"{best}, and labels change within episodes, so their step may say as much. Train with the control "
             f"step: `--controls {','.join([STEP, *results.controls.names])}`"
         )
     if missed := backbone.missed:
         scores = {
-            one.name: one.score
-            for one in results.controls.scores
-            if one.category == category and one.stream in ("", backbone.stream)
+            control.name: control.score
+            for control in results.controls.scores
+            if control.category == category and control.stream in ("", backbone.stream)
         }
         facts = [f"chance {backbone.chance:.2f}, p {backbone.p_fwe:.3f}"]
         facts += [f"{name} {scores[name]:.2f}" for name in missed if name in scores]
         return f"n/a (backbone not shown to exceed {_listed(missed)})", (
-            f"{found} ({'; '.join(facts)}). Expected p < {SIGNIFICANCE} and more than every control that was run. "
+            f"{best} ({'; '.join(facts)}). Expected p < {SIGNIFICANCE} and more than every control that was run. "
             "Label more groups, or choose a label that these controls do not decode"
         )
-    if own.task == "continuous" and backbone.above < LEAST_EXCESS:
+    if settings.task == "continuous" and backbone.above < LEAST_EXCESS:
         return f"n/a (backbone {backbone.above:.2f} above chance)", (
-            f"{found}, {backbone.above:.2f} above chance where a site is chosen on other groups; expected "
+            f"{best}, {backbone.above:.2f} above chance where a site is chosen on other groups; expected "
             f"{LEAST_EXCESS} or more to divide by. Label more groups"
         )
     return "", ""
 
 
 def _listed(names: tuple[str, ...]) -> str:
-    *others, last = names
-    return f"{', '.join(others)} and {last}" if others else last
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def check_same_label(results: Sequence[ProbeResults], places: Sequence[str]) -> None:
     """Raise UsageError where results at two places are of labels that differ in any value or sample."""
     first = results[0]
-    for one, place in zip(results, places, strict=True):
-        if one.settings.label != first.settings.label:
+    for probes, location in zip(results, places, strict=True):
+        if probes.settings.label != first.settings.label:
             raise UsageError(
-                f"the labels {one.settings.target!r} of {place} and {places[0]} differ "
-                f"(sha256 {one.settings.label[:12]} and {first.settings.label[:12]}); retention is compared on "
+                f"the labels {probes.settings.target!r} of {location} and {places[0]} differ "
+                f"(sha256 {probes.settings.label[:12]} and {first.settings.label[:12]}); retention is compared on "
                 "the same labels of the same episodes. Show the runs one by one"
             )

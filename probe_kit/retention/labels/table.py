@@ -87,7 +87,7 @@ class LabelRetentionTable:
     def of_target(self, target: str) -> "LabelRetentionTable":
         """The rows of one label; p stays as it is."""
         rows = tuple(row for row in self.rows if row.retention.target == target)
-        results = {name: one for name, one in self.results.items() if name[1] == target}
+        results = {name: probes for name, probes in self.results.items() if name[1] == target}
         return replace(self, rows=rows, results=results, tried={})
 
     @property
@@ -103,38 +103,43 @@ class LabelRetentionTable:
         )
         rows = []
         for row in self.rows:
-            own = row.retention
-            name = [own.target, own.metric] * several + [own.category] * self.has_categories + [row.run, own.view]
-            rows.append((*name, *_peak(own.backbone), *_peak(own.action), _value(own)))
+            estimate = row.retention
+            name = (
+                [estimate.target, estimate.metric] * several
+                + [estimate.category] * self.has_categories
+                + [row.run, estimate.view]
+            )
+            rows.append((*name, *_peak(estimate.backbone), *_peak(estimate.action), _value(estimate)))
         what = "Labels" if several else f"{first.target}: {first.metric}"
         return Table.of(f"{what}, and what reaches the action", headings, rows, names=len(names), notes=[_NOTE])
 
     @property
     def summary(self) -> Table:
         """The table without sites and chance; runs and views where there are several."""
-        named = {
+        by_column = {
             "label": [row.retention.target for row in self.rows],
             "category": [row.retention.category for row in self.rows],
             "run": [row.run for row in self.rows],
             "view": [row.retention.view for row in self.rows],
         }
-        shown = [name for name, cells in named.items() if name == "label" or len(set(cells)) > 1]
+        columns = [name for name, cells in by_column.items() if name == "label" or len(set(cells)) > 1]
         return Table.of(
             "Labels, and what reaches the action",
-            (*shown, "metric", "backbone above chance", "action above chance", "retention"),
+            (*columns, "metric", "backbone above chance", "action above chance", "retention"),
             [
-                (*(named[name][place] for name in shown), row.retention.metric, _above(row.retention.backbone),
-                 _above(row.retention.action), _value(row.retention).partition(" (")[0])
-                for place, row in enumerate(self.rows)
+                (*(by_column[name][position] for name in columns), row.retention.metric,
+                 _above(row.retention.backbone), _above(row.retention.action),
+                 _value(row.retention).partition(" (")[0])
+                for position, row in enumerate(self.rows)
             ],
-            names=len(shown),
+            names=len(columns),
             notes=[_NOTE],
         )  # fmt: skip
 
     @property
     def sentences(self) -> list[str]:
         """One per row: what reaches the action, or why that has no number. Then how many labels were tried."""
-        several = len({place for place, _ in self.results}) > 1
+        several = len({location for location, _ in self.results}) > 1
         return [*(_sentence(row, several) for row in self.rows), *self._uncontrolled(), *self._tried()]
 
     def _uncontrolled(self) -> list[str]:
@@ -145,18 +150,18 @@ class LabelRetentionTable:
         return [f"No control was run for {names}: a signal there is judged against chance only."]
 
     def _tried(self) -> list[str]:
-        """What the p-values are corrected for, wherever a run has probes of several labels."""
+        """Return what the p-values are corrected for, wherever a run has probes of several labels."""
         names = {row.location: row.run for row in self.rows}
-        found = []
-        for place, targets in self.tried.items():
+        sentences = []
+        for location, targets in self.tried.items():
             if (count := sum(targets.values())) > 1:
-                named = [f"{name} in {of} versions" if of > 1 else name for name, of in targets.items()]
-                shown = ", ".join([*named[:_NAMED], *["…"] * (len(named) > _NAMED)])
+                targets_in_words = [f"{name} in {of} versions" if of > 1 else name for name, of in targets.items()]
+                listed = ", ".join([*targets_in_words[:_NAMED], *["…"] * (len(targets_in_words) > _NAMED)])
                 corrected = "of each label alone" if self.family == "label" else (
                     f"corrected for the {len(self.targets)} labels of this table (Holm)"
                 )  # fmt: skip
-                found.append(f"{names[place]} has probes of {count} labels ({shown}); p is {corrected}.")
-        return found
+                sentences.append(f"{names[location]} has probes of {count} labels ({listed}); p is {corrected}.")
+        return sentences
 
     def to_frame(self) -> "pd.DataFrame":
         """One line per row with the fields of `LabelRetention`, of its streams as `backbone.score` and so on.
@@ -197,8 +202,10 @@ class LabelRetentionTable:
     def _repr_html_(self) -> str:
         from markupsafe import Markup
 
-        said = Markup("").join(Markup("<li>{}</li>").format(without_places(one)) for one in self.sentences)
-        return f"{self.text._repr_html_()}<ul>{said}</ul>"
+        entries = Markup("").join(
+            Markup("<li>{}</li>").format(without_places(sentence)) for sentence in self.sentences
+        )
+        return f"{self.text._repr_html_()}<ul>{entries}</ul>"
 
 
 def label_retention_table(
@@ -217,37 +224,39 @@ def label_retention_table(
     and stream. Raises NoProbesError for a run without probes of a label, UsageError for several runs whose
     labels differ, a target given twice, and keys of another target, and what `measure_label_retention` raises.
     """
-    named = [targets] if isinstance(targets, str) else list(targets)
-    if not runs or not named:
+    columns = [targets] if isinstance(targets, str) else list(targets)
+    if not runs or not columns:
         raise UsageError("retention of a label needs at least one run and one target")
-    if sides := [name for name in named if name in SIDES]:
+    if sides := [name for name in columns if name in SIDES]:
         raise UsageError(
             f"the target {sides[0]!r} is the name of a side. Leave --target out for the retention of sides"
         )
-    if doubles := [name for at, name in enumerate(named) if name in named[:at]]:
+    if doubles := [name for at, name in enumerate(columns) if name in columns[:at]]:
         raise UsageError(f"the target {doubles[0]!r} is given twice; leave one out")
-    chosen = list(keys or [None] * len(runs))
-    if len(chosen) != len(runs):
-        raise UsageError(f"{len(chosen)} keys for {len(runs)} runs; give one per run, or None for the newest")
-    if len(named) > 1 and any(chosen):
+    key_of_run = list(keys or [None] * len(runs))
+    if len(key_of_run) != len(runs):
+        raise UsageError(f"{len(key_of_run)} keys for {len(runs)} runs; give one per run, or None for the newest")
+    if len(columns) > 1 and any(key_of_run):
         raise UsageError(
-            f"stored probes are chosen by key for {len(named)} targets ({', '.join(named)}); a key is of one. "
+            f"stored probes are chosen by key for {len(columns)} targets ({', '.join(columns)}); a key is of one. "
             "Show one target at a time, or leave the keys out"
         )
     places = [str(run.location) for run in runs]
     results: dict[tuple[str, str], ProbeResults] = {}
-    for target in named:
-        own = [load_results(run, key, target) for run, key in zip(runs, chosen, strict=True)]
-        check_same_label(own, places)
-        results |= {(place, target): one for place, one in zip(places, own, strict=True)}
+    for target in columns:
+        of_target = [load_results(run, key, target) for run, key in zip(runs, key_of_run, strict=True)]
+        check_same_label(of_target, places)
+        results |= {(location, target): probes for location, probes in zip(places, of_target, strict=True)}
     names = dict(zip(places, full_names(runs), strict=True))
     rows = [
-        LabelRow(names[place], place, one.key, measure_label_retention(one, view, iterations, category))
-        for (place, _), one in results.items()
-        for category in one.settings.categories
-        for view in views or one.settings.views
+        LabelRow(
+            names[location], location, probes.key, measure_label_retention(probes, view, iterations, category)
+        )
+        for (location, _), probes in results.items()
+        for category in probes.settings.categories
+        for view in views or probes.settings.views
     ]
-    tried = {place: stored_targets(run) for place, run in zip(places, runs, strict=True)}
+    tried = {location: stored_targets(run) for location, run in zip(places, runs, strict=True)}
     corrected = rows if family == "label" else _corrected(rows, results)
     return LabelRetentionTable(tuple(corrected), results, iterations, tried, family)
 
@@ -255,19 +264,24 @@ def label_retention_table(
 def _corrected(rows: Sequence[LabelRow], results: Mapping[tuple[str, str], ProbeResults]) -> list[LabelRow]:
     """The rows with p of both streams corrected for the targets, within each run and view."""
     families: dict[tuple[str, str, str], list[int]] = {}
-    for place, row in enumerate(rows):
-        families.setdefault((row.location, row.retention.category, row.retention.view), []).append(place)
-    found = list(rows)
+    for position, row in enumerate(rows):
+        families.setdefault((row.location, row.retention.category, row.retention.view), []).append(position)
+    corrected = list(rows)
     for members in families.values():
-        own = [rows[place].retention for place in members]
+        estimates = [rows[position].retention for position in members]
         p = [
             holm([None if peak.p_fwe != peak.p_fwe else peak.p_fwe for peak in peaks])
-            for peaks in ([one.backbone for one in own], [one.action for one in own])
+            for peaks in (
+                [estimate.backbone for estimate in estimates],
+                [estimate.action for estimate in estimates],
+            )
         ]
-        for place, one, backbone, action in zip(members, own, *p, strict=True):
-            probes = results[rows[place].location, one.target]
-            found[place] = replace(rows[place], retention=with_corrected_p(one, probes, backbone, action))
-    return found
+        for position, estimate, backbone, action in zip(members, estimates, *p, strict=True):
+            probes = results[rows[position].location, estimate.target]
+            corrected[position] = replace(
+                rows[position], retention=with_corrected_p(estimate, probes, backbone, action)
+            )
+    return corrected
 
 
 def _peak(peak: LabelPeak) -> tuple[str, str, str, str]:
@@ -283,32 +297,37 @@ def _above(peak: LabelPeak) -> str:
     return with_limits(peak.above, peak.ci, number) + _SIGNAL * peak.is_marked
 
 
-def _value(found: LabelRetention) -> str:
-    return with_limits(found.value, found.ci, number) if found.defined else found.note
+def _value(estimate: LabelRetention) -> str:
+    return with_limits(estimate.value, estimate.ci, number) if estimate.defined else estimate.note
 
 
 def _sentence(row: LabelRow, several: bool) -> str:
-    found = row.retention
-    where = f"{found.target}, view {found.view}" + (f", {row.run}" if several else "")
-    where += "" if found.category == "all" else f", category {found.category}"
-    if not found.defined:
-        return f"{where}: retention is not defined: {found.reason}."
-    action = label_of(found.action.stream)
-    limits = with_limits(found.value, found.ci, number)
-    missed = found.action.missed
+    estimate = row.retention
+    where = f"{estimate.target}, view {estimate.view}" + (f", {row.run}" if several else "")
+    where += "" if estimate.category == "all" else f", category {estimate.category}"
+    if not estimate.defined:
+        return f"{where}: retention is not defined: {estimate.reason}."
+    action = label_of(estimate.action.stream)
+    limits = with_limits(estimate.value, estimate.ci, number)
+    missed = estimate.action.missed
     reached = f"not shown to exceed {', '.join(missed)}" if missed else f"signal there (p < {SIGNIFICANCE})"
     return (
         f"{where}: {limits} of the backbone's score above chance is left in the {action}; {reached}. "
-        f"{counted(found.n_groups, 'group')}, {counted(found.n_samples, 'sample')}."
+        f"{counted(estimate.n_groups, 'group')}, {counted(estimate.n_samples, 'sample')}."
     )
 
 
 def _flat(row: LabelRow) -> dict[str, Any]:
     """Fields of a row; nested names are joined by a dot."""
-    own = row.retention
-    line: dict[str, Any] = {"run": row.run, "target": own.target, "task": own.task, "metric": own.metric}
-    line |= {"category": own.category, "view": own.view}
-    for name, peak in (("backbone", own.backbone), ("action", own.action)):
+    estimate = row.retention
+    line: dict[str, Any] = {
+        "run": row.run,
+        "target": estimate.target,
+        "task": estimate.task,
+        "metric": estimate.metric,
+    }
+    line |= {"category": estimate.category, "view": estimate.view}
+    for name, peak in (("backbone", estimate.backbone), ("action", estimate.action)):
         low, high = peak.ci
         line |= {
             f"{name}.stream": peak.stream, f"{name}.site": peak.site, f"{name}.score": peak.score,
@@ -316,21 +335,22 @@ def _flat(row: LabelRow) -> dict[str, Any]:
             f"{name}.ci_low": low, f"{name}.ci_high": high,
             **{f"{name}.exceeds.{control}": better for control, better in peak.exceeds.items()},
         }  # fmt: skip
-    low, high = own.ci
+    low, high = estimate.ci
     line |= {
-        "retention": own.value if own.defined else nan,
-        "retention.ci_low": low if own.defined and low is not None else nan,
-        "retention.ci_high": high if own.defined and high is not None else nan,
-        "note": own.note, "reason": own.reason, "n_groups": own.n_groups, "n_samples": own.n_samples,
+        "retention": estimate.value if estimate.defined else nan,
+        "retention.ci_low": low if estimate.defined and low is not None else nan,
+        "retention.ci_high": high if estimate.defined and high is not None else nan,
+        "note": estimate.note, "reason": estimate.reason, "n_groups": estimate.n_groups,
+        "n_samples": estimate.n_samples,
         "settings": row.settings,
     }  # fmt: skip
     return line
 
 
 def _plain(value: Any) -> Any:
-    """As JSON has it: without NaN."""
+    """Return the value as JSON has it: without NaN."""
     if isinstance(value, dict):
-        return {name: _plain(one) for name, one in value.items()}
+        return {name: _plain(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_plain(item) for item in value]
     return None if isinstance(value, float) and value != value else value

@@ -32,8 +32,8 @@ class EpisodeGrid:
 
     def picture(self, card: Mapping[str, Any]) -> str:
         """The base64 of a card's WebP."""
-        block, place = divmod(int(card["picture"]), self.block)
-        return self.pictures[block][place]
+        block, at = divmod(int(card["picture"]), self.block)
+        return self.pictures[block][at]
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class _Listed:
 
     @property
     def key(self) -> tuple[str, str]:
-        """Which episode of all runs it is."""
+        """The run and the id of the episode."""
         return self.card["run"], self.card["id"]
 
 
@@ -63,34 +63,38 @@ def episode_grid(
     """
     total = sum(len(run.episodes) for run in runs)
     stride = max(1, -(-total // pictures))
-    listed = [one for name, run in zip(names, runs, strict=True) for one in _listed(name, run, stride)]
+    listed = [episode for name, run in zip(names, runs, strict=True) for episode in _listed(name, run, stride)]
     stride = _fitting(listed, stride, picture_bytes)
-    kept = _with_pictures(listed, stride)
-    shown = _without_repeats(kept)
-    distinct = list(dict.fromkeys(picture for picture, _ in shown.values()))
-    places = {picture: place for place, picture in enumerate(distinct)}
+    with_picture = _with_pictures(listed, stride)
+    picture_of = _without_repeats(with_picture)
+    distinct = list(dict.fromkeys(picture for picture, _ in picture_of.values()))
+    places = {picture: at for at, picture in enumerate(distinct)}
     cards = tuple(
-        {**one.card, "picture": places[shown[one.key][0]], "half": shown[one.key][1]}
-        if one.key in shown
-        else {**one.card, "picture": None}
-        for one in listed
+        {**episode.card, "picture": places[picture_of[episode.key][0]], "half": picture_of[episode.key][1]}
+        if episode.key in picture_of
+        else {**episode.card, "picture": None}
+        for episode in listed
     )
     encoded = [b64encode(picture).decode() for picture in distinct]
     blocks = tuple(tuple(encoded[start : start + BLOCK]) for start in range(0, len(encoded), BLOCK))
-    return EpisodeGrid(cards, blocks, _note(len(kept), total, stride, pictures, picture_bytes))
+    return EpisodeGrid(cards, blocks, _note(len(with_picture), total, stride, pictures, picture_bytes))
 
 
-def _without_repeats(kept: Sequence[_Listed]) -> dict[tuple[str, str], tuple[bytes, bool]]:
-    """By episode its picture, and whether it shows the left half of one.
+def _without_repeats(listed: Sequence[_Listed]) -> dict[tuple[str, str], tuple[bytes, bool]]:
+    """Return by episode its picture, and whether it shows the left half of one.
 
     A model that did not act has the first frame alone: another episode's picture holds the same one on the left.
     """
-    pairs = {one.first_frame: one.picture for one in reversed(kept) if one.card["frames"] == 2 and one.first_frame}
-    found = {}
-    for one in kept:
-        pair = pairs.get(one.first_frame) if one.card["frames"] == 1 else None
-        found[one.key] = (pair or one.picture or b"", pair is not None)
-    return found
+    pairs = {
+        episode.first_frame: episode.picture
+        for episode in reversed(listed)
+        if episode.card["frames"] == 2 and episode.first_frame
+    }
+    picture_of = {}
+    for episode in listed:
+        pair = pairs.get(episode.first_frame) if episode.card["frames"] == 1 else None
+        picture_of[episode.key] = (pair or episode.picture or b"", pair is not None)
+    return picture_of
 
 
 def _listed(name: str, run: RunReader, stride: int) -> Iterator[_Listed]:
@@ -117,27 +121,30 @@ def _listed(name: str, run: RunReader, stride: int) -> Iterator[_Listed]:
 
 
 def _with_pictures(listed: Sequence[_Listed], stride: int) -> list[_Listed]:
-    return [one for one in listed if one.picture is not None and one.rank % stride == 0]
+    return [episode for episode in listed if episode.picture is not None and episode.rank % stride == 0]
 
 
 def _fitting(listed: Sequence[_Listed], step: int, most: int) -> int:
     """The smallest multiple of `step` that keeps at most so many bytes of pictures, or no more than one item's."""
-    last = max((one.rank for one in listed), default=0) + step
+    last = max((episode.rank for episode in listed), default=0) + step
     for stride in range(step, last, step):
-        if sum(map(len, {one for one, _ in _without_repeats(_with_pictures(listed, stride)).values()})) <= most:
+        if (
+            sum(map(len, {episode for episode, _ in _without_repeats(_with_pictures(listed, stride)).values()}))
+            <= most
+        ):
             return stride
     return last
 
 
-def _note(kept: int, total: int, stride: int, pictures: int, picture_bytes: int) -> str:
-    if kept == total:
+def _note(with_picture: int, total: int, stride: int, pictures: int, picture_bytes: int) -> str:
+    if with_picture == total:
         return ""
-    if kept == 0:
+    if with_picture == 0:
         return "The runs keep no frames. By default probe-kit extract stores two of every episode."
     if stride > 1:
         return (
-            f"Pictures of {kept} of {total} episodes: above {pictures}, or {picture_bytes / 1e6:.0f} MB of them, "
-            f"a report keeps those of every {stride}th question, in both layouts, to stay small. The others are "
-            "listed without."
+            f"Pictures of {with_picture} of {total} episodes: above {pictures}, or {picture_bytes / 1e6:.0f} MB "
+            f"of them, a report keeps those of every {stride}th question, in both layouts, to stay small. The "
+            "others are listed without."
         )
-    return f"Pictures of {kept} of {total} episodes; the others were played without storing frames."
+    return f"Pictures of {with_picture} of {total} episodes; the others were played without storing frames."

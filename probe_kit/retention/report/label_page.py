@@ -28,7 +28,7 @@ def write_label_report(runs: Sequence[RunReader], path: Path | str, table: Label
 def label_report_html(runs: Sequence[RunReader], table: LabelRetentionTable) -> str:
     """The page as text; the same runs and probes give the same text. See `write_label_report`."""
     names = full_names(runs)
-    places = tuple(place for run in runs for place in (run.location.address, str(run.location)))
+    places = tuple(path for run in runs for path in (run.location.address, str(run.location)))
     sections = label_sections(runs, table, names, places)
     summary = table.summary
     sentence, bibtex = citation(runs)
@@ -46,7 +46,7 @@ def label_report_html(runs: Sequence[RunReader], table: LabelRetentionTable) -> 
             provenance(name, run, None, [table.results[str(run.location), target] for target in table.targets])
             for name, run in zip(names, runs, strict=True)
         ],
-        words=words_of([summary, *(one for section in sections for one in section.tables)]),
+        words=words_of([summary, *(part for section in sections for part in section.tables)]),
         sentence=sentence,
         bibtex=bibtex,
     )

@@ -49,48 +49,48 @@ def label_sections(
 ) -> list[LabelSection]:
     """A section per label of the table. names: of the runs. of_one: name of the run where sections are of one."""
     exhibits = label_figures(runs, table)
-    found = []
+    sections = []
     for target in table.targets:
-        own = table.of_target(target)
+        of_target = table.of_target(target)
         probes = {name: table.results[str(run.location), target] for name, run in zip(names, runs, strict=True)}
         several = len(probes) > 1
-        found.append(
+        sections.append(
             LabelSection(
                 target,
                 of_one,
                 _measured(next(iter(probes.values()))),
-                own.text,
-                tuple(own.sentences),
+                of_target.text,
+                tuple(of_target.sentences),
                 arranged(exhibits, target, names, places),
                 tuple(
-                    _probes_table(one, f"Best sites and controls{f', {name}' if several else ''}")
-                    for name, one in probes.items()
+                    _probes_table(results, f"Best sites and controls{f', {name}' if several else ''}")
+                    for name, results in probes.items()
                 ),
                 tuple(
                     f"{name}: {sentence}" if several else sentence
-                    for name, one in probes.items()
-                    for sentence in best_sites_sentences(one)
+                    for name, results in probes.items()
+                    for sentence in best_sites_sentences(results)
                 ),
             )
         )
-    return found
+    return sections
 
 
 def stored_label_sections(
     runs: Sequence[RunReader], names: Sequence[str], places: tuple[str, ...]
 ) -> list[LabelSection]:
     """A section per run and label column of which the run has probes; none for other runs."""
-    found = []
+    sections = []
     for run, name in zip(runs, names, strict=True):
         of_one = name if len(runs) > 1 else ""
         for target in stored_targets(run):
             try:
                 table = label_retention_table([run], target)
             except NoProbesError as error:
-                found.append(_without_retention(load_results(run, target=target), of_one, str(error)))
+                sections.append(_without_retention(load_results(run, target=target), of_one, str(error)))
             else:
-                found += label_sections([run], replace(table, tried={}), [name], places, of_one)
-    return found
+                sections += label_sections([run], replace(table, tried={}), [name], places, of_one)
+    return sections
 
 
 def _without_retention(results: ProbeResults, of_one: str, reason: str) -> LabelSection:
@@ -101,10 +101,10 @@ def _without_retention(results: ProbeResults, of_one: str, reason: str) -> Label
 
 
 def _measured(results: ProbeResults) -> str:
-    own = results.settings
+    settings = results.settings
     curve = next(iter(results.curves.values()))
-    classes = f" of {len(curve.classes)} classes" if own.task == "classes" else ""
-    return f"A {_TASKS[own.task]} label{classes}; the score is {METRICS[own.task]}."
+    classes = f" of {len(curve.classes)} classes" if settings.task == "classes" else ""
+    return f"A {_TASKS[settings.task]} label{classes}; the score is {METRICS[settings.task]}."
 
 
 _TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "continuous": "continuous"}

@@ -1,4 +1,4 @@
-"""What a report opens with beside its summary: one question, and where its answer can be read."""
+"""The opening of a report beside its summary: one question, and where its answer can be read."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ class Question:
 
     @property
     def caption(self) -> str:
-        """How it ended, in words."""
+        """Return how it ended, in words."""
         outcome = (_ANSWERS if self.card["asked"] else _OUTCOMES).get(self.card["outcome"], "it was captured only")
         answer = f": {self.card['answer']}" if self.card["answer"] else ""
         frames = "First frame" if self.card["frames"] == 1 else "First and last frame"
@@ -52,17 +52,17 @@ def opening_row(table: RetentionTable) -> RetentionRow | None:
 
     Of runs with probes the first category with signal is next, and then the first at all; None without rows.
     """
-    rows = [one.row for run in table.summary for one in run.categories]
+    rows = [category.row for run in table.summary for category in run.categories]
     probed = [row for row in rows if str(row.run.location) in table.results and row.backbone.score is not None]
     lost = [row for row in probed if row.backbone.has_signal and not row.action.has_signal]
-    held = [row for row in probed if row.backbone.has_signal]
-    return next(iter((*lost, *held, *probed, *rows)), None)
+    encoded = [row for row in probed if row.backbone.has_signal]
+    return next(iter((*lost, *encoded, *probed, *rows)), None)
 
 
 def opening_question(row: RetentionRow, name: str, grid: EpisodeGrid) -> Question | None:
     """The first episode of the row's category with a picture, of this run by its name; None without one."""
-    own = [card for card in grid.cards if card["run"] == name and card["category"] == row.category]
-    for card in own:
+    cards = [card for card in grid.cards if card["run"] == name and card["category"] == row.category]
+    for card in cards:
         if card["picture"] is not None:
             return Question(card, f"data:image/webp;base64,{grid.picture(card)}")
     return None
@@ -73,13 +73,13 @@ def opening_curve(row: RetentionRow, table: RetentionTable, position: int) -> Re
     results = table.results.get(str(row.run.location))
     if results is None or row.backbone.score is None:
         return None
-    made = "answer" if modes_of([row]) == "answers" else "action"
+    output = "answer" if modes_of([row]) == "answers" else "action"
     iterations = "best" if table.iterations == "all" else table.iterations
     display = LayerCurveDisplay.from_results(results, row.category, row.view, iterations)
     return ReportFigure(
         "opening", f"Where the answer can be read: {spell(row.category)}", "summary",
         "How often a linear probe names the side of the correct picture, by layer: in the backbone, and where the "
-        f"{made} is made. {ONLY_FILLED}.",
+        f"{output} is made. {ONLY_FILLED}.",
         position, partial(_together, display),
     )  # fmt: skip
 

@@ -61,7 +61,7 @@ def report_html(
     sentence, bibtex = citation(runs)
     rows = table.all_rows
     modes = modes_of(rows)
-    places = tuple(place for run in runs for place in (run.location.address, str(run.location)))
+    places = tuple(path for run in runs for path in (run.location.address, str(run.location)))
     tables = _tables(table)
     summary = table.summary_table
     shown_names = [without_places(name, places) for name in names]
@@ -70,8 +70,8 @@ def report_html(
     labels = stored_label_sections(runs, names, places)
     question, curve = _opening(table, runs, shown_names, grid, places)
     label_tables = [table for label in labels for table in label.tables]
-    further = table.further_tables
-    joined = [one for joined in joins.found for one in known_used_tables(joined)]
+    further_tables = table.further_tables
+    joined = [part for joined in joins.tables for part in known_used_tables(joined)]
     return render(
         "page.html.jinja",
         places,
@@ -91,9 +91,9 @@ def report_html(
         notes=table.notes,
         tables=tables,
         wordings=table.wording_tables,
-        further=further,
+        further=further_tables,
         joined=joined,
-        join_notes=[*joins.refused, *dict.fromkeys(note for joined in joins.found for note in joined.notes)],
+        join_notes=[*joins.refused, *dict.fromkeys(note for joined in joins.tables for note in joined.notes)],
         pictures={
             subject: arranged(exhibits, subject, names, places)
             for subject in ("behaviour", "probes", "retention", "interventions", "join")
@@ -106,7 +106,13 @@ def report_html(
         ],
         labels=labels,
         words=words_of(
-            [summary, *(one for own in tables.values() for one in own), *label_tables, *further, *joined]
+            [
+                summary,
+                *(part for of_subject in tables.values() for part in of_subject),
+                *label_tables,
+                *further_tables,
+                *joined,
+            ]
         ),
         heat=heat_key(),
         sentence=sentence,
@@ -122,11 +128,11 @@ _ANSWERED: dict[Modes, str] = {
 
 
 def _tables(table: RetentionTable) -> dict[str, list[Table]]:
-    """By subject its tables."""
-    found: dict[str, list[Table]] = {subject: [] for subject in SUBJECTS.values()}
-    for title, one in table.tables().items():
-        found[SUBJECTS[title]].append(one)
-    return found
+    """Return the tables by subject."""
+    by_subject: dict[str, list[Table]] = {subject: [] for subject in SUBJECTS.values()}
+    for title, part in table.tables().items():
+        by_subject[SUBJECTS[title]].append(part)
+    return by_subject
 
 
 def _opening(
@@ -149,18 +155,18 @@ def _opening(
 
 def _in_words(table: RetentionTable) -> list[list[RunInWords]]:
     """Per run, its sentences per view."""
-    found: dict[tuple[str | None, str], list[RunInWords]] = {}
+    by_run: dict[tuple[str | None, str], list[RunInWords]] = {}
     for mean in table.means:
-        own = [
+        rows = [
             r
             for r in table.rows
             if (r.group, r.run.location, r.view) == (mean.group, mean.run.location, mean.view)
         ]
-        found.setdefault((mean.group, mean.run.location), []).append(read_run([*own, mean]))
-    return list(found.values())
+        by_run.setdefault((mean.group, mean.run.location), []).append(read_run([*rows, mean]))
+    return list(by_run.values())
 
 
 def listed(names: Sequence[str]) -> str:
     """A, B and C."""
-    *others, last = names
-    return f"{', '.join(others)} and {last}" if others else last
+    *first, last = names
+    return f"{', '.join(first)} and {last}" if first else last

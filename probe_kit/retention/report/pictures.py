@@ -44,19 +44,19 @@ def arranged(
     All but the first of a kind and run are extra, to be unfolded, and so are those of single runs that another
     figure shows side by side.
     """
-    found: dict[str, list[Picture]] = {}
-    own = [exhibit for exhibit in exhibits if exhibit.subject == subject]
-    together = {_kind(exhibit) for exhibit in own if exhibit.run is None}
-    for exhibit in own:
+    by_title: dict[str, list[Picture]] = {}
+    of_subject = [exhibit for exhibit in exhibits if exhibit.subject == subject]
+    together = {_kind(exhibit) for exhibit in of_subject if exhibit.run is None}
+    for exhibit in of_subject:
         run = "" if exhibit.run is None else names[exhibit.run]
         kind = _kind(exhibit)
-        before = [other for pictures in found.values() for other in pictures]
+        before = [other for pictures in by_title.values() for other in pictures]
         extra = any(other.run == run and other.title.partition(",")[0] == kind for other in before)
         extra |= exhibit.run is not None and f"{kind} side by side" in together
-        found.setdefault(exhibit.title, []).append(
+        by_title.setdefault(exhibit.title, []).append(
             Picture(exhibit.title, run, exhibit.reading, *data_uri(exhibit, places), extra)
         )
-    return list(found.values())
+    return list(by_title.values())
 
 
 def _kind(exhibit: ReportFigure) -> str:
@@ -116,5 +116,5 @@ def compact_svg(svg: bytes) -> bytes:
 
 def _rounded(numbers: str) -> str:
     """Numbers and letters of a path, of two decimals each and without needless spaces."""
-    short = re.sub(r"-?\d+\.\d+(?!e)", lambda found: f"{float(found[0]):.2f}".rstrip("0").rstrip("."), numbers)
+    short = re.sub(r"-?\d+\.\d+(?!e)", lambda match: f"{float(match[0]):.2f}".rstrip("0").rstrip("."), numbers)
     return re.sub(r"\s*([A-Za-z])\s*", r"\1", re.sub(r"\s+", " ", short)).strip()

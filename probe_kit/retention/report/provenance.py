@@ -1,4 +1,4 @@
-"""Where the numbers come from and how to cite them."""
+"""The origin of the numbers, and how to cite them."""
 
 import json
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ class Provenance:
 def provenance(
     name: str, run: RunReader, results: ProbeResults | None, labels: Sequence[ProbeResults] = ()
 ) -> Provenance:
-    """What a run says about itself and its probes; runs that were not made by probe_kit say less.
+    """Return what a run says about itself and its probes; runs that were not made by probe_kit say less.
 
     labels: its probes of labels.
     """
@@ -49,10 +49,12 @@ def provenance(
         ),
         "mixed": ", ".join(getattr(run, "mixed", ())),
         "probes": str(probes.get("key", "none" * (not labels))),
-        **{f"probes of {one.settings.target}": one.key for one in labels},
+        **{f"probes of {probes_of.settings.target}": probes_of.key for probes_of in labels},
     }
     documents = {"run settings": settings, "certificate": certificate, "probe settings": probes}
-    documents |= {f"probe settings of {one.settings.target}": _probe_settings(one) for one in labels}
+    documents |= {
+        f"probe settings of {probes_of.settings.target}": _probe_settings(probes_of) for probes_of in labels
+    }
     return Provenance(
         name,
         ProvenanceLine.of_run(run).line,
@@ -63,16 +65,16 @@ def provenance(
 
 def _protocol(settings: dict[str, Any]) -> dict[str, str]:
     """The protocol that a run follows, how it differs from the default, and how the run differs from it."""
-    said = settings.get("protocol")
-    if not said:
+    protocol = settings.get("protocol")
+    if not protocol:
         return {}
     return {
-        "protocol": said["name"],
-        "deviates from it in": _listed(said["deviations"], "instead of") or "nothing",
+        "protocol": protocol["name"],
+        "deviates from it in": _listed(protocol["deviations"], "instead of") or "nothing",
         "it differs from the default in": _listed(
-            {name: pair[::-1] for name, pair in said["differs_from_default"].items()}, "instead of"
+            {name: pair[::-1] for name, pair in protocol["differs_from_default"].items()}, "instead of"
         ),
-        "of it cannot be matched": "; ".join(said["unmatched"]),
+        "of it cannot be matched": "; ".join(protocol["unmatched"]),
     }
 
 

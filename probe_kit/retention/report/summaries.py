@@ -1,4 +1,4 @@
-"""What the tables say, in sentences."""
+"""Sentences that say what the tables hold."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -48,10 +48,10 @@ def _interval_words(row: RetentionRow) -> str:
 
 
 def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
-    found = []
+    sentences = []
     if mean.run.random_weights:
-        found.append("The weights are random: the model is untrained. Read every number as “knows nothing”.")
-    found += _unread(mean) if is_vlm(mean) else _unmoved(mean)
+        sentences.append("The weights are random: the model is untrained. Read every number as “knows nothing”.")
+    sentences += _unread(mean) if is_vlm(mean) else _unmoved(mean)
     biased = [
         row
         for row in rows
@@ -59,19 +59,19 @@ def _warnings(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
     ]
     if biased:
         habit = "The answers have a habit of naming" if is_vlm(mean) else "The policy has a habit of going to"
-        found.append(f"{habit} one side in {_of(biased, rows)}.")
+        sentences.append(f"{habit} one side in {_of(biased, rows)}.")
     if uncontrolled := chance_only(rows):
-        found.append(f"{uncontrolled}.")
+        sentences.append(f"{uncontrolled}.")
     if mean.controls.leaks:
-        found.append(
+        sentences.append(
             f"The suite gives answers away without a model ({', '.join(mean.controls.leaks)}): see the "
             "controls before believing a probe."
         )
-    return found
+    return sentences
 
 
 def _unread(mean: RetentionRow) -> list[str]:
-    """What would be misread of a model that was asked."""
+    """Return warnings about a model that was asked."""
     if (mean.success.share_outside or 0) <= _MOSTLY:
         return []
     unread = percent(mean.success.share_outside)
@@ -79,56 +79,58 @@ def _unread(mean: RetentionRow) -> list[str]:
 
 
 def _unmoved(mean: RetentionRow) -> list[str]:
-    """What would be misread of a policy."""
-    found = []
+    """Return warnings about a policy."""
+    sentences = []
     if (mean.success.share_never_moved or 0) > _MOSTLY:
-        found.append(
+        sentences.append(
             f"The cube never moved in {percent(mean.success.share_never_moved)} % of episodes: "
             "the policy does not grasp, so its success rate is no measure of what it knows."
         )
     elif (mean.success.share_outside or 0) > _MOSTLY:
-        found.append(f"The cube reached neither picture in {percent(mean.success.share_outside)} % of episodes.")
+        sentences.append(
+            f"The cube reached neither picture in {percent(mean.success.share_outside)} % of episodes."
+        )
     if mean.success.share_invalid_action:
-        found.append(
+        sentences.append(
             f"In {percent(mean.success.share_invalid_action)} % of its steps the policy put out "
             "something that is no action."
         )
-    return found
+    return sentences
 
 
 def read_row(row: RetentionRow) -> list[str]:
     """One category in sentences."""
     if row.success.sr is None:
-        found = [
+        sentences = [
             f"Captured in {row.success.n_episodes} episodes; it did not act."
             if row.run.capture_only
             else f"{RATE[modes_of([row])]} {row.success.reason}."
         ]
     else:
         right = round(row.success.sr * row.success.n_episodes)
-        found = [
+        sentences = [
             f"Right in {right} of {row.success.n_episodes} episodes ({row.success.regime}: {row.success.reason})."
         ]
     if (paired := row.success.paired) is not None:
         items = paired.both + paired.one + paired.none
-        found.append(f"{paired.both} of {items} questions right in both layouts.")
+        sentences.append(f"{paired.both} of {items} questions right in both layouts.")
     if row.backbone.score is not None:
-        found.append(
+        sentences.append(
             f"In the backbone a probe is right in {percent(row.backbone.score)} %, best at depth "
             f"{row.backbone.depth:.2f}{_ties_words(row.backbone.ties)}: "
             f"{_clear_words(row.backbone.p_fwe, row.backbone.exceeds)}."
         )
     if row.action.score is not None:
         step = "" if row.action.iteration is None else f", iteration {row.action.iteration}"
-        found.append(
+        sentences.append(
             f"In the {row.run.action_name} {percent(row.action.score)} %, best at depth {row.action.depth:.2f}"
             f"{step}{_ties_words(row.action.ties)}: {_clear_words(row.action.p_fwe, row.action.exceeds)}."
         )
     if row.retention.defined and row.retention.value is not None:
-        found.append(f"Retention {row.retention.value:.2f} ({_interval_words(row)}).")
+        sentences.append(f"Retention {row.retention.value:.2f} ({_interval_words(row)}).")
     elif row.retention.note:
-        found.append(f"Retention {row.retention.note}.")
-    return found
+        sentences.append(f"Retention {row.retention.note}.")
+    return sentences
 
 
 def _ties_words(ties: int | None) -> str:
@@ -152,15 +154,15 @@ def _clear_words(p: float | None, exceeds: Exceeds) -> str:
 
 def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
     """The shorter of the two lists: those that are in, or those that are not."""
-    rest = [row for row in rows if row not in part]
-    shown, prefix = (rest, "all but ") if len(rest) < len(part) else (part, "")
-    return prefix + ", ".join(spell(row.category) for row in shown)
+    absent = [row for row in rows if row not in part]
+    listed, prefix = (absent, "all but ") if len(absent) < len(part) else (part, "")
+    return prefix + ", ".join(spell(row.category) for row in listed)
 
 
 def _of(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
-    """How many of the categories, and which if not all."""
+    """Return how many of the categories, and which if not all."""
     noun = "category" if len(rows) == 1 else "categories"
     if len(part) == len(rows):
         return f"all {len(rows)} {noun}" if len(rows) > 1 else "the only category"
-    named = f" ({_names(part, rows)})" if part else ""
-    return f"{len(part) or 'none'} of {len(rows)} {noun}{named}"
+    names = f" ({_names(part, rows)})" if part else ""
+    return f"{len(part) or 'none'} of {len(rows)} {noun}{names}"

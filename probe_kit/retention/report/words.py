@@ -14,11 +14,11 @@ _AGAINST = "against: "
 
 @dataclass(frozen=True)
 class Word:
-    """An entry. place: its id in the page."""
+    """An entry. anchor: its id in the page."""
 
     name: str
     meaning: str
-    place: str
+    anchor: str
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,20 @@ def words_of(tables: Sequence[Table]) -> Words:
     groups: dict[str, dict[tuple[str, str], None]] = {}
     for table in tables:
         title = re.split("[:,]", table.title)[0]
-        own = {(column.text, column.help): None for column in table.headings if column.help}
-        groups.setdefault(title, {}).update({word: None for word in own if word not in _all(groups)})
-    said = {_word(cell) for cell in cells}
-    groups["Verdicts"] = {(name, text): None for name, text in VERDICT_HELP.items() if name in said}
+        entries_of = {(column.text, column.help): None for column in table.headings if column.help}
+        groups.setdefault(title, {}).update({word: None for word in entries_of if word not in _all(groups)})
+    words = {_word(cell) for cell in cells}
+    groups["Verdicts"] = {(name, text): None for name, text in VERDICT_HELP.items() if name in words}
     groups["Further terms"] = {word: None for word in TERMS.items() if word not in _all(groups)}
     places = {word: f"word-{number}" for number, word in enumerate(_all(groups))}
-    entries = {title: tuple(Word(*word, places[word]) for word in own) for title, own in groups.items() if own}
-    of_values = {name: place for (name, text), place in places.items() if (VERDICT_HELP | TERMS).get(name) == text}
+    entries = {
+        title: tuple(Word(*word, places[word]) for word in entries_of)
+        for title, entries_of in groups.items()
+        if entries_of
+    }
+    of_values = {
+        name: anchor for (name, text), anchor in places.items() if (VERDICT_HELP | TERMS).get(name) == text
+    }
     return Words(entries, places, {cell: of_values[_word(cell)] for cell in cells if _word(cell) in of_values})
 
 
@@ -57,4 +63,4 @@ def _word(cell: str) -> str:
 
 
 def _all(groups: Mapping[str, Mapping[tuple[str, str], None]]) -> list[tuple[str, str]]:
-    return [word for own in groups.values() for word in own]
+    return [word for of_table in groups.values() for word in of_table]

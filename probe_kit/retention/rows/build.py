@@ -59,7 +59,7 @@ class RowWithEstimates:
 
 @dataclass(frozen=True)
 class RowSettings:
-    """What a table is asked to show.
+    """The settings of a table.
 
     epsilons: zone radii in metres for `sr_by_epsilon`, which belong to the rule `disc`. rule, last_steps: see
     `probe_kit.env.scoring.rules.judge`. absent_below: accuracy below which a stream's best site counts as absent.
@@ -83,29 +83,33 @@ def run_rows(
 
     Raises UnknownSiteError for a view that was not probed.
     """
-    shown: Sequence[str | None] = (None,) if results is None else settings.views or results.settings.views
+    views: Sequence[str | None] = (None,) if results is None else settings.views or results.settings.views
     if results is not None and (unknown := set(settings.views or ()) - set(results.settings.views)):
         probed = ", ".join(results.settings.views)
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
     judged = RunUnderRule.of(run, settings.rule, settings.last_steps, settings.with_behaviour)
-    found = stored_image_swaps(run)
-    places = stored_places(run) if found else {}
-    others = stored_other_readouts(run, found)
-    ties = {view: stored_ties(run, results, view) if found else {} for view in shown}
+    effects = stored_image_swaps(run)
+    places = stored_places(run) if effects else {}
+    readouts = stored_other_readouts(run, effects)
+    ties = {view: stored_ties(run, results, view) if effects else {} for view in views}
     drawn = [
         _row(judged, results, settings, group, str(category), episodes, view)
         for category, episodes in judged.run.episodes.groupby("category", sort=False)
         if settings.categories is None or category in settings.categories
-        for view in shown
+        for view in views
     ]
     return [
         replace(
-            one,
+            row,
             row=add_image_swap(
-                one.row, found, places, ties[one.row.view].get(one.row.category, ""), others.get(one.row.category)
+                row.row,
+                effects,
+                places,
+                ties[row.row.view].get(row.row.category, ""),
+                readouts.get(row.row.category),
             ),
         )
-        for one in drawn
+        for row in drawn
     ]
 
 
@@ -211,7 +215,7 @@ def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
 
 
 def _no_success(episodes: "pd.DataFrame", heard: bool) -> SuccessRate:
-    """Of a model that did not act, or whose run keeps nothing to judge by."""
+    """Return an empty rate, of a model that did not act or a run that keeps nothing to judge by."""
     reason = "" if heard else "n/a: the run keeps no trajectories, which this outcome rule needs"
     return SuccessRate(n_episodes=len(episodes), n_items=int(episodes["item_id"].nunique()), reason=reason)
 
@@ -233,12 +237,12 @@ class _ProbedCategory:
     settings: RowSettings
 
     def backbone(self) -> BackbonePart:
-        """Of the backbone's best site."""
+        """Return the part of the backbone's best site."""
         peak = self.peaks.get(BACKBONE)
         return BackbonePart() if peak is None else BackbonePart(**self._part(BACKBONE, peak))
 
     def action(self) -> ActionPart:
-        """Of the best site where the action is made."""
+        """Return the part of the best site where the action is made."""
         peak = self.peaks.get(ACTION)
         if peak is None:
             return ActionPart()
@@ -276,21 +280,21 @@ class _ProbedCategory:
         return verdict(has_signal(exceeds), scored.at_most[name], scored.findable[name], bound)
 
     def retention(self) -> RetentionPart:
-        """Of both streams."""
+        """Return the retention of both streams."""
         if len(self.peaks) < 2:
             return RetentionPart(note="n/a (one stream only)")
         backbone = self.exceeds[BACKBONE]
-        found = estimate_retention(self.peaks, self.streams, backbone, self.settings.absent_below)
+        estimate = estimate_retention(self.peaks, self.streams, backbone, self.settings.absent_below)
         return RetentionPart(
-            value=_number(found.value),
-            ci=limits(found.interval),
-            published=_number(found.published),
-            defined=found.defined,
-            note=found.note,
+            value=_number(estimate.value),
+            ci=limits(estimate.interval),
+            published=_number(estimate.published),
+            defined=estimate.defined,
+            note=estimate.note,
         )
 
     def controls_of(self, success: SuccessRate) -> ControlScores:
-        """What the best sites are compared with."""
+        """Return the scores that the best sites are compared with."""
         baselines = self.controls_run.of_category(self.category)
         untrained = [self._untrained(peak.site.stream) for peak in self.peaks.values()]
         score = None if self.streams is None or BACKBONE not in self.peaks else self.streams.accuracy(BACKBONE)
@@ -300,7 +304,7 @@ class _ProbedCategory:
             probe_minus_sr=None if score is None or success.sr is None else score - success.sr,
             baselines={name: score.score for name, score in baselines.items()},
             leaks=tuple(name for name, score in baselines.items() if score.above_chance),
-            untrained=next((one.untrained for one in untrained if one is not None), None),
+            untrained=next((peak_score.untrained for peak_score in untrained if peak_score is not None), None),
         )
 
     def _untrained(self, stream: str) -> UntrainedScore | None:
@@ -311,16 +315,16 @@ class _ProbedCategory:
 
     def _first_iteration(self, peak: Peak) -> Peak | None:
         """The best layer where the stream has seen nothing of the action yet; None for one that runs once."""
-        own = [site.iteration for site in self.curve.sites if site.stream == peak.site.stream]
-        steps = [step for step in own if step is not None]
+        iterations = [site.iteration for site in self.curve.sites if site.stream == peak.site.stream]
+        steps = [step for step in iterations if step is not None]
         return best_site(self.curve, peak.site.stream, min(steps)) if steps else None
 
 
 def missing_episodes(curve: ProbeCurve) -> dict[str, float]:
-    """By side, the share of items that lack their episode of that side."""
+    """Return by side the share of items that lack their episode of that side."""
     items = len(set(curve.items.tolist()))
     sides = {"left": curve.labels, "right": ~curve.labels}
-    return {side: 1 - len(set(curve.items[chosen].tolist())) / items for side, chosen in sides.items()}
+    return {side: 1 - len(set(curve.items[is_side].tolist())) / items for side, is_side in sides.items()}
 
 
 def _number(value: float) -> float | None:

@@ -31,8 +31,8 @@ def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> Rete
     them, see `probe_kit.retention.columns.columns`. Intervals: of independent
     categories, see `probe_kit.statistics.estimates`.
     """
-    rows = [one.row for one in drawn]
-    estimates = [one.estimates for one in drawn]
+    rows = [part.row for part in drawn]
+    estimates = [part.estimates for part in drawn]
     probed = _probed(estimates)
     first = rows[0]
     means = _means(rows, averaged)
@@ -62,8 +62,8 @@ def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> Rete
 
 def _probed(estimates: Sequence[RowEstimates]) -> list[StreamScores]:
     """Scores of the probed categories; none where they are of different streams."""
-    found = [one.streams for one in estimates if one.streams is not None]
-    return found if len({streams.names for streams in found}) == 1 else []
+    streams_of = [estimate.streams for estimate in estimates if estimate.streams is not None]
+    return streams_of if len({streams.names for streams in streams_of}) == 1 else []
 
 
 def _accuracy_limits(probed: Sequence[StreamScores], name: str) -> Limits | None:
@@ -77,7 +77,7 @@ _PARTS = ("success", "rules", "answers", "backbone", "action", "controls", "imag
 
 
 def _means(rows: Sequence[RetentionRow], averaged: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """By part, the averages of its fields."""
+    """Return by part the averages of its fields."""
     means: dict[str, dict[str, Any]] = {part: {} for part in _PARTS}
     for path in averaged:
         part, _, name = path.partition(".")
@@ -101,20 +101,20 @@ def _success(
 def _rules(
     rows: Sequence[RetentionRow], estimates: Sequence[RowEstimates], means: dict[str, Any]
 ) -> OutcomeRuleScores:
-    found = [row.rules for row in rows]
-    sides = {one.idle_side for one in found}
+    rules = [row.rules for row in rows]
+    sides = {of_category.idle_side for of_category in rules}
     return OutcomeRuleScores(
-        rule=found[0].rule,
-        rule_words=found[0].rule_words,
-        last_steps=found[0].last_steps,
-        n_answered=_sum([one.n_answered for one in found]),
-        n_grasped=_sum([one.n_grasped for one in found]),
+        rule=rules[0].rule,
+        rule_words=rules[0].rule_words,
+        last_steps=rules[0].last_steps,
+        n_answered=_sum([of_category.n_answered for of_category in rules]),
+        n_grasped=_sum([of_category.n_grasped for of_category in rules]),
         sr_answered_ci=_rate_limits(estimates, "sr_answered"),
         sr_grasped_ci=_rate_limits(estimates, "sr_grasped"),
         idle_side=sides.pop() if len(sides) == 1 else "both",
-        sr_by_rule=_mean_by_key([one.sr_by_rule for one in found]),
-        sr_by_epsilon=_mean_by_key([one.sr_by_epsilon for one in found]),
-        behaviour=_mean_by_key([one.behaviour for one in found]),
+        sr_by_rule=_mean_by_key([of_category.sr_by_rule for of_category in rules]),
+        sr_by_epsilon=_mean_by_key([of_category.sr_by_epsilon for of_category in rules]),
+        behaviour=_mean_by_key([of_category.behaviour for of_category in rules]),
         **means,
     )
 
@@ -128,11 +128,11 @@ def _retention(rows: Sequence[RetentionRow], probed: Sequence[StreamScores]) -> 
     counted, missing = [row for row in rows if row.retention.defined], _left_out(rows)
     if not probed or len(probed[0].names) < 2:
         return RetentionPart(note=rows[0].retention.note)
-    found = retention(Scores.mean([streams.scores for streams in probed]))
+    ratio = retention(Scores.mean([streams.scores for streams in probed]))
     note = f"published ratios without {', '.join(missing)}" if counted and missing else ""
     return RetentionPart(
-        value=found.value,
-        ci=limits(found.interval),
+        value=ratio.value,
+        ci=limits(ratio.interval),
         published=_mean(counted, "retention.published"),
         defined=bool(counted),
         note=note if counted else rows[0].retention.note,
@@ -140,7 +140,7 @@ def _retention(rows: Sequence[RetentionRow], probed: Sequence[StreamScores]) -> 
 
 
 def _rate_limits(estimates: Sequence[RowEstimates], name: str) -> Limits | None:
-    shares = [one.rates[name] for one in estimates if name in one.rates]
+    shares = [estimate.rates[name] for estimate in estimates if name in estimate.rates]
     if not shares:
         return None
     return limits(Rate.mean([Rate(share.value, share.interval()) for share in shares]).interval)
@@ -154,8 +154,8 @@ def _mean(rows: Sequence[RetentionRow], path: str) -> Any:
 
 
 def _sum(values: Sequence[int | None]) -> int | None:
-    known = [value for value in values if value is not None]
-    return sum(known) if known else None
+    numbers = [value for value in values if value is not None]
+    return sum(numbers) if numbers else None
 
 
 def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""By which outcome rule a success rate was made, what else it leaves unsaid, and what the other rules say."""
+"""The outcome rule of a success rate, what it leaves unsaid, and what the other rules say."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -93,9 +93,9 @@ class RunUnderRule:
             return cls(run, rule, words, last_steps)
         if not getattr(run, "has_trajectories", False):
             return cls(run, rule, words, last_steps)
-        own = cast("Judgeable", run)
-        verdicts = {name: own.judged(name) for name in RULES}
-        return cls(own.under(rule, last_steps), rule, words, last_steps, verdicts, own.behaviour)
+        judgeable = cast("Judgeable", run)
+        verdicts = {name: judgeable.judged(name) for name in RULES}
+        return cls(judgeable.under(rule, last_steps), rule, words, last_steps, verdicts, judgeable.behaviour)
 
     @property
     def scored(self) -> bool:
@@ -124,11 +124,11 @@ class RunUnderRule:
         """`sr_answered` and `sr_grasped`, where they are defined."""
         if not self.scored:
             return {}
-        found = {"sr_answered": self._conditional(episodes, 1 - shares_of(episodes, "oob"))}
+        shares = {"sr_answered": self._conditional(episodes, 1 - shares_of(episodes, "oob"))}
         if self.behaviour is not None:
             grasped = self.behaviour["grasped"].to_numpy(float)[episodes.index]
-            found["sr_grasped"] = self._conditional(episodes, grasped)
-        return {name: share for name, share in found.items() if share is not None}
+            shares["sr_grasped"] = self._conditional(episodes, grasped)
+        return {name: share for name, share in shares.items() if share is not None}
 
     def _facts(
         self, episodes: "pd.DataFrame", answered: "np.ndarray[Any, np.dtype[np.float64]]"
@@ -136,7 +136,7 @@ class RunUnderRule:
         assert self.verdicts is not None
         assert self.behaviour is not None
         verdicts = {name: of_rule.loc[episodes.index] for name, of_rule in self.verdicts.items()}
-        acted, own = self.behaviour.loc[episodes.index], verdicts[self.rule]
+        acted, by_rule = self.behaviour.loc[episodes.index], verdicts[self.rule]
         grasped = acted["grasped"].to_numpy(float)
         rate = self._conditional(episodes, grasped)
         stayed = answered[~acted["moved"].to_numpy(bool)].sum()
@@ -145,9 +145,9 @@ class RunUnderRule:
             "sr_grasped": None if rate is None else rate.value,
             "sr_grasped_ci": None if rate is None else limits(rate.interval()),
             "share_unmoved_answers": float(stayed / answered.sum()) if answered.any() else None,
-            "sr_idle": float((own["idle"] == "correct").mean()),
-            "idle_side": _idle_side(own["idle"], episodes["side_correct"]),
-            "share_both_zones": float(own["both"].mean()),
+            "sr_idle": float((by_rule["idle"] == "correct").mean()),
+            "idle_side": _idle_side(by_rule["idle"], episodes["side_correct"]),
+            "share_both_zones": float(by_rule["both"].mean()),
             "sr_by_rule": {name: float(of_rule["correct"].mean()) for name, of_rule in verdicts.items()},
             "behaviour": _behaviour(acted),
         }
@@ -162,7 +162,7 @@ class RunUnderRule:
 
 
 def _idle_side(idle: "pd.Series[str]", sides: "pd.Series[str]") -> str:
-    """Where the untouched cube lies, by the rule."""
+    """Return where the untouched cube lies, by the rule."""
     placed = {
         "none" if zone == "oob" else side if zone == "correct" else {"left": "right", "right": "left"}[side]
         for zone, side in zip(idle, sides, strict=True)
@@ -172,18 +172,18 @@ def _idle_side(idle: "pd.Series[str]", sides: "pd.Series[str]") -> str:
 
 def _behaviour(acted: "pd.DataFrame") -> dict[str, float]:
     """Shares of episodes; of those that made a choice where there is one to make."""
-    found = {name: float(acted[name].mean()) for name in ("grasped", "moved", "released")}
+    shares = {name: float(acted[name].mean()) for name in ("grasped", "moved", "released")}
     for name in ("first_choice", "closer_to", "release_near"):
-        chosen = acted[name][acted[name].isin(["correct", "wrong"])]
-        found[f"{name}_made"] = len(chosen) / len(acted)
-        if len(chosen):
-            found[f"{name}_correct"] = float((chosen == "correct").mean())
-    found["correct_side_share"] = float(acted["correct_side_share"].mean())
-    return found
+        choices = acted[name][acted[name].isin(["correct", "wrong"])]
+        shares[f"{name}_made"] = len(choices) / len(acted)
+        if len(choices):
+            shares[f"{name}_correct"] = float((choices == "correct").mean())
+    shares["correct_side_share"] = float(acted["correct_side_share"].mean())
+    return shares
 
 
 def rule_sentence(rules: OutcomeRuleScores) -> str:
-    """What outcomes were judged by, and what the rule gives away; for captions."""
+    """Return what outcomes were judged by, and what the rule gives away; for captions."""
     steps = f", mean of the last {rules.last_steps} control steps (all, where there are fewer)" * (
         rules.last_steps > 1
     )
@@ -213,7 +213,7 @@ def under_rule(run: RunReader, rule: str, last_steps: int = 1) -> RunReader:
     return cast("Judgeable", run).under(rule, last_steps)
 
 
-def check_epsilons(rule: str, asked: bool) -> None:
+def check_epsilons(rule: str, are_set: bool) -> None:
     """Radii are those of the rule `disc`. Raises UsageError where they are asked for with another one."""
-    if asked and rule != DEFAULT_RULE:
+    if are_set and rule != DEFAULT_RULE:
         raise UsageError(f"zone radii belong to the outcome rule disc; {rule} has none. Leave out --epsilons")

@@ -20,7 +20,7 @@ Mode = Literal["answers", "acts"]
 
 @dataclass(frozen=True, kw_only=True)
 class RunInfo:
-    """Whose numbers a row holds.
+    """The run that the numbers of a row are of.
 
     location: folder or URL. label: what the run is called in tables and legends. settings: sha256 of the run's
     settings; probes: key of its probe results. action_stream: `expert`, or `action` in a policy without one, whose
@@ -48,13 +48,13 @@ class RunInfo:
 
     @property
     def action_name(self) -> str:
-        """What `action_stream` is called in a sentence."""
+        """The name of `action_stream` in a sentence."""
         return label_of(self.action_stream or "expert")
 
 
 @dataclass(frozen=True, kw_only=True)
 class AnswerStats:
-    """How the model of a VLM run was asked, and what else its answers say; all None for a policy run.
+    """The way in which the model of a VLM run was asked, and what else its answers say; all None for a policy run.
 
     asked_for: `target`, `distractor` or `absent`. score: by which of its scores `success.sr` is. accuracy_text,
     accuracy_logits, accuracy_order_balanced: shares that are right by each score. share_unparsable: answers in
@@ -105,13 +105,13 @@ class SwapEffect:
 
     @property
     def explanation(self) -> str:
-        """What the verdict rests on; empty without one."""
+        """The evidence of the verdict; empty without one."""
         return "" if self.use is None else self.use.explanation
 
 
 @dataclass(frozen=True, kw_only=True)
 class StreamPart:
-    """What can be read in one stream.
+    """The scores of probes of one stream.
 
     score: accuracy of the sites that the inner folds choose, on the outer folds; balanced between the sides,
     so that chance is one half. ci: its 95 % interval. peak: accuracy of the site that is best on all of them,
@@ -153,12 +153,12 @@ class StreamPart:
 
 @dataclass(frozen=True, kw_only=True)
 class BackbonePart(StreamPart):
-    """What can be read in the backbone; see `StreamPart`."""
+    """The scores of probes of the backbone; see `StreamPart`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ActionPart(StreamPart):
-    """What can be read where the action is made; see `StreamPart`.
+    """The scores of probes where the action is made; see `StreamPart`.
 
     iteration: the flow-matching step or action token of the site. first_peak, first_layer: of the best layer at
     the first iteration, which has seen no action. All three are None where the stream runs once.
@@ -189,7 +189,7 @@ class RetentionPart:
 
 @dataclass(frozen=True, kw_only=True)
 class ControlScores:
-    """What the probes are compared with.
+    """The scores that those of probes are compared with.
 
     n_groups: independent groups of items. missing: by side, the share of items without their episode of that
     side. probe_minus_sr: backbone score − success rate. baselines: accuracy of each control that never sees the

@@ -1,4 +1,4 @@
-"""How displays and figures show themselves as the last line of a notebook's cell, whatever pyplot's backend is."""
+"""Displays that show their figure as the last line of a notebook's cell, whatever pyplot's backend is."""
 
 from io import BytesIO
 from typing import TYPE_CHECKING

@@ -1,4 +1,4 @@
-"""What a figure is about, in one line: model, weights, suite, sizes, settings."""
+"""The line under a figure: model, weights, suite, sizes, settings."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -15,7 +15,7 @@ SHOWN = 12
 
 @dataclass(frozen=True)
 class ProvenanceLine:
-    """Where the numbers of a figure come from.
+    """The origin of the numbers of a figure.
 
     weights: sha256 of the weights that acted, None for a scripted policy. suite: `name@version#hash`.
     n: number of episodes, in words. settings: sha256 of the run's settings. probes: key of the probe results.
@@ -34,14 +34,14 @@ class ProvenanceLine:
 
     @classmethod
     def of_run(cls, run: RunReader) -> Self:
-        """Of a run's behaviour."""
+        """Return the line of a run's behaviour."""
         rule = getattr(run, "rule", "disc")
         n = f"n = {counted(len(run.episodes), 'episode')}" + ("" if rule == "disc" else f" by the rule {rule}")
         return cls(run.label, run.random_weights, run.weights_sha256, run.suite, n, run.settings_sha256)
 
     @classmethod
     def of_results(cls, results: ProbeResults, view: str) -> Self:
-        """Of probes in one view."""
+        """Return the line of probes in one view."""
         settings = results.settings
         sizes = [curve.labels.size for (_, name), curve in results.curves.items() if name == view]
         n = f"n = {_span(sizes)} episodes per category, view {view}"
@@ -52,19 +52,19 @@ class ProvenanceLine:
 
     @classmethod
     def of_label(cls, results: ProbeResults, category: str, view: str) -> Self:
-        """Of probes of a label in one category and view."""
-        own, curve = results.settings, results.curves[category, view]
+        """Return the line of probes of a label in one category and view."""
+        settings, curve = results.settings, results.curves[category, view]
         of = "" if category == "all" else f", category {category}"
         sizes = f"{counted(curve.labels.size, 'sample')} in {counted(curve.n_groups, 'group')}"
         n = f"n = {sizes}, view {view}{of}"
         return cls(
-            own.model, own.random_weights, own.weights, own.suite, n, own.run_settings, results.key, own.target,
-            own.call if own.window == 1 else None,
+            settings.model, settings.random_weights, settings.weights, settings.suite, n, settings.run_settings,
+            results.key, settings.target, settings.call if settings.window == 1 else None,
         )  # fmt: skip
 
     @classmethod
     def of_row(cls, row: RetentionRow) -> Self:
-        """Of a row of the retention table, usually a mean."""
+        """Return the line of a row of the retention table, usually a mean."""
         n = f"n = {counted(row.success.n_episodes, 'episode')}"
         return cls(
             row.run.label or row.run.model,
@@ -79,7 +79,7 @@ class ProvenanceLine:
 
     @property
     def parts(self) -> tuple[str, str, str, str, str, str, str]:
-        """What a line under a figure says, most important first; random weights are named in capitals.
+        """Return the parts of the line, most important first; random weights are named in capitals.
 
         Model, suite, n, call, target, probes, weights; empty where there is nothing to say.
         """

@@ -1,4 +1,4 @@
-"""What a display contributes to reports and `--figures`: figures, each with how to read it."""
+"""The figures that a display contributes to reports and `--figures`, each with how to read it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -40,7 +40,7 @@ class DrawnRun:
 
 @dataclass(frozen=True)
 class FigureSource:
-    """What figures of a report are made of."""
+    """The table and the runs that figures of a report are made of."""
 
     table: RetentionTable
     runs: tuple[DrawnRun, ...]
@@ -96,5 +96,5 @@ def in_view(title: str, view: str, views: Sequence[str]) -> str:
 
 
 def view_suffix(view: str, views: Sequence[str]) -> str:
-    """Of a file's name; the first view needs none."""
+    """Return the end of a file's name; the first view needs none."""
     return "" if view == views[0] else f"-{view.replace(':', '-')}"

@@ -1,4 +1,4 @@
-"""What all figures share: colours, markers, axes without clutter, and the caption."""
+"""The look that all figures share: colours, markers, axes without clutter, and the caption."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ _LEGEND_ROWS, _ROW_HEIGHT = 2, 0.17
 
 @dataclass(frozen=True)
 class Line:
-    """How one series is drawn; colour is never the only difference."""
+    """The look of one series; colour is never the only difference."""
 
     colour: str
     marker: str
@@ -69,7 +69,7 @@ SERIES = (
 
 
 def series(position: int) -> Line:
-    """How the series at `position` is drawn."""
+    """Return the look of the series at `position`."""
     return SERIES[position % len(SERIES)]
 
 
@@ -126,11 +126,11 @@ def accuracy_axis(axes: "Axes") -> None:
 
 def mark_below(axes: "Axes", places: "ArrayLike", accuracy: "ArrayLike", colour: str) -> None:
     """A mark at the lower edge, with the number, for every accuracy (percent) that the scale does not reach."""
-    for place, value in zip(np.asarray(places), np.asarray(accuracy), strict=True):
+    for at, value in zip(np.asarray(places), np.asarray(accuracy), strict=True):
         if value < ACCURACY[0]:
-            axes.plot([place], [ACCURACY[0] + 1.5], ls="none", marker="v", ms=5, color=colour, gid="below")
+            axes.plot([at], [ACCURACY[0] + 1.5], ls="none", marker="v", ms=5, color=colour, gid="below")
             axes.annotate(
-                f"{value:.0f}", (place, ACCURACY[0] + 1.5), (0, 5), textcoords="offset points", fontsize=6.5,
+                f"{value:.0f}", (at, ACCURACY[0] + 1.5), (0, 5), textcoords="offset points", fontsize=6.5,
                 ha="center", color=colour,
             )  # fmt: skip
 

@@ -54,7 +54,7 @@ class ClassConfusionDisplay(LabelPanel):
         view: str | None = None,
         category: str | None = None,
     ) -> Self:
-        """From stored probes of a binary label or of classes; view, category: the first probed one by default.
+        """Read stored probes of a binary label or of classes; view, category: the first probed one by default.
 
         Raises UnknownSiteError for a view or stream that was not probed, UsageError for a continuous label.
         """
@@ -64,22 +64,22 @@ class ClassConfusionDisplay(LabelPanel):
         if not curve.classes:
             raise UsageError(f"the label {results.settings.target!r} is continuous; expected classes to confuse")
         row = best_row(curve, stream)
-        known = np.arange(len(curve.classes))
+        classes = np.arange(len(curve.classes))
         return cls(
             target=results.settings.target,
             view=view,
             stream=stream,
             site=str(curve.sites[row]),
             classes=curve.classes,
-            counts=confusion_matrix(curve.labels, curve.decisions[row], labels=known),
+            counts=confusion_matrix(curve.labels, curve.decisions[row], labels=classes),
             certificate=ProvenanceLine.of_label(results, category, view),
         )
 
     @property
     def shares(self) -> NDArray[np.float64]:
         """(K, K) of each true class; the mean of the diagonal is the balanced accuracy."""
-        found: NDArray[np.float64] = self.counts / self.counts.sum(axis=1, keepdims=True).clip(1)
-        return found
+        shares: NDArray[np.float64] = self.counts / self.counts.sum(axis=1, keepdims=True).clip(1)
+        return shares
 
     @property
     def title(self) -> str:

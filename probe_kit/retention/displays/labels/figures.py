@@ -21,8 +21,8 @@ def label_figures(runs: Sequence[RunReader], table: LabelRetentionTable) -> list
 
     Nothing is drawn yet. Raises UsageError for a run that the table was not made of.
     """
-    known = {place for place, _ in table.results}
-    if strangers := [str(run.location) for run in runs if str(run.location) not in known]:
+    locations = {location for location, _ in table.results}
+    if strangers := [str(run.location) for run in runs if str(run.location) not in locations]:
         raise UsageError(f"the table has no rows of {', '.join(strangers)}; make it of the runs that are drawn")
     stems = file_names(table.targets)
     return [
@@ -38,8 +38,8 @@ def label_figures(runs: Sequence[RunReader], table: LabelRetentionTable) -> list
 
 def _places(table: LabelRetentionTable, run: RunReader, target: str) -> list[tuple[str, str]]:
     """Categories and views of the table's rows."""
-    own = (row.retention for row in table.rows if row.location == str(run.location))
-    return [(one.category, one.view) for one in own if one.target == target]
+    of_run = (row.retention for row in table.rows if row.location == str(run.location))
+    return [(estimate.category, estimate.view) for estimate in of_run if estimate.target == target]
 
 
 def file_names(targets: Sequence[str]) -> list[str]:
@@ -48,8 +48,8 @@ def file_names(targets: Sequence[str]) -> list[str]:
     for target in targets:
         name = re.sub(r"[^\w.-]+", "-", target).strip(".-") or "label"
         tries = (name, *(f"{name}-{number}" for number in range(2, len(targets) + 1)))
-        taken = {other.casefold() for other in names}
-        names.append(next(one for one in tries if one.casefold() not in taken))
+        used = {other.casefold() for other in names}
+        names.append(next(free for free in tries if free.casefold() not in used))
     return names
 
 

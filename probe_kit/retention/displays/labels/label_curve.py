@@ -69,7 +69,7 @@ class LabelCurveDisplay(LabelPanel):
         view: str | None = None,
         category: str | None = None,
     ) -> Self:
-        """From stored probes; view, category: by default the first. Raises UnknownSiteError for others."""
+        """Read stored probes; view, category: by default the first. Raises UnknownSiteError for others."""
         category, view, curve = label_curve_of(results, view, category)
         rows = rows_of(curve, stream)
         layers = np.array([curve.sites[row].layer for row in rows])
@@ -77,8 +77,8 @@ class LabelCurveDisplay(LabelPanel):
         best = np.array([curve.largest_excess(rows[layers == layer]) for layer in numbers])
         several = int(max((layers == layer).sum() for layer in numbers))
         table = scores_of(results, category, view).set_index("site")
-        shown = table.loc[[str(curve.sites[row]) for row in best]]
-        limits = shown[["ci_low", "ci_high"]].to_numpy(dtype=float).T
+        best_rows = table.loc[[str(curve.sites[row]) for row in best]]
+        limits = best_rows[["ci_low", "ci_high"]].to_numpy(dtype=float).T
         null = curve.null[best]
         band = np.full((2, best.size), np.nan)
         if null.shape[1] >= _ENOUGH:
@@ -99,7 +99,7 @@ class LabelCurveDisplay(LabelPanel):
             chance=curve.chance[best],
             null_low=band[0],
             null_high=band[1],
-            signal=shown["signal"].to_numpy(dtype=bool),
+            signal=best_rows["signal"].to_numpy(dtype=bool),
             control=(controls[0].name, controls[0].score) if controls else None,
             several=several,
             certificate=ProvenanceLine.of_label(results, category, view),
@@ -116,7 +116,7 @@ class LabelCurveDisplay(LabelPanel):
         return f"held-out {self.metric}"
 
     def further_handles(self) -> "list[Artist]":
-        """What filled and open markers are."""
+        """Return the handles of filled and open markers."""
         return list(significance_handles())
 
     def draw(self, axes: "Axes") -> None:
@@ -132,8 +132,15 @@ class LabelCurveDisplay(LabelPanel):
             self.layers, self.score, color=line.colour, lw=1.3, ls=line.dash, marker=line.marker, ms=4.5,
             mfc="white", label=label_of(self.stream),
         )  # fmt: skip
-        shown = self.signal
-        axes.plot(self.layers[shown], self.score[shown], color=line.colour, ls="none", marker=line.marker, ms=4.5)
+        has_signal = self.signal
+        axes.plot(
+            self.layers[has_signal],
+            self.score[has_signal],
+            color=line.colour,
+            ls="none",
+            marker=line.marker,
+            ms=4.5,
+        )
         layer_axis(axes, int(self.layers.max()) + 1)
         if self.several > 1:
             axes.set_xlabel("layer, at its best site", fontsize=8.5)
@@ -141,9 +148,9 @@ class LabelCurveDisplay(LabelPanel):
         axes.set_ylim(min(low, 0.0), max(high, 1.05))
 
     def _draw_ground(self, axes: "Axes") -> None:
-        """What a site is compared with; of a single layer as wide as a step between layers."""
+        """Draw chance and controls; of a single layer as wide as a step between layers."""
         wide = self.layers if self.layers.size > 1 else self.layers + np.array([-0.3, 0.3])
-        band = [np.broadcast_to(one, wide.shape) for one in (self.null_low, self.null_high, self.chance)]
+        band = [np.broadcast_to(edge, wide.shape) for edge in (self.null_low, self.null_high, self.chance)]
         if not np.isnan(self.null_low).any():
             axes.fill_between(wide, band[0], band[1], color=BACKGROUND, lw=0, label="95 % of permuted labels")
         if not np.isnan(self.chance).any():

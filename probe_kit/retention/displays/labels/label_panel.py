@@ -1,4 +1,4 @@
-"""What figures of a label share: a panel per stream of the model, and the site that a panel is of."""
+"""The parts that figures of a label share: a panel per stream of the model, and the site of a panel."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -38,14 +38,14 @@ class LabelPanel(Display):
     @property
     @abstractmethod
     def measure(self) -> str:
-        """What the upright axis counts."""
+        """Return the name of the upright axis."""
 
     @abstractmethod
     def draw(self, axes: "Axes") -> None:
         """Marks with labels for the legend, and the axes' scales."""
 
     def further_handles(self) -> "list[Artist]":
-        """Of the legend, behind those of what is drawn."""
+        """Return handles of the legend, behind those of what is drawn."""
         return []
 
     def plot(self, ax: "Axes | None" = None) -> Self:
@@ -83,18 +83,18 @@ def _draw_legend(figure: "Figure", grid: "Sequence[Axes]", display: LabelPanel) 
     handles: dict[str, Artist] = {}
     for axes in grid:
         handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    if shown := [*handles.values(), *display.further_handles()]:
-        legend_above(figure, shown)
+    if every := [*handles.values(), *display.further_handles()]:
+        legend_above(figure, every)
 
 
 def label_curve_of(results: ProbeResults, view: str | None, category: str | None) -> tuple[str, str, ProbeCurve]:
     """Return category, view and curve, by default the first. Raises UnknownSiteError for others."""
-    own = results.settings
-    view, category = view or own.views[0], category or own.categories[0]
+    settings = results.settings
+    view, category = view or settings.views[0], category or settings.categories[0]
     if (category, view) not in results.curves:
         raise UnknownSiteError(
-            f"view {view!r}, category {category!r} was not probed; probed: {', '.join(own.views)} of "
-            f"{', '.join(own.categories)}"
+            f"view {view!r}, category {category!r} was not probed; probed: {', '.join(settings.views)} of "
+            f"{', '.join(settings.categories)}"
         )
     return category, view, results.curves[category, view]
 

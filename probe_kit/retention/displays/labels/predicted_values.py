@@ -54,7 +54,7 @@ class PredictedValuesDisplay(LabelPanel):
         view: str | None = None,
         category: str | None = None,
     ) -> Self:
-        """From stored probes of a continuous label; view, category: the first probed one by default.
+        """Read stored probes of a continuous label; view, category: the first probed one by default.
 
         Raises UnknownSiteError for a view or stream that was not probed, UsageError for a label of classes.
         """

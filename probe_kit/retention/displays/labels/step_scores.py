@@ -63,7 +63,7 @@ class StepScoresDisplay(LabelPanel):
         view: str | None = None,
         category: str | None = None,
     ) -> Self:
-        """From stored probes; view, category: the first probed one by default.
+        """Read stored probes; view, category: the first probed one by default.
 
         Raises UnknownSiteError for a view or stream that was not probed, UsageError for labels of a single step.
         """
@@ -71,7 +71,7 @@ class StepScoresDisplay(LabelPanel):
         if curve.steps.size < 2:
             raise UsageError(f"the label {results.settings.target!r} has one step; expected several to show")
         row = best_row(curve, stream)
-        own, scores = results.settings, curve.scores[row]
+        settings, scores = results.settings, curve.scores[row]
         table = scores_of(results, category, view).set_index("site")
         balanced = curve.step_scores(scores)
         limits = [
@@ -79,14 +79,14 @@ class StepScoresDisplay(LabelPanel):
                 balanced[at_step],
                 curve.labels[at_step],
                 curve.groups[at_step],
-                own.task,
+                settings.task,
                 curve.deviations[at_step],
             )
             for at_step in (curve.places == step for step in curve.steps)
         ]
         return cls(
-            target=own.target,
-            metric=METRICS[own.task],
+            target=settings.target,
+            metric=METRICS[settings.task],
             view=view,
             stream=stream,
             part=curve.parts[row],
@@ -97,7 +97,9 @@ class StepScoresDisplay(LabelPanel):
             score=curve.by_step(scores),
             low=np.array([low for low, _ in limits]),
             high=np.array([high for _, high in limits]),
-            controls={one.name: np.array(one.by_step) for one in _with_steps(results, category, view, stream)},
+            controls={
+                control.name: np.array(control.by_step) for control in _with_steps(results, category, view, stream)
+            },
             certificate=ProvenanceLine.of_label(results, category, view),
         )
 
@@ -112,7 +114,7 @@ class StepScoresDisplay(LabelPanel):
         return f"{self.metric} at each step"
 
     def further_handles(self) -> "list[Artist]":
-        """What filled and open markers are."""
+        """Return the handles of filled and open markers."""
         return list(significance_handles())
 
     def draw(self, axes: "Axes") -> None:
@@ -141,8 +143,10 @@ class StepScoresDisplay(LabelPanel):
 def _with_steps(results: ProbeResults, category: str, view: str, stream: str) -> list[ControlScore]:
     """The best control and `step`, each once; none of controls that were stored without scores by step."""
     steps = results.curves[category, view].steps.size
-    own = [one for one in results.controls.of_stream(category, view, stream) if len(one.by_step) == steps]
-    return [one for number, one in enumerate(own) if number == 0 or one.name == STEP]
+    controls = [
+        control for control in results.controls.of_stream(category, view, stream) if len(control.by_step) == steps
+    ]
+    return [control for number, control in enumerate(controls) if number == 0 or control.name == STEP]
 
 
 def _whole_numbers(axes: "Axes", label: str) -> None:
