@@ -105,24 +105,24 @@ class Commands(typer.core.TyperGroup):
         option = error.option_name if hasattr(error, "possibilities") else None
         homes = [path for path, command in commands_of(self, ctx) if option in _options(command)]
         if homes:
-            named = ", ".join(f"`probe-kit {path}`" for path in homes)
+            listed = ", ".join(f"`probe-kit {path}`" for path in homes)
             error.message, error.possibilities = (
-                f"{option} is not an option of this command, but of {named}.",
+                f"{option} is not an option of this command, but of {listed}.",
                 None,
             )
         error.message = terminal_safe(str(error.message))
-        found: Exception = error
-        return found
+        advised: Exception = error
+        return advised
 
 
 def commands_of(group: Any, ctx: Any, prefix: str = "") -> list[tuple[str, Any]]:
     """Every command below `group` with its path, such as `suite build`."""
-    found: list[tuple[str, Any]] = []
+    commands: list[tuple[str, Any]] = []
     for name in group.list_commands(ctx):
         command = group.get_command(ctx, name)
         path = f"{prefix}{name}"
-        found += commands_of(command, ctx, f"{path} ") if hasattr(command, "commands") else [(path, command)]
-    return found
+        commands += commands_of(command, ctx, f"{path} ") if hasattr(command, "commands") else [(path, command)]
+    return commands
 
 
 def _options(command: Any) -> set[str]:
@@ -140,8 +140,8 @@ app = typer.Typer(
 )
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(requested: bool) -> None:
+    if requested:
         from probe_kit import __version__
 
         out.print(f"probe-kit {__version__}")
@@ -154,7 +154,7 @@ def _before_commands(
         bool, typer.Option("--version", help="Print the version and stop.", callback=_print_version, is_eager=True)
     ] = False,
 ) -> None:
-    """What stands in front of every command."""
+    """Read the options in front of every command."""
 
 
 def _stored_runs_of_study(name: str) -> "list[Run] | None":
@@ -177,7 +177,7 @@ for command in (
     app.command(rich_help_panel=_PANEL_OF[command.__name__.replace("_", "-")])(command)
 app.command(cls=KindHelp, rich_help_panel=_PANEL_OF["intervene"])(intervene)
 RUNS_BY_NAME.append(_stored_runs_of_study)
-for group in (app, *(named.typer_instance for named in app.registered_groups)):
+for group in (app, *(registered.typer_instance for registered in app.registered_groups)):
     for registered in group.registered_commands if group else ():
         if registered.cls is not KindHelp:
             registered.cls = PanelledHelp

@@ -48,11 +48,11 @@ class Finding:
 
     subject: str
     state: State
-    seen: str
+    result: str
     advice: str = ""
 
     def to_json(self) -> dict[str, str]:
-        """As `probe-kit doctor --json` prints it."""
+        """Return the finding as `probe-kit doctor --json` prints it."""
         return asdict(self)
 
 
@@ -69,10 +69,10 @@ def examine() -> list[Finding]:
 
 def _python() -> Finding:
     low, below = _PYTHONS
-    seen = f"{sys.version.split()[0]} on {sys.platform}"
+    described = f"{sys.version.split()[0]} on {sys.platform}"
     if low <= sys.version_info[:2] < below:
-        return Finding("python", "ok", seen)
-    return Finding("python", "missing", seen, "Use Python 3.12 or 3.13: `uv venv --python 3.12`")
+        return Finding("python", "ok", described)
+    return Finding("python", "missing", described, "Use Python 3.12 or 3.13: `uv venv --python 3.12`")
 
 
 def _processor() -> Finding:
@@ -85,19 +85,21 @@ def _memory() -> Finding:
     available = _available_memory()
     if available is None:
         return Finding("memory", "note", "cannot be read on this system", "The demo needs about 2 GB")
-    seen = f"{available / 1e9:.1f} GB available"
+    described = f"{available / 1e9:.1f} GB available"
     if available < DEMO_MEMORY:
-        return Finding("memory", "note", seen, "The demo needs about 2 GB; close something, or it may be killed")
-    return Finding("memory", "ok", seen)
+        return Finding(
+            "memory", "note", described, "The demo needs about 2 GB; close something, or it may be killed"
+        )
+    return Finding("memory", "ok", described)
 
 
 def _available_memory() -> float | None:
     """Bytes, as Linux counts them; elsewhere all of the machine's, or None."""
     meminfo = Path("/proc/meminfo")
     if meminfo.is_file():
-        found = re.search(r"MemAvailable:\s+(\d+) kB", meminfo.read_text(encoding="utf-8"))
-        if found:
-            return float(found[1]) * 1024
+        match = re.search(r"MemAvailable:\s+(\d+) kB", meminfo.read_text(encoding="utf-8"))
+        if match:
+            return float(match[1]) * 1024
     if "SC_PHYS_PAGES" in os.sysconf_names:
         return float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
     return None
@@ -105,16 +107,16 @@ def _available_memory() -> float | None:
 
 def _disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free
-    seen = f"{free / 1e9:.1f} GB free here"
+    described = f"{free / 1e9:.1f} GB free here"
     if free < DEMO_DISK:
         return Finding(
-            "disk", "missing", seen, f"The demo needs {DEMO_DISK / 1e6:.0f} MB: run it elsewhere (--out)"
+            "disk", "missing", described, f"The demo needs {DEMO_DISK / 1e6:.0f} MB: run it elsewhere (--out)"
         )
     if free < ROOMY_DISK:
         return Finding(
-            "disk", "note", seen, "Enough for the demo; a full-size model and its runs want 20 GB and more"
+            "disk", "note", described, "Enough for the demo; a full-size model and its runs want 20 GB and more"
         )
-    return Finding("disk", "ok", seen)
+    return Finding("disk", "ok", described)
 
 
 # -- trials in processes of their own --------------------------------------------------------------------------
@@ -173,34 +175,34 @@ def let_policy_act() -> dict[str, Any]:
 
 def _scene() -> list[Finding]:
     advice = "pybullet is compiled on installation: it needs a C++ compiler, and numpy at that time"
-    found = _trial("simulator", "draw_scene", advice)
-    if isinstance(found, Finding):
-        return [found]
-    simulator = Finding("simulator", "ok", f"pybullet {found['pybullet']} with numpy")
-    if not found["numpy"]:
+    trial = _trial("simulator", "draw_scene", advice)
+    if isinstance(trial, Finding):
+        return [trial]
+    simulator = Finding("simulator", "ok", f"pybullet {trial['pybullet']} with numpy")
+    if not trial["numpy"]:
         advice = f"Build it again beside numpy: `{install_command(rebuild='pybullet')}`"
-        seen = f"pybullet {found['pybullet']} without numpy: pictures cost three times as much"
-        simulator = Finding("simulator", "note", seen, advice)
+        described = f"pybullet {trial['pybullet']} without numpy: pictures cost three times as much"
+        simulator = Finding("simulator", "note", described, advice)
     drawn = (
-        f"TinyRenderer (no GPU, no display needed; EGL is not used), {found['size']} in {found['seconds']:.2f} s"
+        f"TinyRenderer (no GPU, no display needed; EGL is not used), {trial['size']} in {trial['seconds']:.2f} s"
     )
     return [simulator, Finding("renderer", "ok", drawn)]
 
 
 def _policy() -> list[Finding]:
-    found = _trial("policy", "let_policy_act", f"Install again: `{install_command()}`")
-    if isinstance(found, Finding):
-        return [found]
-    acted = f"pi0-tiny acts (torch {found['torch']}, lerobot {found['lerobot']})"
-    return [Finding("policy", "ok", acted), _gpu(found["gpus"])]
+    trial = _trial("policy", "let_policy_act", f"Install again: `{install_command()}`")
+    if isinstance(trial, Finding):
+        return [trial]
+    acted = f"pi0-tiny acts (torch {trial['torch']}, lerobot {trial['lerobot']})"
+    return [Finding("policy", "ok", acted), _gpu(trial["gpus"])]
 
 
 def _gpu(gpus: list[dict[str, Any]]) -> Finding:
     if not gpus:
         advice = "The demo needs none; pi0 wants a GPU of 16 GB or more, and drivers that torch finds"
         return Finding("gpu", "note", "none that torch can use", advice)
-    seen = ", ".join(f"{gpu['name']} with {gpu['gigabytes']:.0f} GB" for gpu in gpus)
-    return Finding("gpu", "ok", seen)
+    described = ", ".join(f"{gpu['name']} with {gpu['gigabytes']:.0f} GB" for gpu in gpus)
+    return Finding("gpu", "ok", described)
 
 
 def _trial(subject: str, function: str, advice: str) -> "dict[str, Any] | Finding":
@@ -211,16 +213,16 @@ def _trial(subject: str, function: str, advice: str) -> "dict[str, Any] | Findin
     """
     code = f"import json, probe_kit.doctor as d; print('\\n' + json.dumps(d.{function}()))"
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", code], capture_output=True, encoding="utf-8", errors="replace",
             timeout=PATIENCE, check=False,
         )  # fmt: skip
     except subprocess.TimeoutExpired:
         return Finding(subject, "note", f"not known: no answer within {PATIENCE} s{_load()}", TRY_AGAIN)
-    if done.returncode != 0:
-        words = done.stderr.strip().splitlines() or ["no message"]
-        return Finding(subject, "missing", f"ended with code {done.returncode}: {words[-1]}", advice)
-    answer: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    if process.returncode != 0:
+        words = process.stderr.strip().splitlines() or ["no message"]
+        return Finding(subject, "missing", f"ended with code {process.returncode}: {words[-1]}", advice)
+    answer: dict[str, Any] = json.loads(process.stdout.strip().splitlines()[-1])
     return answer
 
 
@@ -256,10 +258,10 @@ def _tokenizers() -> list[Finding]:
 
     findings = [Finding("tokenizer", "ok", "pi0-tiny: embedded")]
     for family, repository in TOKENIZERS.items():
-        here = isinstance(try_to_load_from_cache(repository, "tokenizer_config.json"), str)
-        advice = "" if here else f"Comes with the model, or `hf download {repository} --include 'tokenizer*'`"
-        seen = f"{family}: {repository} {'is in the cache' if here else 'is not in the cache'}"
-        findings.append(Finding("tokenizer", "ok" if here else "note", seen, advice))
+        is_cached = isinstance(try_to_load_from_cache(repository, "tokenizer_config.json"), str)
+        advice = "" if is_cached else f"Comes with the model, or `hf download {repository} --include 'tokenizer*'`"
+        described = f"{family}: {repository} {'is in the cache' if is_cached else 'is not in the cache'}"
+        findings.append(Finding("tokenizer", "ok" if is_cached else "note", described, advice))
     return findings
 
 
@@ -267,18 +269,20 @@ def _extras() -> list[Finding]:
     """Optional dependencies by extra; Ray is one of them."""
     needed: dict[str, list[str]] = {}
     for requirement in requires("probe-kit") or ():
-        found = re.match(r"([\w.-]+).*extra == ['\"]([\w-]+)['\"]", requirement)
-        if found:
-            needed.setdefault(found[2], []).append(found[1])
+        match = re.match(r"([\w.-]+).*extra == ['\"]([\w-]+)['\"]", requirement)
+        if match:
+            needed.setdefault(match[2], []).append(match[1])
     return [_extra(name, packages) for name, packages in needed.items()]
 
 
 def _extra(name: str, packages: list[str]) -> Finding:
-    here = {package: _installed(package) for package in packages}
-    lacking = [package for package, found in here.items() if found is None]
+    versions = {package: _installed(package) for package in packages}
+    lacking = [package for package, version in versions.items() if version is None]
     if lacking:
         return Finding(f"extra {name}", "note", f"without {', '.join(lacking)}", f"`{install_command(name)}`")
-    return Finding(f"extra {name}", "ok", ", ".join(f"{package} {found}" for package, found in here.items()))
+    return Finding(
+        f"extra {name}", "ok", ", ".join(f"{package} {version}" for package, version in versions.items())
+    )
 
 
 def _installed(package: str) -> str | None:

@@ -38,5 +38,5 @@ def _print_findings(findings: "list[Finding]") -> None:
     for finding in findings:
         advice = marked("\n[dim]{}[/]", finding.advice) if finding.advice else ""
         mark = marked(f"[{colours[finding.state]}]{{}}[/]", finding.state)
-        table.add_row(mark, finding.subject, Text.assemble(finding.seen, advice))
+        table.add_row(mark, finding.subject, Text.assemble(finding.result, advice))
     out.print(table)

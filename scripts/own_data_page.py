@@ -69,7 +69,7 @@ def play(where: Path) -> tuple[pk.Run, list[list[Observation]]]:
     def watched(controller: PolicyController, turns: Any) -> Any:
         for turn in turns:
             assert isinstance(turn, Turn)
-            shown.setdefault(turn.seed, []).append(turn.seen)
+            shown.setdefault(turn.seed, []).append(turn.observation)
         return act(controller, turns)
 
     PolicyController.act = watched  # type: ignore[method-assign]

@@ -85,14 +85,14 @@ class TaskQueue[T]:
 
     def take(self, slot: int) -> T | None:
         """Return the next task for a worker; None if it should finish what it holds, or wait."""
-        held = self._held[slot]
-        if any(key in self._failures for key in held):
+        tasks = self._held[slot]
+        if any(key in self._failures for key in tasks):
             return None
         self.read_ahead()
-        for waiting in (self._fresh, {} if held else self._suspects):
+        for waiting in (self._fresh, {} if tasks else self._suspects):
             for key, task in waiting.items():
                 if self._fits is None or self._fits(slot, task):
-                    held[key] = waiting.pop(key)
+                    tasks[key] = waiting.pop(key)
                     return task
         return None
 
@@ -172,12 +172,12 @@ def _hand_out(pool: Pool, queue: TaskQueue[Any], idle: set[int]) -> None:
 
 
 def _take_back[T](queue: TaskQueue[T], slot: int, lost: Lost) -> Iterator[GivenUp[T]]:
-    held = queue.holds(slot)
-    names = [*map(str, held)][:_NAMED_TASKS] + ["…"] * (len(held) > _NAMED_TASKS)
-    count = f"{len(held)} {queue.noun}s" if len(held) > 1 else f"the {queue.noun}"
-    again = f"{count} it held ({', '.join(names)}) will be tried again" if held else f"it held no {queue.noun}"
+    tasks = queue.holds(slot)
+    names = [*map(str, tasks)][:_NAMED_TASKS] + ["…"] * (len(tasks) > _NAMED_TASKS)
+    count = f"{len(tasks)} {queue.noun}s" if len(tasks) > 1 else f"the {queue.noun}"
+    again = f"{count} it held ({', '.join(names)}) will be tried again" if tasks else f"it held no {queue.noun}"
     warnings.warn(f"{lost}; {again}", WorkerLostWarning, stacklevel=3)
-    for key, task in held.items():
+    for key, task in tasks.items():
         if not queue.retry(slot, key, lost.counts):
             yield GivenUp(task, str(lost))
 

@@ -36,8 +36,8 @@ def open_arrays(source: Path | BinaryIO | bytes) -> "NpzFile":
             _check_header(packed, entry)
     if not isinstance(content, Path):
         content.seek(0)
-    found: NpzFile = np.load(content, allow_pickle=False)
-    return found
+    archive: NpzFile = np.load(content, allow_pickle=False)
+    return archive
 
 
 def _check_header(packed: ZipFile, entry: ZipInfo) -> None:

@@ -52,14 +52,14 @@ def read_regular_text(path: Path, most: int = MOST_BYTES) -> str:
     return read_regular(path, most).decode("utf-8")
 
 
-def _check(path: Path, found: os.stat_result, most: int) -> None:
-    kind = stat.S_IFMT(found.st_mode)
+def _check(path: Path, status: os.stat_result, most: int) -> None:
+    kind = stat.S_IFMT(status.st_mode)
     if kind == stat.S_IFDIR:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if kind != stat.S_IFREG:
         raise OSError(errno.EINVAL, f"it is {_KINDS.get(kind, 'no file')}; expected a regular file", str(path))
-    if found.st_size > most:
-        raise _too_large(path, found.st_size, most)
+    if status.st_size > most:
+        raise _too_large(path, status.st_size, most)
 
 
 def _too_large(path: Path, size: int, most: int) -> OSError:

@@ -16,7 +16,7 @@ MOST_VALUES = 1 << 25
 _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
 
-def parse_json(content: bytes | str, **further: Any) -> Any:
+def parse_json(content: bytes | str, **options: Any) -> Any:
     """The value. further: hooks of `json.loads`.
 
     Raises ValueError for text that is not UTF-8 or JSON, nests too deeply, has half characters, repeats a key, or
@@ -26,7 +26,7 @@ def parse_json(content: bytes | str, **further: Any) -> Any:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
         if len(text) > MOST_VALUES and (most := sum(map(text.count, ",[{"))) > MOST_VALUES:
             raise ValueError(f"it may hold {most:,} values; expected at most {MOST_VALUES:,}")
-        value = json.loads(text, object_pairs_hook=_distinct, **further)
+        value = json.loads(text, object_pairs_hook=_distinct, **options)
         (json.dumps(value, ensure_ascii=False) if _HALF.search(text) else text).encode()
     except RecursionError:
         raise ValueError("it nests too deeply") from None

@@ -16,7 +16,7 @@ _SUFFIX = ".tmp"
 
 @contextmanager
 def draft_of(path: Path) -> Iterator[Path]:
-    """Where to make the file or folder `path`, which the body renames when it is whole; gone afterwards.
+    """Yield a path for the file or folder `path`, which the body renames when it is whole; gone afterwards.
 
     A draft lies in a hidden folder beside `path`, `.<name>.<letters>.tmp`, which is locked as long as its process
     lives. Those that killed processes left for the same `path` are removed first.

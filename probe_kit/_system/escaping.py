@@ -32,10 +32,10 @@ def csv_of_frame(frame: "pd.DataFrame") -> str:
     import pandas as pd
 
     safe = frame.rename(columns=escaped)
-    for place, (_, column) in enumerate(frame.items()):
+    for position, (_, column) in enumerate(frame.items()):
         if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_datetime64_any_dtype(column)):
             cells = pd.Series([escaped(cell) for cell in column], index=column.index, dtype=object)
-            safe.isetitem(place, cells.array)
+            safe.isetitem(position, cells.array)
     lines = _Lines()
     safe.to_csv(lines, index=False, lineterminator=_Lines.END)
     return lines.getvalue()
@@ -85,8 +85,8 @@ def markdown_safe(text: str) -> str:
     return _MARKUP.sub(_escaped, re.sub(r"\s*[\r\n\u2028\u2029]+\s*", " ", text))
 
 
-def _escaped(found: re.Match[str]) -> str:
-    sign = found[0].lstrip()
+def _escaped(match: re.Match[str]) -> str:
+    sign = match[0].lstrip()
     if sign[0].isdigit():
-        return f"{found[0][:-1]}\\{sign[-1]}"
-    return found[0][: len(found[0]) - len(sign)] + f"\\{sign}"
+        return f"{match[0][:-1]}\\{sign[-1]}"
+    return match[0][: len(match[0]) - len(sign)] + f"\\{sign}"

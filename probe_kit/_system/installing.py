@@ -68,5 +68,5 @@ def _uv() -> str:
 def _python() -> str:
     """The running Python as a shell finds it."""
     name = Path(sys.executable).name
-    found = shutil.which(name)
-    return name if found is not None and Path(found) == Path(sys.executable) else shlex.quote(sys.executable)
+    path = shutil.which(name)
+    return name if path is not None and Path(path) == Path(sys.executable) else shlex.quote(sys.executable)

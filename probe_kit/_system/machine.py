@@ -23,16 +23,16 @@ def check_device_name(device: str, present: bool = True) -> None:
 
     present: False accepts a device of another machine.
     """
-    found = _DEVICE.fullmatch(device)
-    if found is None or found["kind"] not in _KINDS:
+    match = _DEVICE.fullmatch(device)
+    if match is None or match["kind"] not in _KINDS:
         raise UsageError(
             f"device {device!r} cannot be used: it is none of {', '.join(_KINDS)}, with an index such as cuda:1. "
             f"{what_is_here()}"
         )
     if not present:
         return
-    if (found["kind"] == "cuda" and _surely_without_gpu()) or (
-        found["kind"] == "mps" and sys.platform != "darwin"
+    if (match["kind"] == "cuda" and _surely_without_gpu()) or (
+        match["kind"] == "mps" and sys.platform != "darwin"
     ):
         raise UsageError(f"device {device!r} cannot be used: this machine has no such device. {what_is_here()}")
 
@@ -63,9 +63,9 @@ def _of_system() -> list[str]:
     if sys.platform == "darwin":
         return ["mps"]
     models = [
-        found[1].strip()
+        match[1].strip()
         for card in sorted(_NVIDIA.glob("*/information"))
-        if (found := re.search(r"^Model:(.*)$", card.read_text(errors="replace", encoding="utf-8"), re.MULTILINE))
+        if (match := re.search(r"^Model:(.*)$", card.read_text(errors="replace", encoding="utf-8"), re.MULTILINE))
     ]
     return [f"{counted(len(models), 'GPU')} ({', '.join(dict.fromkeys(models))})"] if models else []
 

@@ -32,15 +32,15 @@ def open_parquet(source: Path | BinaryIO, extra: str) -> Iterator[Any]:
     """
     parquet = require("pyarrow.parquet", extra)
     if isinstance(source, Path):
-        with open_regular(source, MOST_FILE_BYTES) as opened, open_parquet(opened, extra) as found:
-            yield found
+        with open_regular(source, MOST_FILE_BYTES) as opened, open_parquet(opened, extra) as file:
+            yield file
         return
     metadata = parquet.read_metadata(source)
     columns = [metadata.schema.column(number) for number in range(metadata.num_columns)]
-    texts = [one.path for one in columns if one.physical_type == _TEXT and one.path == one.name]
+    texts = [column.path for column in columns if column.physical_type == _TEXT and column.path == column.name]
     source.seek(0)
-    with parquet.ParquetFile(source, read_dictionary=texts) as found:
-        yield found
+    with parquet.ParquetFile(source, read_dictionary=texts) as file:
+        yield file
 
 
 def read_parquet(parquet: Any, columns: Sequence[str] | None = None, groups: Sequence[int] | None = None) -> Any:
@@ -57,8 +57,11 @@ def read_parquet(parquet: Any, columns: Sequence[str] | None = None, groups: Seq
     for batch in parquet.iter_batches(batch_size=rows, row_groups=list(groups), columns=names):
         total += sum(map(_decoded_bytes, batch.columns))
         _check(total, MOST_BYTES, "bytes")
-        plain = [one.dictionary_decode() if pa.types.is_dictionary(one.type) else one for one in batch.columns]
-        fields = [field.with_type(one.type) for field, one in zip(batch.schema, plain, strict=True)]
+        plain = [
+            column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
+            for column in batch.columns
+        ]
+        fields = [field.with_type(column.type) for field, column in zip(batch.schema, plain, strict=True)]
         batches.append(pa.RecordBatch.from_arrays(plain, schema=pa.schema(fields, batch.schema.metadata)))
     if batches:
         return pa.Table.from_batches(batches)
@@ -86,10 +89,10 @@ def _check_sizes(metadata: Any, columns: Sequence[str] | None, groups: Sequence[
     return max(1, min(_ROWS, _BATCH_BYTES // longest))
 
 
-def _check(found: int, most: int, unit: str) -> None:
-    if found > most:
+def _check(size: int, most: int, unit: str) -> None:
+    if size > most:
         raise TooLargeError(
-            f"its cells have {found:,} {unit} once they are read; expected at most {most:,}. Give a smaller "
+            f"its cells have {size:,} {unit} once they are read; expected at most {most:,}. Give a smaller "
             "table, or leave columns out"
         )
 

@@ -99,7 +99,7 @@ def check_spellings(cells: Sequence[Any], where: Callable[[int], str], error: Ca
 
 
 def _spelling(cell: str) -> tuple[str, str]:
-    """What two spellings of one name share, and the spelling: of a number its zeros in front."""
+    """The part that two spellings of one name share, and the spelling: of a number its zeros in front."""
     number = number_of(cell)
     if number is None:
         return "".join(sign for sign in cell.casefold() if category(sign) != "Cf"), cell

@@ -140,7 +140,7 @@ def _separator(
     best = [separator for separator in several if keyed[separator] == most]
     if len(best) > 1 and most:
         raise error(
-            f"{path}: its heading has {' and '.join(SEPARATORS[one] for one in best)}; expected one separator. "
+            f"{path}: its heading has {' and '.join(SEPARATORS[name] for name in best)}; expected one separator. "
             "Write sep=; as the first line, with the right one"
         )
     return best[0]

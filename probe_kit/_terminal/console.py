@@ -50,15 +50,15 @@ class SafeConsole(Console):
         raise BrokenPipeError(EPIPE, "the reader has gone")
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """What is drawn, with visible signs in place of what the terminal would obey."""
+        """Draw with visible signs in place of what the terminal would obey."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=terminal_safe(segment.text))
 
 
 def marked(template: str, *values: object) -> Text:
     """A template of ours with rich's markup and a `{}` for each value; what stands in a value is text only."""
-    whole = Text.from_markup(template, emoji=False)
-    parts = whole.split("{}", allow_blank=True, include_separator=True)
+    text = Text.from_markup(template, emoji=False)
+    parts = text.split("{}", allow_blank=True, include_separator=True)
     filled = iter(values)
     for part in parts:
         if part.plain.endswith("{}"):
@@ -89,7 +89,7 @@ def split(text: str | None) -> tuple[str, ...] | None:
 
 
 def whole_number(text: str) -> int | None:
-    """What a text of up to nine digits says, None for any other."""
+    """Return the number of a text of up to nine digits, None for any other."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < 10 else None
 
 
@@ -111,9 +111,9 @@ def print_json_text(text: str) -> None:
     typer.echo(safe)
 
 
-def _escaped(found: re.Match[str]) -> str:
+def _escaped(match: re.Match[str]) -> str:
     """A sign as JSON writes it in ASCII: one escape, or the two of a surrogate pair."""
-    return json.dumps(found[0])[1:-1] if ord(found[0]) != 0x7F else "\\u007f"
+    return json.dumps(match[0])[1:-1] if ord(match[0]) != 0x7F else "\\u007f"
 
 
 def print_text(text: str) -> None:
@@ -153,7 +153,7 @@ def counter(bar: Progress, description: str) -> Callable[..., None]:
         return Heartbeat(description, say)
     task = bar.add_task(description, total=None)
 
-    def advance(done: int, total: int, *_: object) -> None:
-        bar.update(task, completed=done, total=total)
+    def advance(finished: int, total: int, *_: object) -> None:
+        bar.update(task, completed=finished, total=total)
 
     return advance

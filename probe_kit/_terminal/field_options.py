@@ -80,7 +80,7 @@ class FieldOption:
 def options_of(model: type[BaseModel]) -> Iterator[FieldOption]:
     """The options among the fields of a model, in their order."""
     for name, info in model.model_fields.items():
-        for option in (one for one in info.metadata if isinstance(one, OptionInfo)):
+        for option in (entry for entry in info.metadata if isinstance(entry, OptionInfo)):
             texts = (option.default, *(option.param_decls or ()))
             declared = (str(text).rpartition("/")[2].strip() for text in texts)
             flag = next(text for text in declared if text.startswith("--"))
@@ -97,26 +97,26 @@ def command_with(
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        first, *own = inspect.signature(command, eval_str=True).parameters.values()
-        names = {one.name for one in own}
+        first, *parameters = inspect.signature(command, eval_str=True).parameters.values()
+        names = {parameter.name for parameter in parameters}
         added: dict[str, inspect.Parameter] = {}
-        for one in chain.from_iterable(map(options_of, models)):
-            if one.parameter not in names and offers(one.parameter):
-                added.setdefault(one.parameter, _parameter(one))
+        for option in chain.from_iterable(map(options_of, models)):
+            if option.parameter not in names and offers(option.parameter):
+                added.setdefault(option.parameter, _parameter(option))
 
         def run(context: typer.Context, **values: Any) -> None:
             typed = {
                 name: value for name in added if _was_typed(context, name) and (value := values[name]) is not None
             }
-            command(typed, **{one.name: values[one.name] for one in own})
+            command(typed, **{parameter.name: values[parameter.name] for parameter in parameters})
 
-        required = [one for one in added.values() if one.name in _required(models)]
-        others = [one for one in (*own, *added.values()) if one not in required]
-        ordered = [*required, *sorted(others, key=lambda one: _panel(one) is not None)]
+        required = [parameter for parameter in added.values() if parameter.name in _required(models)]
+        optional = [parameter for parameter in (*parameters, *added.values()) if parameter not in required]
+        ordered = [*required, *sorted(optional, key=lambda parameter: _panel(parameter) is not None)]
         context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-        keyword = [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in ordered]
+        keyword = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in ordered]
         run.__signature__ = inspect.Signature([context, *keyword])  # type: ignore[attr-defined]
-        run.__annotations__ = {one.name: one.annotation for one in (context, *keyword)}
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in (context, *keyword)}
         run.__name__, run.__doc__, run.__module__ = command.__name__, command.__doc__, command.__module__
         run.__wrapped__ = command  # type: ignore[attr-defined]
         del first
@@ -128,15 +128,20 @@ def command_with(
 def _required(models: Iterable[type[BaseModel]]) -> set[str]:
     """The parameters that every command line has: those of required fields, but for fields that choose a model."""
     first = next(iter(models), None)
-    return set() if first is None else {one.parameter for one in options_of(first) if one.info.is_required()}
+    return (
+        set() if first is None else {option.parameter for option in options_of(first) if option.info.is_required()}
+    )
 
 
-def _parameter(one: FieldOption) -> inspect.Parameter:
-    required = one.info.is_required()
-    default = None if required or one.typed == list[str] | None else one.info.default
-    typed = one.typed | None if default is None and one.typed is not object else one.typed
+def _parameter(offered: FieldOption) -> inspect.Parameter:
+    required = offered.info.is_required()
+    default = None if required or offered.typed == list[str] | None else offered.info.default
+    typed = offered.typed | None if default is None and offered.typed is not object else offered.typed
     return inspect.Parameter(
-        one.parameter, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[typed, one.option]
+        offered.parameter,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=default,
+        annotation=Annotated[typed, offered.option],
     )
 
 
@@ -146,9 +151,9 @@ def _was_typed(context: typer.Context, name: str) -> bool:
 
 
 def _panel(parameter: inspect.Parameter) -> str | None:
-    for one in get_args(parameter.annotation)[1:]:
-        if isinstance(one, OptionInfo):
-            return one.rich_help_panel
+    for entry in get_args(parameter.annotation)[1:]:
+        if isinstance(entry, OptionInfo):
+            return entry.rich_help_panel
     return None
 
 
@@ -157,10 +162,10 @@ def _bare(annotation: Any) -> Any:
     if get_origin(annotation) is Annotated:
         return _bare(get_args(annotation)[0])
     if get_origin(annotation) in (Union, UnionType):
-        return Union[tuple(_bare(one) for one in get_args(annotation))]  # noqa: UP007 - made of a tuple
+        return Union[tuple(_bare(member) for member in get_args(annotation))]  # noqa: UP007 - made of a tuple
     return annotation
 
 
 def plain(value: Mapping[str, Any]) -> dict[str, Any]:
     """The entries that are neither None nor False: those that were chosen."""
-    return {name: one for name, one in value.items() if one is not None and one is not False}
+    return {name: entry for name, entry in value.items() if entry is not None and entry is not False}

@@ -16,7 +16,7 @@ def leave_at_once() -> None:
 
 
 def begun() -> None:
-    """From here on both are a KeyboardInterrupt, because work could be under way that is to be kept."""
+    """Make both a KeyboardInterrupt from here on, because work could be under way that is to be kept."""
     for number in _ENDING:
         if signal.getsignal(number) is _leave:
             signal.signal(number, signal.default_int_handler)

@@ -37,7 +37,7 @@ def rows_html(title: str, columns: Sequence[str], rows: Iterable[Sequence[object
 
 
 def _safe(text: str) -> str:
-    """For HTML, and without the places of this machine: notebooks are sent to others."""
+    """Escape for HTML, without the places of this machine: notebooks are sent to others."""
     return escape(without_places(text))
 
 
@@ -64,14 +64,14 @@ class _Bar:
         self._drawn = 0.0
         self._handle: Any = None
 
-    def __call__(self, done: int, total: int, *_: object) -> None:
+    def __call__(self, finished: int, total: int, *_: object) -> None:
         now = time.monotonic()
-        if self._handle is not None and done < total and now - self._drawn < _REDRAW_S:
+        if self._handle is not None and finished < total and now - self._drawn < _REDRAW_S:
             return
         self._drawn = now
         from IPython.display import display
 
-        picture = _Drawn(self._label, done, total, now - self._started)
+        picture = _Drawn(self._label, finished, total, now - self._started)
         if self._handle is None:
             self._handle = display(picture, display_id=True)  # type: ignore[no-untyped-call]
         else:
@@ -81,10 +81,10 @@ class _Bar:
 class _Drawn:
     """One state of a bar."""
 
-    def __init__(self, label: str, done: int, total: int, seconds: float) -> None:
-        left = f", about {seconds * (total - done) / done:.0f} s left" if 0 < done < total else ""
-        self._text = f"{label}: {done} of {total}, {seconds:.0f} s{left}"
-        self._done, self._total = done, total
+    def __init__(self, label: str, finished: int, total: int, seconds: float) -> None:
+        remaining = f", about {seconds * (total - finished) / finished:.0f} s left" if 0 < finished < total else ""
+        self._text = f"{label}: {finished} of {total}, {seconds:.0f} s{remaining}"
+        self._done, self._total = finished, total
 
     def __repr__(self) -> str:
         return self._text

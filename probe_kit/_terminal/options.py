@@ -35,7 +35,7 @@ class Names(tuple[str, ...]):
         return cls(split(text) or ()) if isinstance(text, str) else text
 
     def __str__(self) -> str:
-        """As it is typed."""
+        """Return the names as they are typed."""
         return ",".join(self)
 
 
@@ -50,14 +50,14 @@ NAMED: Any = LISTED | {"parser": read_categories}
 """The same for categories."""
 
 
-def check_no_others(given: Mapping[str, object], what: str = "labels of your own") -> None:
+def check_no_others(typed: Mapping[str, object], what: str = "labels of your own") -> None:
     """Raise UsageError for an option that does not go with `what`. given: options, with whether they are given."""
-    if wrong := [name for name, value in given.items() if value]:
+    if wrong := [name for name, value in typed.items() if value]:
         raise UsageError(f"{wrong[0]} is not for {what}; leave it out")
 
 
 def choices(names: Collection[object]) -> str:
-    """How help shows what an option accepts, such as `<one|two>`."""
+    """Return the choices of an option as help shows them, such as `<one|two>`."""
     return f"<{'|'.join(map(str, names))}>"
 
 
@@ -78,17 +78,17 @@ def some_of(names: Collection[str], none: str | None = None) -> Callable[[str | 
             return text
         if text == none:
             return Names()
-        found = Names.parse(text)
-        if not found:
+        parts = Names.parse(text)
+        if not parts:
             raise typer.BadParameter(f"it is empty; expected some of {', '.join(names)}")
-        return Names(_checked(part, names) for part in found)
+        return Names(_checked(part, names) for part in parts)
 
     return parse
 
 
-def _checked(name: str, known: Collection[str]) -> str:
-    if name not in known:
-        raise typer.BadParameter(f"{name!r} is not one of {', '.join(map(repr, known))}.")
+def _checked(name: str, choices: Collection[str]) -> str:
+    if name not in choices:
+        raise typer.BadParameter(f"{name!r} is not one of {', '.join(map(repr, choices))}.")
     return name
 
 

@@ -23,26 +23,30 @@ class PanelledHelp(typer.core.TyperCommand):
 
     def get_params(self, ctx: Any) -> list[Any]:
         """All options, or the most used ones while `--help` prints them."""
-        found = super().get_params(ctx)
-        return [one for one in found if not _panel_of(one)] if ctx.meta.get(_MAIN_ONLY) else found
+        parameters = super().get_params(ctx)
+        return (
+            [parameter for parameter in parameters if not _panel_of(parameter)]
+            if ctx.meta.get(_MAIN_ONLY)
+            else parameters
+        )
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the most used options, and the names of the further panels."""
-        further = self._further_panels()
-        ctx.meta[_MAIN_ONLY] = bool(further)
+        panels = self._further_panels()
+        ctx.meta[_MAIN_ONLY] = bool(panels)
         try:
             super().format_help(ctx, formatter)
         finally:
             ctx.meta[_MAIN_ONLY] = False
-        if further:
-            typer.echo(f" Further options, with {HELP_ALL}: {', '.join(further)}.\n")
+        if panels:
+            typer.echo(f" Further options, with {HELP_ALL}: {', '.join(panels)}.\n")
 
     def format_whole_help(self, ctx: Any, formatter: Any) -> None:
         """Print all panels."""
         super().format_help(ctx, formatter)
 
     def _further_panels(self) -> list[str]:
-        panels = [panel for one in self.params if (panel := _panel_of(one))]
+        panels = [panel for parameter in self.params if (panel := _panel_of(parameter))]
         return list(dict.fromkeys(panels)) if len(self.params) > MOST_OPTIONS else []
 
 

@@ -12,8 +12,8 @@ def terminal_safe(text: str) -> str:
     return UNSAFE.sub(_sign, text)
 
 
-def _sign(found: re.Match[str]) -> str:
-    code = ord(found[0])
+def _sign(match: re.Match[str]) -> str:
+    code = ord(match[0])
     return chr(0x2400 + code) if code < 0x20 else "\u2421" if code == 0x7F else "\ufffd"
 
 
@@ -29,10 +29,10 @@ _BARE = re.compile(
 
 def without_places(text: str, places: tuple[str, ...] = ()) -> str:
     """`text` with the last part alone of every absolute path, and of `places`, which may hold spaces."""
-    for place in sorted(filter(None, places), key=len, reverse=True):
-        text = text.replace(place, _last(place))
-    text = _QUOTED.sub(lambda found: f"{found[1]}{_last(found[2])}{found[1]}", text)
-    return _BARE.sub(lambda found: _last(found[0]), text)
+    for path in sorted(filter(None, places), key=len, reverse=True):
+        text = text.replace(path, _last(path))
+    text = _QUOTED.sub(lambda match: f"{match[1]}{_last(match[2])}{match[1]}", text)
+    return _BARE.sub(lambda match: _last(match[0]), text)
 
 
 def _last(path: str) -> str:

@@ -10,7 +10,7 @@ EVERY = 60.0
 
 
 class Heartbeat:
-    """A progress callback (done, total, …): a line after `FIRST` seconds, then every `EVERY`, and one at the end.
+    """A progress callback (finished, total, …): a line after `FIRST` seconds, every `EVERY`, and at the end.
 
     what: what is counted. say: takes each line. clock: seconds, of any origin. The rate is that of what was done
     since the first call: before it a model was loaded, or a run that is continued was made.
@@ -27,30 +27,30 @@ class Heartbeat:
         self._due = self._started + FIRST
         self._ended: tuple[int, int] | None = None
 
-    def __call__(self, done: int, total: int, *_: object) -> None:
-        """`done` of `total` are finished; whatever else a caller tells is not used."""
+    def __call__(self, finished: int, total: int, *_: object) -> None:
+        """`finished` of `total` are finished; whatever else a caller tells is not used."""
         now = self._clock()
         if self._first is None:
-            self._first = done, now
+            self._first = finished, now
         # Several events of one answer, as a worker of a Ray cluster gives them, all find the last one counted.
-        if (done, total) == self._ended or (now < self._due and done < total):
+        if (finished, total) == self._ended or (now < self._due and finished < total):
             return
-        self._ended = (done, total) if done >= total else None
+        self._ended = (finished, total) if finished >= total else None
         self._due = now + EVERY
         before, since = self._first
-        rate = (done - before) / (now - since) if now > since else 0.0
+        rate = (finished - before) / (now - since) if now > since else 0.0
         pace = f", {_per_time(rate)}" if rate > 0 else ""
-        left = f", about {spoken((total - done) / rate)} left" if rate > 0 and done < total else ""
-        self._say(f"{self._what}: {done}/{total} after {spoken(now - self._started)}{pace}{left}")
+        remaining = f", about {spoken((total - finished) / rate)} left" if rate > 0 and finished < total else ""
+        self._say(f"{self._what}: {finished}/{total} after {spoken(now - self._started)}{pace}{remaining}")
 
 
 def spoken(seconds: float) -> str:
     """A duration in its two largest units: `3 h 12 min`, `4 min 05 s`, `12 s`."""
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, seconds_left = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:
         return f"{hours} h {minutes:02d} min"
-    return f"{minutes} min {rest:02d} s" if minutes else f"{rest} s"
+    return f"{minutes} min {seconds_left:02d} s" if minutes else f"{seconds_left} s"
 
 
 def _per_time(rate: float) -> str:

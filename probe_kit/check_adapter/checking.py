@@ -43,8 +43,8 @@ def subjects_of(
     Raises UnknownModelError, UsageError, MissingExtraError and CheckpointError as `Family.check` does.
     """
     family = find_family(model)
-    chosen = family.check(checkpoint, device, dtype, False, read_pairs(options), 0)
-    common: dict[str, Any] = {"options": chosen, "instructions": instructions or INSTRUCTIONS}
+    load_options = family.check(checkpoint, device, dtype, False, read_pairs(options), 0)
+    common: dict[str, Any] = {"options": load_options, "instructions": instructions or INSTRUCTIONS}
     common |= {"device": device, "dtype": dtype}
     kinds = [kind for kind in CONTRACTS if (family.acts if kind.acting else family.reads)]
     return [kind(model, checkpoint, **common) for kind in kinds]
@@ -75,8 +75,8 @@ def outcomes(subjects: Sequence[Subject]) -> Iterator[Outcome]:
         return
     for subject in subjects:
         subject.share_model(first)
-        for own in CONTRACTS[type(subject)]:
-            yield checked(own.name, own.sentence, own.change, partial(own, subject))
+        for contract in CONTRACTS[type(subject)]:
+            yield checked(contract.name, contract.sentence, contract.change, partial(contract, subject))
     model = first.model
     mismatch = isinstance(model, Policy) and model.embodiment_mismatch() is not None
     del model
@@ -90,25 +90,25 @@ def outcomes(subjects: Sequence[Subject]) -> Iterator[Outcome]:
 def _run(subject: Subject, mismatch: bool) -> None:
     from probe_kit.check_adapter.smoke_run import act_twice, answer_twice
 
-    chosen: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "checkpoint": subject.given_checkpoint, "options": subject.options, "device": subject.device,
         "dtype": subject.dtype,
     }  # fmt: skip
     words = subject.instructions[0]
     if subject.acting:
-        act_twice(subject.name, chosen, words, mismatch, subject.folder)
+        act_twice(subject.name, settings, words, mismatch, subject.folder)
     else:
-        answer_twice(subject.name, chosen, words, subject.folder)
+        answer_twice(subject.name, settings, words, subject.folder)
 
 
 def _require_light(module: str) -> None:
-    """In a process of its own: this one may have imported torch. Raises UsageError if it cannot be imported."""
-    done = subprocess.run(
+    """Import in a process of its own: this one may have imported torch. Raises UsageError if that fails."""
+    process = subprocess.run(
         [sys.executable, "-c", _LISTED.format(module=module)],
         capture_output=True, encoding="utf-8", errors="replace", check=False, timeout=_PATIENCE,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
     )  # fmt: skip
-    if done.returncode not in (0, _HEAVY):
-        last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
+    if process.returncode not in (0, _HEAVY):
+        last = (process.stderr.strip().splitlines() or [f"exit code {process.returncode}"])[-1]
         raise UsageError(f"`import {module}` fails in a new process: {last}")
-    require(done.returncode == 0, f"`import {module}` imports torch", "a module that imports none")
+    require(process.returncode == 0, f"`import {module}` imports torch", "a module that imports none")

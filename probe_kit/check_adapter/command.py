@@ -78,13 +78,15 @@ def _print_outcome(outcome: "Outcome") -> None:
 
 
 def _print_end(model: str, checkpoint: str | None, outcomes: "list[Outcome]") -> None:
-    """How many passed, and what to do next."""
-    counts = {state: sum(one.state == state for one in outcomes) for state in ("passed", "failed", "skipped")}
+    """Print how many passed, and what to do next."""
+    counts = {
+        state: sum(outcome.state == state for outcome in outcomes) for state in ("passed", "failed", "skipped")
+    }
     out.print(", ".join(f"{count} {state}" for state, count in counts.items()))
     if counts["failed"]:
-        first = next(one for one in outcomes if one.state == "failed")
+        first = next(outcome for outcome in outcomes if outcome.state == "failed")
         say(marked("next: {}. Then run the same command again.", first.change.rstrip(".")))
     else:
-        play = "extract" if any(one.name == "two_episodes_are_extracted" for one in outcomes) else "ask"
-        place = f" --checkpoint {checkpoint}" if checkpoint else ""
-        say(marked("next: [bold]probe-kit {} --model {}[/] --items 24", play, f"{model}{place}"))
+        play = "extract" if any(outcome.name == "two_episodes_are_extracted" for outcome in outcomes) else "ask"
+        checkpoint_option = f" --checkpoint {checkpoint}" if checkpoint else ""
+        say(marked("next: [bold]probe-kit {} --model {}[/] --items 24", play, f"{model}{checkpoint_option}"))

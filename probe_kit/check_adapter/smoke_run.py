@@ -19,11 +19,13 @@ _SIDE = 224
 _COLOURS = ("red", "blue")
 
 
-def act_twice(model: str, chosen: Mapping[str, Any], instruction: str, capture_only: bool, folder: Path) -> None:
+def act_twice(
+    model: str, load_options: Mapping[str, Any], instruction: str, capture_only: bool, folder: Path
+) -> None:
     """Extract two episodes, and load every site again.
 
-    chosen: checkpoint, options, device and dtype. capture_only: do not act, for actions that do not fit the arm.
-    Raises what `extract_run` raises, and CheckFailedError for a run that is not whole.
+    load_options: checkpoint, options, device and dtype. capture_only: do not act, for actions that do not fit
+    the arm. Raises what `extract_run` raises, and CheckFailedError for a run that is not whole.
     """
     settings = ExtractSettings(
         model,
@@ -33,15 +35,15 @@ def act_twice(model: str, chosen: Mapping[str, Any], instruction: str, capture_o
         capture_only=capture_only,
         accept_units=True,  # a tiny checkpoint may have any statistics
         max_steps=STEPS,
-        **chosen,
+        **load_options,
     )
     _read_back(extract_run(settings, folder / "run"))
 
 
-def answer_twice(model: str, chosen: Mapping[str, Any], instruction: str, folder: Path) -> None:
+def answer_twice(model: str, load_options: Mapping[str, Any], instruction: str, folder: Path) -> None:
     """Ask about two episodes, activations included, and load every site again. Raises as `act_twice` does."""
     settings = AskSettings(
-        model, suite=_one_item(instruction, folder), frames="none", env_workers=0, tokens="pooled", **chosen
+        model, suite=_one_item(instruction, folder), frames="none", env_workers=0, tokens="pooled", **load_options
     )
     _read_back(ask_run(settings, folder / "run"))
 

@@ -41,14 +41,16 @@ def ask(
     from probe_kit.extract.extraction import prepare_asks
     from probe_kit.runs.store import locate
 
-    wanted = AskSettings.per_prompt_and_size(prompt, picture_size, typed)
-    places = [None if out_folder is None else f"{out_folder.rstrip('/')}/{one.short_name}" for one in wanted]
+    requested = AskSettings.per_prompt_and_size(prompt, picture_size, typed)
+    places = [
+        None if out_folder is None else f"{out_folder.rstrip('/')}/{settings.short_name}" for settings in requested
+    ]
     runs: list[Run] = []
-    prepared = prepare_asks(wanted, places, fetch=not dry_run)
-    for number, place in enumerate(places):
+    prepared = prepare_asks(requested, places, fetch=not dry_run)
+    for number, folder in enumerate(places):
         with err.status("loading suite and model"):
             extraction = next(prepared)
-        location = locate(place or Path("runs") / extraction.default_name())
+        location = locate(folder or Path("runs") / extraction.default_name())
         print_plan(extraction, location)
         if number == 0:  # of all of them, because they ask about the same items
             print_sufficiency(extraction)
@@ -60,7 +62,7 @@ def ask(
 
 
 def _print_answers(runs: "Sequence[Run]") -> None:
-    """How each run went, what to look at, and what to do next."""
+    """Print how each run went, what to look at, and what to do next."""
     for run in runs:
         episodes = run.episodes
         counts = ", ".join(f"{name} {count}" for name, count in episodes["outcome"].value_counts().items())

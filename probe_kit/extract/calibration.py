@@ -35,7 +35,7 @@ TURNS = 3
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was measured and chosen.
+    """A measurement, and the batch that it led to.
 
     inference: seconds of one call of the model, by batch. turn: seconds in which one simulator carries out the
     actions of one inference and draws the next picture, its share of setting up an episode included.
@@ -50,7 +50,7 @@ class Calibration:
 
     @property
     def words(self) -> str:
-        """As the plan prints it."""
+        """The line of the plan."""
         processes = (
             f"{self.env_workers} simulating processes" if self.env_workers else "simulating in this process"
         )
@@ -75,12 +75,12 @@ def calibrated(
     most = largest_batch(controller.policy.card.batch, len(plan.episodes))
     with torch_threads(controller.threads):
         times = inference_times(lambda batch: _infer(controller, example, batch), most)
-    found = choose(times, _turn(settings, controller, source, plan), cores_here())
-    return settings.changed(batch=found.batch, env_workers=found.env_workers), found
+    calibration = choose(times, _turn(settings, controller, source, plan), cores_here())
+    return settings.changed(batch=calibration.batch, env_workers=calibration.env_workers), calibration
 
 
 def largest_batch(of_card: int | None, episodes: int) -> int:
-    """What may be tried: the card's bound, LARGEST, and half of the episodes, since two groups take turns."""
+    """Return the largest batch to try: two groups take turns, so that it is half of the episodes at most."""
     return max(1, min(LARGEST, of_card or LARGEST, episodes // 2))
 
 
@@ -119,8 +119,8 @@ def choose(inference: Mapping[int, float], turn: float, cores: int) -> Calibrati
         return turn * -(-batch // hands)
 
     def rate(batch: int) -> float:
-        own = inference[batch]
-        return batch / (max(own, simulating(batch)) if cores > 1 else own + batch * turn)
+        seconds = inference[batch]
+        return batch / (max(seconds, simulating(batch)) if cores > 1 else seconds + batch * turn)
 
     best = max(map(rate, inference))
     batch = min(size for size in inference if rate(size) >= ENOUGH * best)

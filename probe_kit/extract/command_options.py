@@ -23,7 +23,7 @@ class Sizes(tuple[tuple[int, int], ...]):
         return cls(map(read_size, several("--picture-size", text)))
 
     def __str__(self) -> str:
-        """As they are typed."""
+        """Return the sizes as they are typed."""
         return ",".join(f"{width}x{height}" for width, height in self)
 
 

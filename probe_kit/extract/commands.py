@@ -65,7 +65,7 @@ def extract(
 
 
 def print_plan(extraction: "Extraction", location: "Location") -> None:
-    """What is going to be run, how much it stores and where."""
+    """Print the plan of a run, how much it stores and where."""
     from rich.table import Table
 
     from probe_kit.extract.needs import space_needed
@@ -107,13 +107,13 @@ def _weights_row(extraction: "Extraction") -> dict[str, str]:
     settings, controller = extraction.settings, extraction.controller
     model: Any = getattr(controller, "policy", None) or getattr(controller, "model", None)
     loaded = None if model is None else model.card.parameters
-    wanted = settings.model
-    words = weights_needed(wanted.family, wanted.checkpoint, wanted.options, wanted.dtype, loaded)
+    requested = settings.model
+    words = weights_needed(requested.family, requested.checkpoint, requested.options, requested.dtype, loaded)
     return {"weights": words} if words else {}
 
 
 def _units_row(settings: "Settings") -> dict[str, str]:
-    """Whose units the actions get, of a family whose checkpoints have several."""
+    """The line about the units that actions get, of a family whose checkpoints have several."""
     from probe_kit.hooks.registry import get_family
 
     family = get_family(settings.model.family)
@@ -143,12 +143,12 @@ def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> 
 def _acts_row(identity: Mapping[str, Any]) -> dict[str, str]:
     if not identity.get("capture_only"):
         return {}
-    shown = "only captured, once per episode" if "scene" in identity else "recorded frames are shown"
-    return {"acts": f"no: {shown}; no success rate"}
+    reason = "only captured, once per episode" if "scene" in identity else "recorded frames are shown"
+    return {"acts": f"no: {reason}; no success rate"}
 
 
 def print_sufficiency(extraction: "Extraction") -> None:
-    """What the plan is enough for, said before any work; too few items in yellow."""
+    """Print what the plan is enough for, before any work; too few items in yellow."""
     from rich.table import Table
 
     from probe_kit.suite.validation.sufficiency import GROUPS_FOR_PROBES, Smallest, sufficiencies
@@ -163,13 +163,15 @@ def print_sufficiency(extraction: "Extraction") -> None:
     table = Table(show_header=False, title=f"enough for ({Smallest.of(suite).words})", box=None)
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
-    for one in sufficiencies(suite, scored, bool(plan.streams)):
-        table.add_row(one.name, marked("[yellow]{}[/]" if one.enough is False else "{}", one.words))
+    for sufficiency in sufficiencies(suite, scored, bool(plan.streams)):
+        table.add_row(
+            sufficiency.name, marked("[yellow]{}[/]" if sufficiency.enough is False else "{}", sufficiency.words)
+        )
     err.print(table)
 
 
 def _pace_row(extraction: "Extraction") -> dict[str, str]:
-    """What a calibration chose; nothing where batch and processes were given."""
+    """The line about what a calibration chose; nothing where batch and processes were typed."""
     if extraction.calibration is not None:
         return {"pace": extraction.calibration.words}
     return (
@@ -180,9 +182,9 @@ def _pace_row(extraction: "Extraction") -> dict[str, str]:
 def _protocol_row(identity: dict[str, Any]) -> dict[str, str]:
     if "protocol" not in identity:
         return {}
-    said = identity["protocol"]
-    changed = ", ".join(f"{name}={run} instead of {was}" for name, (was, run) in said["deviations"].items())
-    name = " ".join(filter(None, (said["name"], said.get("variant"))))
+    protocol = identity["protocol"]
+    changed = ", ".join(f"{name}={run} instead of {was}" for name, (was, run) in protocol["deviations"].items())
+    name = " ".join(filter(None, (protocol["name"], protocol.get("variant"))))
     return {"protocol": name + (f", but {changed}" if changed else ", as released")}
 
 

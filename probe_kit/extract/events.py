@@ -62,6 +62,6 @@ def add_traceback(error: BaseException) -> None:
 
 def traceback_of(error: BaseException) -> str:
     """The traceback of `error`, after that of the process it was sent from."""
-    here = "".join(traceback.format_exception(error))
+    local = "".join(traceback.format_exception(error))
     sent: str = error.__dict__.get("probe_kit_traceback", "")
-    return (sent + here)[-LONGEST_TRACEBACK:]
+    return (sent + local)[-LONGEST_TRACEBACK:]

@@ -61,8 +61,8 @@ class Extraction(Prepared):
             raise UsageError("this extraction was planned without its model; prepare it again with fetch=True")
         with location.in_words():
             self._check_settings(location)
-            if not force and (further := self.further_plan(location)).episodes:
-                check_if_full(space_needed(further, self.settings), location)
+            if not force and (addition := self.further_plan(location)).episodes:
+                check_if_full(space_needed(addition, self.settings), location)
             writer = self.writer(location)
             with writer.owned():
                 location.check_exclusive(RUN_FILE)
@@ -91,32 +91,34 @@ class Extraction(Prepared):
             return self.plan
         root = read_root(location)
         root.check_continuable()
-        rows = further_rows(root.plan, self.plan.to_json()["episodes"], str(location))
-        added = {row["episode_id"] for row in rows}
-        return self.plan.only(one for one in self.plan.episodes if one.episode_id in added)
+        added = {
+            planned["episode_id"]
+            for planned in further_rows(root.plan, self.plan.to_json()["episodes"], str(location))
+        }
+        return self.plan.only(row for row in self.plan.episodes if row.episode_id in added)
 
     def _play(self, writer: RunWriter[Plan], remaining: list[int], progress: Progress | None) -> None:
-        total, done, given_up = len(self.plan.episodes), 0, list[Failed]()
+        total, committed, given_up = len(self.plan.episodes), 0, list[Failed]()
         with closing(play(self, writer, remaining)) as events:
             for event in events:
                 if isinstance(event, Done):
-                    done += 1
+                    committed += 1
                     if progress:
-                        progress(total - len(remaining) + done, total, event.outcome["outcome"])
+                        progress(total - len(remaining) + committed, total, event.outcome["outcome"])
                     continue
                 given_up.append(event)
                 writer.give_up(event.number, event.reason, event.traceback)
-                if len(given_up) >= HOPELESS and not done:
-                    raise _failure(writer, given_up, done)
+                if len(given_up) >= HOPELESS and not committed:
+                    raise _failure(writer, given_up, committed)
         if given_up:
             seal(writer.location)
-            raise _failure(writer, given_up, done)
+            raise _failure(writer, given_up, committed)
 
 
-def _failure(writer: RunWriter[Plan], given_up: list[Failed], done: int) -> EpisodesFailedError:
+def _failure(writer: RunWriter[Plan], given_up: list[Failed], committed: int) -> EpisodesFailedError:
     error = EpisodesFailedError(
-        f"{counted(len(given_up), 'episode')} failed twice and were given up; {done} others were finished and are "
-        "kept. The same command tries them again; --partial reads the run without them"
+        f"{counted(len(given_up), 'episode')} failed twice and were given up; {committed} others were finished "
+        "and are kept. The same command tries them again; --partial reads the run without them"
     )
     for failed in given_up:
         where = f" (traceback in {writer.location}/{failure_key(failed.number)})" if failed.traceback else ""
@@ -144,10 +146,10 @@ def prepare(
         # This process only plans; the GPUs belong to the workers.
         # Each worker calibrates on its own device.
         measures = {"batch": 1} if settings.machine.batch == "auto" else {}
-        here = settings.changed(device="cpu", **measures)
-        planned = load(here, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
-        chosen = planned.settings.changed(device=settings.machine.device, batch=settings.machine.batch)
-        return Extraction(chosen, planned.source, planned.plan, planned.card, None, declared=planned.declared)
+        on_cpu = settings.changed(device="cpu", **measures)
+        planned = load(on_cpu, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
+        for_workers = planned.settings.changed(device=settings.machine.device, batch=settings.machine.batch)
+        return Extraction(for_workers, planned.source, planned.plan, planned.card, None, declared=planned.declared)
     prepared = load(settings, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
     return Extraction(**{field.name: getattr(prepared, field.name) for field in fields(prepared)})
 
@@ -171,13 +173,13 @@ def prepare_asks(
     What is wrong with any of them, as far as it is known without the model, is said before the first.
     Raises what `prepare` raises.
     """
-    for own, out in zip(settings, outs, strict=True):
-        open_checked(own, None if out is None else locate(out), fetch=fetch)
+    for one_run, out in zip(settings, outs, strict=True):
+        open_checked(one_run, None if out is None else locate(out), fetch=fetch)
     if not fetch:
-        yield from (prepare(own, out, fetch=False) for own, out in zip(settings, outs, strict=True))
+        yield from (prepare(one_run, out, fetch=False) for one_run, out in zip(settings, outs, strict=True))
         return
     first = settings[0]
     elsewhere = first.machine.elsewhere
     answer_model = load_answer_model(first.changed(device="cpu") if elsewhere else first)
-    for own, out in zip(settings, outs, strict=True):
-        yield prepare(own, out, answer_model)
+    for one_run, out in zip(settings, outs, strict=True):
+        yield prepare(one_run, out, answer_model)

@@ -53,13 +53,15 @@ def models(
             line = ", ".join(f"{name} {value}" for name, value in settings.items())
             out.print(marked("  [dim]protocol  [/] {}: {}", protocol, line), soft_wrap=True)
         if (supported := row["interventions"]) is not None:
-            one = (
+            readout = (
                 ""
                 if supported["readout"] == "first-chunk"
                 else "; one action per inference, which says little alone"
             )
-            asked = "; ".join(f"{option} {', '.join(values)}" for option, values in supported["asked_as"].items())
-            out.print(marked("  [dim]intervene [/] {}", f"{asked}{one}"), soft_wrap=True)
+            supported_options = "; ".join(
+                f"{option} {', '.join(values)}" for option, values in supported["asked_as"].items()
+            )
+            out.print(marked("  [dim]intervene [/] {}", f"{supported_options}{readout}"), soft_wrap=True)
         for option in row["options"]:
             default = f" Default {option['default']}." if option["default"] else ""
             line = f"-M {option['name']}={option['kind'].upper()}  {option['help']}{default}"
@@ -86,11 +88,11 @@ def _listed(rows: list[dict[str, Any]]) -> Text:
     lines = [(row["model"], row["does"], _in_a_word(row["ready"]), row["description"]) for row in rows]
     lines = [("model", "does", "ready", "what it is"), *lines]
     widths = [max(len(line[column]) for line in lines) for column in range(3)]
-    shown = [
+    joined = [
         "  ".join([*(f"{cell:{width}}" for cell, width in zip(line, widths, strict=False)), line[3]])
         for line in lines
     ]
-    cut = [line if len(line) <= out.width else f"{line[: out.width - 1].rpartition(' ')[0]} …" for line in shown]
+    cut = [line if len(line) <= out.width else f"{line[: out.width - 1].rpartition(' ')[0]} …" for line in joined]
     return Text("\n".join([*cut, "A page per model: probe-kit models NAME"]))
 
 
@@ -99,7 +101,7 @@ def _in_a_word(ready: str) -> str:
 
 
 def _ready(family: "Family") -> str:
-    """Whether it can be run here. A third party's family may be wrong about itself, and only about itself."""
+    """Say if a family can be run here. A third party's family may be wrong about itself, and only about itself."""
     try:
         lacking = family.missing()
     except (ImportError, ValueError, TypeError, AttributeError, OSError) as error:
@@ -112,9 +114,9 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
     from probe_kit.extract.rollout.controllers import SCRIPTED
     from probe_kit.hooks.registry import find_family, own_families, third_party_families
 
-    chosen = list(own_families().values())
+    families = list(own_families().values())
     if name is not None:
-        chosen = [] if name in SCRIPTED else [find_family(name, tuple(SCRIPTED))]
+        families = [] if name in SCRIPTED else [find_family(name, tuple(SCRIPTED))]
     rows = [
         {
             "model": family.name,
@@ -138,7 +140,7 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
                 for option in family.options
             ],
         }
-        for family in chosen
+        for family in families
     ]
     scripted = dict.fromkeys(("checkpoint", "streams", "embodiment", "scene"), "")
     scripted |= {"weights": "", "ready": "yes", "notes": "no activations"}
@@ -148,9 +150,9 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
         for model, text in SCRIPTED.items()
         if name in (None, model)
     ]
-    others = third_party_families() if name is None else {}
+    third_party = third_party_families() if name is None else {}
     rows += [
         {"model": model, "description": text, **dict.fromkeys(scripted, ""), "ready": "?", "does": "?", **nothing}
-        for model, text in others.items()
+        for model, text in third_party.items()
     ]
     return rows

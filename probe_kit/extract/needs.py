@@ -91,12 +91,15 @@ def planned_sizes(settings: Settings, instructions: Sequence[str] = ()) -> Plann
         return None
     outline = family.outline(settings.model.checkpoint, settings.model.options, settings.model.dtype)
     if outline is None or outline.model is None:
-        streams = [StoredStream.of(one.stream, one.tokens, view_names(one.roles)) for one in declared]
+        streams = [
+            StoredStream.of(declared_stream.stream, declared_stream.tokens, view_names(declared_stream.roles))
+            for declared_stream in declared
+        ]
         why = "" if outline is None else f", because its own configuration cannot be read here: {outline.reason}"
         source = f"of the released size{why}"
     else:
         tokens = _tokens(outline.model, instructions or (_INSTRUCTION,))
-        average = {one.stream.name: one.tokens for one in declared}
+        average = {declared_stream.stream.name: declared_stream.tokens for declared_stream in declared}
         names = outline.model.role_names
         streams = [
             StoredStream.of(stream, tokens.get(name, average.get(name, 1)), view_names(names[name]))
@@ -157,11 +160,13 @@ def weights_needed(
         return ""
     count = _parameters(family, checkpoint, options, dtype) if parameters is None else parameters
     sizes = {name: in_units(family.weights_bytes(options, name, count) or 0) for name in DTYPES}
-    held = {name: in_units(family.memory_bytes(options, name, count) or 0) for name in DTYPES}
+    memory_by_dtype = {name: in_units(family.memory_bytes(options, name, count) or 0) for name in DTYPES}
     every = (
-        held["float32"] if family.always_float32 else " or ".join(f"{own} in {name}" for name, own in held.items())
+        memory_by_dtype["float32"]
+        if family.always_float32
+        else " or ".join(f"{size} in {name}" for name, size in memory_by_dtype.items())
     )
-    memory = next((own for name, own in held.items() if name == dtype), every)
+    memory = next((size for name, size in memory_by_dtype.items() if name == dtype), every)
     download = "nothing to download"
     if not family.is_here(checkpoint, options):
         counted = family.bytes_to_fetch(checkpoint, options)

@@ -83,7 +83,7 @@ class ModelSettings(Part):
 
 
 class Capture(Part):
-    """What is stored of the activations of a model that acts.
+    """The stored activations of a model that acts.
 
     tokens: `pooled` stores pooled views only, `all` also every token. captured_calls: inferences captured per
     episode, from the first on; `all` is as many as an episode can have, once the model is loaded. later_views:
@@ -132,7 +132,7 @@ class Capture(Part):
 
 
 class AskCapture(Part):
-    """What is stored of the activations of a model that answers: of its only inference, or nothing."""
+    """The stored activations of a model that answers: of its only inference, or nothing."""
 
     tokens: Annotated[
         AskTokens,
@@ -166,7 +166,7 @@ else:
 
 
 class ActTask(Part):
-    """How a policy acts, or that it is only captured.
+    """The task of a policy: to act, or to be captured only.
 
     protocol: a published one, such as `act2answer`: what is not chosen is as it has it, see `protocols`. execute:
     actions per inference; None for the policy's own. rotation: what reaches the controller as the rotation of an
@@ -218,7 +218,7 @@ PromptTemplate = Annotated[Template, BeforeValidator(_template)]
 
 
 class AskTask(Part):
-    """How a model is asked.
+    """The task of a model that answers: prompt, picture and object.
 
     protocol: a published one, whose scene takes the place of the default one; it decides nothing else of a
     question. prompt: a template, or its name or file. picture: `frame` shows the first frame of the episode,
@@ -261,7 +261,7 @@ class AskTask(Part):
 
 
 class Machine(Part):
-    """What changes no stored number: how fast a run comes, and the pictures that are stored for people.
+    """Settings that change no stored number: how fast a run comes, and the pictures that are stored for people.
 
     frames: `ends` stores small copies of the first and last frame of every episode, `all` of every frame, `none`
     none. env_workers: processes that simulate and draw; None for two per observation of a batch, 0 for this

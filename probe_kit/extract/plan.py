@@ -80,7 +80,7 @@ class Plan:
     decoder: str | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """As stored in `plan/`: `episodes` as flat columns, and `suite_parent`."""
+        """Return the plan as stored in `plan/`: `episodes` as flat columns, and `suite_parent`."""
         return {"episodes": [row.to_json() for row in self.episodes], "suite_parent": self.suite_parent}
 
     def numbered(self, numbers: Mapping[str, int]) -> Self:

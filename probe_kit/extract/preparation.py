@@ -50,7 +50,7 @@ _EMPTY_CAMERA = "empty_camera"
 
 @dataclass(frozen=True)
 class Prepared:
-    """What a run starts from: the source is open, the model is loaded and the plan is made.
+    """The beginning of a run: the source is open, the model is loaded and the plan is made.
 
     source: as the model is shown it. card: the part of the identity that the loaded model decides. controller:
     None if the model is loaded again by workers elsewhere. calibration: what chose the batch, None if it was not
@@ -74,7 +74,7 @@ class Prepared:
         return {**self.settings.identity(), **self.card, **self.plan.identity}
 
     def provenance(self) -> dict[str, Any]:
-        """That of a process that plays with these settings here; with the decoder of recorded videos."""
+        """The provenance of a process that plays with these settings here; with the decoder of recorded videos."""
         dtype: str | None = self.card.get("dtype")
         decoder = {} if self.plan.decoder is None else {"decoder": self.plan.decoder}
         return provenance_here(self.settings.machine.device, dtype) | decoder
@@ -91,9 +91,9 @@ class Prepared:
 
         A command with more items finds it too; one with other categories, wordings or another suite does not.
         """
-        named = [self.identity(), *self.plan.name_parts]
+        hashed = [self.identity(), *self.plan.name_parts]
         # Without the weights' hash there is no name yet.
-        name = [self.settings.model.family, "…" if self.declared else sha256_json(named)[:8]]
+        name = [self.settings.model.family, "…" if self.declared else sha256_json(hashed)[:8]]
         if isinstance(self.settings, AskSettings):
             name = ["ask", name[0], self.settings.short_name, name[1]]
         return "-".join(name)
@@ -246,8 +246,8 @@ def _check_words(settings: Settings, source: Source[Any]) -> None:
     texts: Iterable[str] = source.instructions
     if isinstance(settings, AskSettings):
         assert isinstance(source, SceneSource)
-        named = phrases(source.suite, settings.task.query, settings.seed)
-        texts = dict.fromkeys(phrase.text for phrase in named.values())
+        objects = phrases(source.suite, settings.task.query, settings.seed)
+        texts = dict.fromkeys(phrase.text for phrase in objects.values())
     if settings.source.command:  # said together with cameras and state, see `_check_before_loading`
         return
     find_family(settings.model.family, tuple(SCRIPTED)).check_words(texts, settings.model.checkpoint)
@@ -321,9 +321,9 @@ def _check_other_run(settings: Settings, source: Source[Any], location: Location
         root = read_root(location)
         root.check_continuable()
         decided = {name: value for name, value in settings.identity().items() if name not in _OF_THE_CHECKPOINT}
-        known = json.loads(canonical_json({**decided, **early}))
-        stored = {name: root.own_settings[name] for name in known if name in root.own_settings}
-        check_other_settings(stored, {name: known[name] for name in stored}, str(location))
+        requested = json.loads(canonical_json({**decided, **early}))
+        stored = {name: root.own_settings[name] for name in requested if name in root.own_settings}
+        check_other_settings(stored, {name: requested[name] for name in stored}, str(location))
         if root.plan:
             further_rows(root.plan, [row.to_json() for row in _rows(settings, source)], str(location))
 
@@ -400,7 +400,9 @@ def _check_loaded(settings: ExtractSettings, policy: "Policy") -> None:
         pairs["weights_seed"] = model.weights_seed, card.weights_seed
     if card.family in family_names():
         pairs["model"] = model.family, card.family
-    wrong = [f"{name} {has!r} instead of {asked!r}" for name, (asked, has) in pairs.items() if asked != has]
+    wrong = [
+        f"{name} {has!r} instead of {requested!r}" for name, (requested, has) in pairs.items() if requested != has
+    ]
     if wrong:
         raise UsageError(
             f"the loaded policy has {', '.join(wrong)}. Give the policy of these settings, or leave it out"
@@ -511,7 +513,7 @@ def _declared_execute(settings: Settings, sizes: PlannedSizes) -> int:
 def _declared_card(settings: Settings) -> dict[str, Any]:
     """The part of the identity of a model that was not loaded."""
     execute = settings.task.execute if isinstance(settings, ExtractSettings) else None
-    chosen: Mapping[str, Any] = {"dtype": settings.model.dtype, "execute": execute}
-    known = {name: value for name, value in chosen.items() if value is not None}
+    requested: Mapping[str, Any] = {"dtype": settings.model.dtype, "execute": execute}
+    declared = {name: value for name, value in requested.items() if value is not None}
     model = {"model": settings.model.family, "random_weights": settings.model.random_weights}
-    return {**model, "weights_sha256": None, **known}
+    return {**model, "weights_sha256": None, **declared}

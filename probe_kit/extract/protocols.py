@@ -35,7 +35,7 @@ def protocol_scene(protocol: str | None, name: str | None = None, **changes: Any
 
 
 def scene_of(model: str, protocol: str | None = None, name: str | None = None, **changes: Any) -> "SceneSpec":
-    """What `model` plays: the preset `name`, else the protocol's, else its family's home; with fields replaced.
+    """Return a model's scene: the preset `name`, else the protocol's, else its family's home; fields replaced.
 
     An unknown family and a scripted policy have the default scene. Errors are those of `protocol_scene`.
     """
@@ -61,7 +61,7 @@ def check_protocol(name: str) -> None:
 
 
 def protocol_identity(model: ModelSettings, task: ActTask, source: SourceSettings) -> dict[str, Any]:
-    """What a run says of the protocol it follows, under `protocol`; empty without one.
+    """Return what a run stores of the protocol it follows, under `protocol`; empty without one.
 
     variant: which of several checkpoints of the protocol it is, where it has several for the model.
     differs_from_default: what the protocol has and what is the default here, by setting. deviations: what the
@@ -99,7 +99,7 @@ def protocol_row(model: ModelSettings, protocol: str | None) -> ProtocolRow | No
     if protocol not in family.protocols:
         from probe_kit.hooks.registry import known_families
 
-        using = [name for name, one in known_families().items() if protocol in one.protocols]
+        using = [name for name, candidate in known_families().items() if protocol in candidate.protocols]
         raise UsageError(
             f"the protocol {protocol} does not use {model.family}; it uses {', '.join(using)}. Leave --protocol "
             f"out, and take its scene with --scene {SCENES[protocol]}"
@@ -114,7 +114,7 @@ def _family(model: str) -> "Family | None":
 
 
 def _used(model: ModelSettings, task: ActTask, scene: "SceneSpec") -> dict[str, str]:
-    """What the run is made with, under the names of `ProtocolRow.settings`."""
+    """The values that the run is made with, under the names of `ProtocolRow.settings`."""
     used = {f"-M {name}": _told(as_text(value)) for name, value in model.options.items()}
     plain = {
         "checkpoint": model.checkpoint, "execute": task.execute, "rotation": task.rotation, "dtype": model.dtype,
@@ -129,19 +129,19 @@ def _told(value: str) -> str:
 
 
 def _defaults(model: str, row: ProtocolRow) -> dict[str, str]:
-    """What the same settings are without a protocol, in the words of `probe-kit models`."""
+    """The values of the same settings without a protocol, in the words of `probe-kit models`."""
     from probe_kit.hooks.registry import find_family
 
     family = find_family(model)
-    known = {f"-M {option.name}": option.default for option in family.options}
-    known |= {f"-M {name}": as_text(value) for name, value in family.of_default.items()}
-    known |= {
+    defaults = {f"-M {option.name}": option.default for option in family.options}
+    defaults |= {f"-M {name}": as_text(value) for name, value in family.of_default.items()}
+    defaults |= {
         "checkpoint": family.default_checkpoint or EMBEDDED,
         "execute": "the checkpoint's",
         "rotation": PLAIN,
         "dtype": "the checkpoint's",
     }
-    return {name: known[name] for name in row.settings()}
+    return {name: defaults[name] for name in row.settings()}
 
 
 def _scene(scene: "SceneSpec") -> dict[str, str]:

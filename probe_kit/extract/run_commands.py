@@ -29,27 +29,27 @@ def verify(
 
     if build:
         say("sealed" if seal(run) else "nothing to seal")
-    found = verify_run(run, deep)
+    audit = verify_run(run, deep)
     if as_json:
-        print_json({**asdict(found), "ok": found.ok, "finished": found.finished})
+        print_json({**asdict(audit), "ok": audit.ok, "finished": audit.finished})
     else:
         checked = "every byte" if deep else "structure and sizes"
-        sealed = "sealed" if found.sealed else "not sealed"
-        failed = f", {found.failed} failed" if found.failed else ""
-        out.print(f"{found.committed} of {found.planned} episodes{failed}, {sealed}; {checked} checked")
-        if found.ok and not found.finished:
+        sealed = "sealed" if audit.sealed else "not sealed"
+        failed = f", {audit.failed} failed" if audit.failed else ""
+        out.print(f"{audit.committed} of {audit.planned} episodes{failed}, {sealed}; {checked} checked")
+        if audit.ok and not audit.finished:
             out.print(
                 "whole, but not finished: if it was finished before, this is an older state of it. The same "
                 "`probe-kit extract` continues it",
                 soft_wrap=True,
             )
-        if found.left_out:
-            out.print(f"a copy without activations: {', '.join(found.left_out)}", soft_wrap=True)
-        for stray in found.strays:
+        if audit.left_out:
+            out.print(f"a copy without activations: {', '.join(audit.left_out)}", soft_wrap=True)
+        for stray in audit.strays:
             out.print(f"belongs to no part of the run: {stray}", highlight=False, markup=False, soft_wrap=True)
-        for problem in found.problems:
+        for problem in audit.problems:
             out.print(f"damaged: {problem}", soft_wrap=True)
-    if not found.ok:
+    if not audit.ok:
         raise typer.Exit(DAMAGED)
 
 

@@ -101,8 +101,8 @@ class Settings(Part):
 
         Raises UsageError and SceneError for values that cannot be used, TypeError for a name that is no field.
         """
-        named = {} if checkpoint is None else {"checkpoint": checkpoint}
-        super().__init__(**self._by_part(model, named | values))
+        fields = {} if checkpoint is None else {"checkpoint": checkpoint}
+        super().__init__(**self._by_part(model, fields | values))
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
@@ -120,17 +120,17 @@ class Settings(Part):
         places = {name: part for part in _PARTS for name in _model_of(cls, part).model_fields}
         places |= dict.fromkeys((*SceneSettings.model_fields, *SceneOptions.model_fields), "source")
         places |= dict.fromkeys(cls.model_fields, "")
-        given: dict[str, dict[str, Any]] = {part: {} for part in ("", "source", *_PARTS)}
+        by_part: dict[str, dict[str, Any]] = {part: {} for part in ("", "source", *_PARTS)}
         for name, value in (("family", model), *values.items()) if isinstance(model, str) else values.items():
             if name not in places:
                 near = get_close_matches(name, places, n=1)
                 raise TypeError(
                     f"{cls.__name__} has no setting {name!r}" + (f"; is it {near[0]}?" if near else "")
                 )
-            given[places[name]][name] = value
-        parts, scene = given.pop(""), given.pop("source")
+            by_part[places[name]][name] = value
+        parts, scene = by_part.pop(""), by_part.pop("source")
         parts |= {} if model is None or isinstance(model, str) else {"model": model}
-        for part, fields in given.items():
+        for part, fields in by_part.items():
             parts[part] = dict(parts.get(part, {})) | fields
         if "family" not in parts["model"]:
             raise UsageError("no model is named; give --model NAME, which `probe-kit models` lists")
@@ -148,25 +148,33 @@ class Settings(Part):
         yield from (cls, SceneOptions, *cls.sources)
 
     @classmethod
-    def of_command(cls, typed: Mapping[str, Any], file: Mapping[str, Any] | None = None, **chosen: Any) -> Self:
+    def of_command(
+        cls, typed: Mapping[str, Any], file: Mapping[str, Any] | None = None, **further_fields: Any
+    ) -> Self:
         """The settings of a command.
 
         typed: the values that were typed, by parameter. file: settings by part, which typed ones replace.
-        chosen: further fields by name.
+        further_fields: by name.
         Raises UsageError for two sources, for options of another source, and what `__init__` raises.
         """
-        parts = [one for part in (*(_model_of(cls, part) for part in _PARTS), cls) for one in options_of(part)]
-        values = chosen | {one.field: typed[one.parameter] for one in parts if one.parameter in typed}
-        rest = {name: value for name, value in typed.items() if name not in {one.parameter for one in parts}}
+        parts = [
+            option for part in (*(_model_of(cls, part) for part in _PARTS), cls) for option in options_of(part)
+        ]
+        values = further_fields | {
+            option.field: typed[option.parameter] for option in parts if option.parameter in typed
+        }
+        source_options = {
+            name: value for name, value in typed.items() if name not in {option.parameter for option in parts}
+        }
         before = None if file is None else cls(**{"model": values.pop("family", None), **file})
-        kind, fields = cls._typed_source(rest, None if before is None else before.source)
+        kind, fields = cls._typed_source(source_options, None if before is None else before.source)
         if kind is SceneSettings:
             values |= fields
         else:
             if refused := [name for name in values if name in kind.decides]:
                 _refuse(refused, kind)
-            known = dict(before.source) if before is not None and isinstance(before.source, kind) else {}
-            values["source"] = kind(**{**known, **fields})
+            former = dict(before.source) if before is not None and isinstance(before.source, kind) else {}
+            values["source"] = kind(**{**former, **fields})
         return cls(values.pop("family", None), **values) if before is None else before.changed(**values)
 
     @classmethod
@@ -174,14 +182,14 @@ class Settings(Part):
         cls, typed: Mapping[str, Any], before: SourceSettings | None
     ) -> tuple[type[SourceSettings], dict[str, Any]]:
         """The kind of source that options name, and the values of its fields."""
-        options = {kind: {one.parameter: one for one in options_of(kind)} for kind in cls.sources}
-        options[SceneSettings] |= {one.parameter: one for one in options_of(SceneOptions)}
+        options = {kind: {option.parameter: option for option in options_of(kind)} for kind in cls.sources}
+        options[SceneSettings] |= {option.parameter: option for option in options_of(SceneOptions)}
         keys = {kind: next(iter(options[kind].values())) for kind in cls.sources[1:]}
-        chosen = [kind for kind, key in keys.items() if key.parameter in typed]
-        if len(chosen) > 1:
-            flags = " and ".join(keys[kind].flag for kind in chosen)
-            raise UsageError(f"{flags} are {len(chosen)} sources; give one")
-        kind = chosen[0] if chosen else SceneSettings if before is None else type(before)
+        typed_kinds = [kind for kind, key in keys.items() if key.parameter in typed]
+        if len(typed_kinds) > 1:
+            flags = " and ".join(keys[kind].flag for kind in typed_kinds)
+            raise UsageError(f"{flags} are {len(typed_kinds)} sources; give one")
+        kind = typed_kinds[0] if typed_kinds else SceneSettings if before is None else type(before)
         if strange := [name for name in typed if name not in options[kind]]:
             if kind is not SceneSettings:
                 _refuse(strange, kind)
@@ -253,7 +261,7 @@ class ExtractSettings(Settings):
 
     @classmethod
     def _by_part(cls, model: Any, values: Mapping[str, Any]) -> dict[str, Any]:
-        """As of every run, with a number or `auto` for a batch that was not chosen."""
+        """Return the values by part, with a number or `auto` for a batch that was not typed."""
         parts = super()._by_part(model, values)
         machine = parts["machine"]
         if machine.get("batch") is None:
@@ -265,7 +273,7 @@ class ExtractSettings(Settings):
         return parts
 
     def identity(self) -> dict[str, Any]:
-        """As of every run, with the task."""
+        """Return the identity of every run, with the task."""
         task = {"execute": None, **self.task.model_dump(mode="json", exclude_none=True, exclude={"protocol"})}
         rotation = {"rotation": self.task.rotation or PLAIN}
         return {**super().identity(), **task, **rotation, **protocol_identity(self.model, self.task, self.source)}
@@ -296,7 +304,7 @@ class ExtractSettings(Settings):
         )
 
     def marks(self) -> list[str]:
-        """Whether the streams were edited."""
+        """Return a mark where the streams were edited."""
         edits = self.task.edits
         return [f"edited {sha256_json([edit.to_json() for edit in edits])[:6]}"] if edits else []
 
@@ -349,7 +357,7 @@ class AskSettings(Settings):
         return f"{width}x{height}"
 
     def identity(self) -> dict[str, Any]:
-        """As of every run, with the task."""
+        """Return the identity of every run, with the task."""
         prompt = self.task.prompt
         ask = {
             "prompt": prompt.name,
@@ -378,12 +386,13 @@ def refuse(settings: Settings, names: Iterable[str], why: str) -> None:
 
     names: of fields, or NAME=VALUE where only that value has none. why: the rest of the sentence.
     """
-    chosen, wrong = settings.chosen(), []
-    flags = {one.field: one.flag for part in _PARTS for one in options_of(type(getattr(settings, part)))}
+    changed, wrong = settings.chosen(), []
+    offered = (option for part in _PARTS for option in options_of(type(getattr(settings, part))))
+    flags = {option.field: option.flag for option in offered}
     for name, _, value in (text.partition("=") for text in names):
         if name == "options":
-            wrong += [f"-M {option}" for option in chosen.get(name, {})]
-        elif name in chosen and (not value or chosen[name] == value):
+            wrong += [f"-M {key}" for key in changed.get(name, {})]
+        elif name in changed and (not value or changed[name] == value):
             wrong.append(" ".join(filter(None, (flags.get(name, name), value))))
     if wrong:
         raise UsageError(f"{', '.join(wrong)} {why}")
@@ -401,21 +410,21 @@ def _with_scene(parts: Mapping[str, Any], fields: dict[str, Any]) -> Any:
     Raises UsageError for such fields with another source.
     """
     source = parts.get("source")
-    known = dict(source) if isinstance(source, SceneSettings | Mapping) else {}
-    if (isinstance(source, SourceSettings) and not known) or known.get("kind", "scene") != "scene":
+    former = dict(source) if isinstance(source, SceneSettings | Mapping) else {}
+    if (isinstance(source, SourceSettings) and not former) or former.get("kind", "scene") != "scene":
         settings = _read_source(source)
-        if chosen := [name for name, value in fields.items() if value not in (None, False)]:
-            _refuse(chosen, type(settings))
+        if refused := [name for name, value in fields.items() if value not in (None, False)]:
+            _refuse(refused, type(settings))
         return settings
     changes = {name: fields.pop(name) for name in SceneOptions.model_fields if name in fields and name != "scene"}
     changes = SceneOptions(**changes).changes
-    scene = fields.pop("scene", None) or known.get("scene")
+    scene = fields.pop("scene", None) or former.get("scene")
     if scene is None or isinstance(scene, str):
         model, task = dict(parts["model"]), dict(parts["task"])
         scene = scene_of(model["family"], task.get("protocol"), scene, **changes)
     elif changes:
         scene = replace(SceneSettings(scene=scene).scene, **changes)
-    return SceneSettings(**{**known, **fields, "scene": scene})
+    return SceneSettings(**{**former, **fields, "scene": scene})
 
 
 def _short(checkpoint: str) -> str:

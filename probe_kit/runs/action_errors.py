@@ -17,7 +17,7 @@ Matrix = NDArray[np.float64]
 
 
 class ShownRun(Protocol):
-    """What is read of a run on recordings; see `Run`."""
+    """The parts of a run on recordings that are read; see `Run`."""
 
     @property
     def recorded(self) -> bool:
@@ -25,15 +25,15 @@ class ShownRun(Protocol):
 
     @property
     def location(self) -> Any:
-        """Where it lies."""
+        """The place of the run."""
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Of the run and its selection."""
+        """The settings of the run and its selection."""
 
     @property
     def inputs(self) -> StoredInputs | None:
-        """What was shown."""
+        """The inputs that were shown."""
 
     @property
     def episodes(self) -> "pd.DataFrame":
@@ -104,8 +104,8 @@ class ActionErrors:
         frames = self.by_frame
         squares = frames.assign(first=frames["first"] ** 2, chunk=frames["chunk"] ** 2)
         groups = squares.groupby("source_episode")
-        found = groups[["first", "chunk"]].mean() ** 0.5
-        table: pd.DataFrame = found.assign(frames=groups.size()).reset_index()
+        means = groups[["first", "chunk"]].mean() ** 0.5
+        table: pd.DataFrame = means.assign(frames=groups.size()).reset_index()
         return table[["source_episode", "frames", "first", "chunk"]]
 
     @property
@@ -155,13 +155,13 @@ def why_not_compared(run: ShownRun) -> str | None:
     recorded, predicted = (run.settings[DATASET]["inputs"][kind][-1] for kind in ("action", "prediction"))
     if recorded != predicted:
         return f"the policy predicts {predicted} numbers, the data set has {recorded}"
-    found: str | None = run.settings["recording"].get(OTHER_ACTIONS)
-    return found
+    reason: str | None = run.settings["recording"].get(OTHER_ACTIONS)
+    return reason
 
 
 def _mean(values: Matrix, axes: int | tuple[int, ...]) -> Matrix:
     """The mean of the numbers among `values`; NaN, without a warning, where there are none."""
-    there = np.isfinite(values)
-    count = there.sum(axis=axes)
-    total = np.where(there, values, 0.0).sum(axis=axes)
+    finite = np.isfinite(values)
+    count = finite.sum(axis=axes)
+    total = np.where(finite, values, 0.0).sum(axis=axes)
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))

@@ -173,8 +173,8 @@ def encode_bfloat16(values: NDArray[np.float32]) -> NDArray[np.uint16]:
     """float32 to the bits of bfloat16, to the nearest and half to even; NaN stays NaN."""
     bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
     rounded = (bits + (0x7FFF + ((bits >> 16) & 1))) >> 16  # wraps around only for NaN
-    found: NDArray[np.uint16] = np.where(np.isnan(values), NOT_A_NUMBER, rounded).astype(np.uint16)
-    return found
+    encoded: NDArray[np.uint16] = np.where(np.isnan(values), NOT_A_NUMBER, rounded).astype(np.uint16)
+    return encoded
 
 
 def index_bytes(count: int) -> int:
@@ -183,7 +183,7 @@ def index_bytes(count: int) -> int:
 
 
 def chunk_slices(index: bytes) -> list[slice]:
-    """Where every inner chunk lies in its shard, in the order of the index; an absent one is empty."""
+    """Return the bytes of every inner chunk in its shard, in the order of the index; an absent one is empty."""
     entries = np.frombuffer(index[:-CHECKSUM], "<u8").reshape(-1, 2)
     return [
         slice(0, 0) if start == _ABSENT else slice(start, start + length) for start, length in entries.tolist()
@@ -191,6 +191,6 @@ def chunk_slices(index: bytes) -> list[slice]:
 
 
 def inner_chunks(shard: bytes, count: int) -> list[slice]:
-    """Where the `count` inner chunks of a whole shard lie, then where its index does."""
+    """Return the bytes of the `count` inner chunks of a whole shard, then those of its index."""
     index = slice(len(shard) - index_bytes(count), len(shard))
     return [*chunk_slices(shard[index]), index]

@@ -85,7 +85,7 @@ class Bucket(Location):
         return self._url
 
     def beside(self, name: str) -> Path:
-        """In the working directory."""
+        """Return a path in the working directory."""
         return Path(name)
 
     def free_bytes(self) -> None:
@@ -216,11 +216,11 @@ class Bucket(Location):
             return None
 
     def keys(self, folder: str) -> list[str]:
-        """From a listing."""
+        """Read a listing."""
         return sorted(self._listing(folder))
 
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
-        """From a listing."""
+        """Read a listing."""
         listing = self._listing(folder)
         return {key: listing[f"{folder}/{key}"] for key in keys if f"{folder}/{key}" in listing}
 
@@ -309,7 +309,7 @@ class Bucket(Location):
 
     @contextmanager
     def rebuilding(self, folder: str, stamp: str) -> Iterator[Store]:
-        """In its final folder, which is not read before its stamp is written, and as if it were empty.
+        """Build in the final folder, which is not read before its stamp is written, and as if it were empty.
 
         Two processes that build it at once write the same bytes, and neither removes what the other wrote.
         """

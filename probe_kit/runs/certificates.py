@@ -31,11 +31,13 @@ class Certificate(Record):
 
 def write_certificate(root: Root, parts: Mapping[str, Any], provenance: Provenance) -> None:
     """Record the checks and loaded parts of one process; `certificate.json` stays from the first one."""
-    own = json.loads(json.dumps({**parts, "provenance": name_of(provenance), "run": root.identity}, default=list))
-    key = f"{CERTIFICATES}/{sha256_json(own)[:NAME_DIGITS]}.json"
-    root.location.create(key, Certificate.model_validate(own).to_bytes())
+    record = json.loads(
+        json.dumps({**parts, "provenance": name_of(provenance), "run": root.identity}, default=list)
+    )
+    key = f"{CERTIFICATES}/{sha256_json(record)[:NAME_DIGITS]}.json"
+    root.location.create(key, Certificate.model_validate(record).to_bytes())
     if not root.location.exists(CERTIFICATE_FILE):
-        root.location.create(CERTIFICATE_FILE, Certificate.model_validate({**own, **provenance}).to_bytes())
+        root.location.create(CERTIFICATE_FILE, Certificate.model_validate({**record, **provenance}).to_bytes())
 
 
 def read_certificate(root: Root) -> tuple[dict[str, Any], list[dict[str, Any]]]:

@@ -64,7 +64,7 @@ class CheckedStore(WrapperStore[Store]):
             del self._underway[number]
 
     async def _first(self, number: int, prototype: BufferPrototype) -> RunDamagedError | None:
-        """What is wrong with objects that were asked for before and have not come yet."""
+        """The damage of objects that were requested before and have not come yet."""
         for key in [key for earlier, key in sorted(self._underway.items()) if earlier < number]:
             try:
                 self._checked(key, await super().get(key, prototype, None), None)
@@ -91,7 +91,9 @@ class CheckedStore(WrapperStore[Store]):
         self, key: str, byte_ranges: Sequence[ByteRequest | None], *, prototype: BufferPrototype, **how: Any
     ) -> AsyncIterator[Sequence[tuple[int, Buffer | None]]]:
         """Parts of one object, fetched in the way of the store below."""
-        if key not in self._indexes and any(isinstance(one, RangeByteRequest) for one in byte_ranges):
+        if key not in self._indexes and any(
+            isinstance(byte_range, RangeByteRequest) for byte_range in byte_ranges
+        ):
             await self._read_index(key, prototype)
         async for group in super().get_ranges(key, byte_ranges, prototype=prototype, **how):
             yield [(number, self._checked(key, value, byte_ranges[number])) for number, value in group]
@@ -108,7 +110,7 @@ class CheckedStore(WrapperStore[Store]):
             yield key
 
     async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
-        """Those that begin so."""
+        """Yield the keys that begin so."""
         for key in self._sums:
             if key.startswith(prefix):
                 yield key
@@ -130,9 +132,9 @@ class CheckedStore(WrapperStore[Store]):
         """Raise RunDamagedError for a file that was made larger: a sparse one stands for all memory."""
         if not isinstance(self._store, LocalStore):
             return
-        file, known = self._store.root / key, self._sums[key]
-        if file.is_file() and (size := file.stat().st_size) > known.length:
-            raise self._damaged(key, str(known.size_problem(size)))
+        file, expected = self._store.root / key, self._sums[key]
+        if file.is_file() and (size := file.stat().st_size) > expected.length:
+            raise self._damaged(key, str(expected.size_problem(size)))
 
     def _checked(self, key: str, value: Buffer | None, byte_range: ByteRequest | None) -> Buffer:
         if value is None:
@@ -154,7 +156,7 @@ class CheckedStore(WrapperStore[Store]):
         if not digests or block_digest(content) != digests[-1]:
             return "has another index than was written"
         self._indexes[key] = {
-            (part.start, part.stop): known for part, known in zip(chunk_slices(content), digests, strict=False)
+            (part.start, part.stop): block for part, block in zip(chunk_slices(content), digests, strict=False)
         }
         return None
 

@@ -39,7 +39,7 @@ METADATA = "zarr.json"
 
 
 class Seal(Record):
-    """Of which commits the columns were made, and the hashes of all their objects by key in their folder."""
+    """The commits that the columns were made of, and the hashes of all objects by key in their folder."""
 
     kind: ClassVar[str] = "seal"
     run: str
@@ -96,11 +96,11 @@ class Columns:
         """The pooled columns of one stream, read when they are used."""
         import xarray as xr
 
-        others = ("role", LATER)  # which may have other numbers of calls
+        other_arrays = ("role", LATER)  # which may have other numbers of calls
         self.array(f"{stream}/pooled")  # checks its metadata
         with bounded_codecs():
             dataset: xr.Dataset = xr.open_zarr(
-                self.store, group=stream, consolidated=False, chunks=None, drop_variables=others
+                self.store, group=stream, consolidated=False, chunks=None, drop_variables=other_arrays
             )
         return dataset["pooled"].drop_attrs()
 
@@ -115,16 +115,16 @@ def find_columns(root: Root, commits: Mapping[int, Commit]) -> Columns | None:
     seal = next((seal for seal in _read_seals(root, commits) if seal.stamp == stamp), None)
     if seal is None:
         return None
-    found = Columns(location, location.derived(COLUMNS, stamp), seal.objects)
-    if not location.exists(f"{found.folder}/{METADATA}"):
-        if not (location.keys(found.folder) and location.exists(seal_key(stamp))):
+    columns = Columns(location, location.derived(COLUMNS, stamp), seal.objects)
+    if not location.exists(f"{columns.folder}/{METADATA}"):
+        if not (location.keys(columns.folder) and location.exists(seal_key(stamp))):
             return None  # all of them were removed, as is allowed, or are being built again
-        raise RunDamagedError(f"{location}/{found.folder}/{METADATA} is missing. {found.advice}")
-    return found
+        raise RunDamagedError(f"{location}/{columns.folder}/{METADATA} is missing. {columns.advice}")
+    return columns
 
 
 def seal_key(stamp: str) -> str:
-    """Where the hashes of the columns lie that were made from the commits that `stamp` names."""
+    """Return the key of the hashes of the columns that were made from the commits that `stamp` names."""
     return f"{SEALED}/{stamp[:NAME_DIGITS]}.json"
 
 

@@ -76,25 +76,25 @@ def numbered(location: Location, folder: str) -> Iterator[tuple[int, str, bytes]
             yield int(match[1]), f"{folder}/{name}", raw
 
 
-def read_commits(root: Root, known: Mapping[int, Commit] | None = None) -> dict[int, Commit]:
+def read_commits(root: Root, checked: Mapping[int, Commit] | None = None) -> dict[int, Commit]:
     """All commits by episode number, each checked, and against the sizes of the objects it names.
 
-    known: commits that were read and checked before; these are not read again.
+    checked: commits that were read and checked before; these are not read again.
     Raises RunDamagedError naming the first commit that was changed or belongs elsewhere, or the first object that
     is missing or has another size.
     """
-    unread = _unread(root.location, known) if known else numbered(root.location, COMMITS)
+    unread = _unread(root.location, checked) if checked else numbered(root.location, COMMITS)
     commits = {number: read_commit(root, number, key, raw) for number, key, raw in unread}
     if problem := next(size_problems(root, commits), None):
         raise RunDamagedError(f"{root.location}/{problem}")
-    return dict(sorted({**(known or {}), **commits}.items()))
+    return dict(sorted({**(checked or {}), **commits}.items()))
 
 
-def _unread(location: Location, known: Mapping[int, Commit]) -> Iterator[tuple[int, str, bytes]]:
-    """Number, key and content of the commits that are not among the `known` ones."""
+def _unread(location: Location, checked: Mapping[int, Commit]) -> Iterator[tuple[int, str, bytes]]:
+    """Number, key and content of the commits that are not among the `checked` ones."""
     for key in location.keys(COMMITS):
         name = _NUMBERED.fullmatch(key.rpartition("/")[2])
-        if name and int(name[1]) not in known:
+        if name and int(name[1]) not in checked:
             yield int(name[1]), key, location.read(key)
 
 
@@ -130,8 +130,8 @@ def _problems(root: Root, commit: Commit) -> Iterator[str]:
     needed = {object_key(name, commit.episode, axes) for name, axes in root.arrays.items()}
     if lost := needed - {*commit.objects}:
         yield f"names no object {min(lost)}"
-    if further := {*commit.objects} - needed - {trajectory}:
-        yield f"names {min(further)}, which is no object of this episode"
+    if strange_objects := {*commit.objects} - needed - {trajectory}:
+        yield f"names {min(strange_objects)}, which is no object of this episode"
     if trajectory in commit.objects:
         if not root.has_trajectories:
             yield f"names {trajectory}, though the run keeps no trajectories"
@@ -177,16 +177,16 @@ def size_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
     """Objects of episodes that are missing or have another size, without reading them."""
     sizes = root.location.sizes(DATA, (key for commit in commits.values() for key in commit.objects))
     for number, commit in commits.items():
-        for key, known in commit.objects.items():
+        for key, expected in commit.objects.items():
             size = sizes.get(key)
-            problem = known.size_problem(size)
+            problem = expected.size_problem(size)
             if problem and not (size is None and is_left_out(key, root.left_out)):
                 yield f"{DATA}/{key} of episode {commit.episode_id} {problem}. {redo(number)}"
 
 
 def committed_sums(root: Root, commits: Mapping[int, Commit]) -> dict[str, Sum]:
     """Sums of all objects of `data.zarr`, by key: metadata, and those that commits name."""
-    sums = {key.removeprefix(f"{DATA}/"): known for key, known in root.sums.items()}
+    sums = {key.removeprefix(f"{DATA}/"): expected for key, expected in root.sums.items()}
     for commit in commits.values():
         sums |= commit.objects
     return sums

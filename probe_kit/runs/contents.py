@@ -28,7 +28,7 @@ class StoredObject:
     """
 
     key: str
-    known: Sum
+    stored_sum: Sum
     advice: str
     owner: str = ""
     optional: bool = False
@@ -37,7 +37,7 @@ class StoredObject:
         """The fault in an object of this size, None for one that is missing."""
         if size is None and self.optional:
             return None
-        words = self.known.size_problem(size)
+        words = self.stored_sum.size_problem(size)
         return f"{self.key}{self.owner} {words}. {self.advice}" if words else None
 
 
@@ -60,19 +60,19 @@ def record_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | No
 
 def stored_objects(root: Root, commits: Mapping[int, Commit], columns: Columns | None) -> Iterator[StoredObject]:
     """All objects whose hash a record holds. Results with a damaged head are left out."""
-    for key, known in root.sums.items():
-        yield StoredObject(key, known, RESTORE)
+    for key, expected in root.sums.items():
+        yield StoredObject(key, expected, RESTORE)
     pictures = {folder for folder in ILLUSTRATIONS if root.location.keys(folder)}
     for number, commit in commits.items():
         owner = f" of episode {commit.episode_id}"
-        for key, known in commit.objects.items():
-            yield StoredObject(f"{DATA}/{key}", known, redo(number), owner, is_left_out(key, root.left_out))
-        for key, known in commit.pictures.items():
+        for key, expected in commit.objects.items():
+            yield StoredObject(f"{DATA}/{key}", expected, redo(number), owner, is_left_out(key, root.left_out))
+        for key, expected in commit.pictures.items():
             lost = key.partition("/")[0] not in pictures  # a user may delete the folder of all pictures
-            yield StoredObject(key, known, redo_picture(number), owner, lost)
+            yield StoredObject(key, expected, redo_picture(number), owner, lost)
     if columns is not None:
-        for key, known in columns.sums.items():
-            yield StoredObject(f"{columns.folder}/{key}", known, columns.advice)
+        for key, expected in columns.sums.items():
+            yield StoredObject(f"{columns.folder}/{key}", expected, columns.advice)
     for home in BUNDLES:
         for key in bundle_keys(root.location, home):
             yield from _of_result(root, home, key)
@@ -83,9 +83,9 @@ def _of_result(root: Root, home: str, key: str) -> Iterator[StoredObject]:
         bundle = read_bundle(root.location, home, key)
     except RunDamagedError:  # verification reads every head by itself
         return
-    for name, (actual, known) in bundle.files.items():
+    for name, (actual, expected) in bundle.files.items():
         yield StoredObject(
-            f"{bundle.folder}/{actual}", known, advice_for(bundle.folder), "", name in root.left_out
+            f"{bundle.folder}/{actual}", expected, advice_for(bundle.folder), "", name in root.left_out
         )
 
 
@@ -109,8 +109,8 @@ def stray_keys(
 
     objects: those of `stored_objects`.
     """
-    known = {*record_keys(root, commits, columns), *(stored.key for stored in objects)}
-    return [key for key in root.location.keys("") if key not in known and not _expected(key)]
+    expected = {*record_keys(root, commits, columns), *(stored.key for stored in objects)}
+    return [key for key in root.location.keys("") if key not in expected and not _expected(key)]
 
 
 def _expected(key: str) -> bool:

@@ -43,12 +43,12 @@ class Folder(Location):
 
     @property
     def name(self) -> str:
-        """Of the folder."""
+        """The name of the folder."""
         return self._path.resolve().name
 
     @property
     def path(self) -> Path:
-        """As the user gave it."""
+        """The path as the user typed it."""
         return self._path
 
     @property
@@ -61,7 +61,7 @@ class Folder(Location):
         return self._path.resolve().parent / name if self._path.name in ("", "..") else self._path.with_name(name)
 
     def free_bytes(self) -> int:
-        """Of the disk where the folder lies or will lie."""
+        """Return the free space of the disk where the folder lies or will lie."""
         existing = next(p for p in (self._path, *self._path.resolve().parents) if p.exists())
         return shutil.disk_usage(existing).free
 
@@ -116,12 +116,12 @@ class Folder(Location):
         return sorted(path.relative_to(self._path).as_posix() for path in below if path.is_file())
 
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
-        """From the directory entries."""
+        """Read the directory entries."""
         paths = {key: self._path / folder / key for key in keys if _inside(key)}
         return {key: path.stat().st_size for key, path in paths.items() if path.is_file()}
 
     def flush(self, keys: Iterable[str]) -> None:
-        """By `fsync` of each file, many at once."""
+        """Flush each file by `fsync`, many at once."""
         with ThreadPoolExecutor(_FLUSHERS) as threads:
             list(threads.map(_flush, [self._path / key for key in keys]))
 
@@ -142,7 +142,7 @@ class Folder(Location):
     ) -> None:
         """Write a draft in the same folder, flush it to the disk if it is to be durable, and give it its name."""
         path = self._inner(key)
-        for left in reversed(range(_TRIES)):
+        for tries_left in reversed(range(_TRIES)):
             try:
                 with suppress(FileExistsError):  # another process removed it just after it existed
                     path.parent.mkdir(parents=True, exist_ok=True)
@@ -150,7 +150,7 @@ class Folder(Location):
                     give_name(draft, path)
                 return
             except FileNotFoundError:
-                if not left:  # before: another process cleared the drafts here, or removed the folder
+                if not tries_left:  # before: another process cleared the drafts here, or removed the folder
                     raise
 
     def delete(self, key: str) -> None:
@@ -227,7 +227,7 @@ class Folder(Location):
 
     @contextmanager
     def tended(self, folder: str) -> Iterator[None]:
-        """By a lock on the folder itself, so that drafts in it have no owner any more."""
+        """Lock the folder itself, so that drafts in it have no owner any more."""
         path = self._path / folder
         path.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDONLY)

@@ -20,23 +20,24 @@ _NUMBER = "episode"
 class Growth:
     """A plan beside the one that is stored.
 
-    stored, asked: episodes of either. added: episodes that only the plan has. results: probes and interventions
-    that are stored with the run, such as `probes 1a2b3c4d5e6f`; after a growth they are of former episodes.
+    stored, requested: episodes of either. added: episodes that only the plan has. results: probes and
+    interventions that are stored with the run, such as `probes 1a2b3c4d5e6f`; after a growth they are of former
+    episodes.
     """
 
     stored: int
-    asked: int
+    requested: int
     added: int
     results: tuple[str, ...] = ()
 
     @property
     def words(self) -> str:
-        """In a line; empty where both plans are the same."""
+        """The growth in a line; empty where both plans are the same."""
         if self.added:
             stale = f"; of the former episodes only: {', '.join(self.results)}" if self.results else ""
-            return f"from {self.stored} to {self.asked} episodes; stored ones stay as they are{stale}"
-        if self.asked < self.stored:
-            return f"no: the run has {self.stored} episodes, these {self.asked} among them, and never shrinks"
+            return f"from {self.stored} to {self.requested} episodes; stored ones stay as they are{stale}"
+        if self.requested < self.stored:
+            return f"no: the run has {self.stored} episodes, these {self.requested} among them, and never shrinks"
         return ""
 
 
@@ -44,23 +45,23 @@ _CONTENT = "content_blake2b"
 """Of recordings: hash of the files that hold an episode."""
 
 
-def further_rows(stored: Sequence[Row], asked: Sequence[Row], where: str) -> list[Row]:
+def further_rows(stored: Sequence[Row], requested: Sequence[Row], where: str) -> list[Row]:
     """The rows of a plan that the stored one lacks; none if the stored one holds them all.
 
     Raises SettingsMismatchError if both plan one episode differently, or if each has some that the other lacks.
     """
-    was, now = ({row["episode_id"]: row for row in rows} for rows in (stored, asked))
+    was, now = ({row["episode_id"]: row for row in rows} for rows in (stored, requested))
     for name in was.keys() & now.keys():
         _check_equal(was[name], now[name], where)
-    further = [row for name, row in now.items() if name not in was]
+    added = [row for name, row in now.items() if name not in was]
     lost = [row for name, row in was.items() if name not in now]
-    if further and lost:
+    if added and lost:
         raise SettingsMismatchError(
-            f"{where} has {_counted(stored)}; this command asks for {_counted(asked)}. A run grows and never gets "
-            f"smaller, and {len(lost)} of its episodes are not asked for (the first is {lost[0]['episode_id']}). "
-            "Ask for at least what it has, or choose another --out"
+            f"{where} has {_counted(stored)}; this command asks for {_counted(requested)}. A run grows and never "
+            f"gets smaller, and {len(lost)} of its episodes are not asked for (the first is "
+            f"{lost[0]['episode_id']}). Ask for at least what it has, or choose another --out"
         )
-    return further
+    return added
 
 
 def _check_equal(was: Row, now: Row, where: str) -> None:
@@ -88,8 +89,8 @@ def _counted(rows: Sequence[Row]) -> str:
     return f"items of {counts}" + (f" in the wordings {wordings}" if wordings else "")
 
 
-def growth_at(location: Location, asked: Sequence[Row]) -> Growth | None:
-    """How the run at `location` would grow by a plan with these rows; None if none is there or has a plan.
+def growth_at(location: Location, requested: Sequence[Row]) -> Growth | None:
+    """Return the growth of the run at `location` by a plan with these rows; None if none is there or has a plan.
 
     Raises as `further_rows`, ActivationsLeftOutError for a copy without activations, and RunDamagedError if the
     stored run was changed.
@@ -101,14 +102,14 @@ def growth_at(location: Location, asked: Sequence[Row]) -> Growth | None:
     stored = root.plan
     if not stored:
         return None
-    added = len(further_rows(stored, asked, str(location)))
+    added = len(further_rows(stored, requested, str(location)))
     results = [f"{home} {key}" for home in BUNDLES for key in bundle_keys(location, home)] if added else []
-    return Growth(len(stored), len(asked), added, tuple(results))
+    return Growth(len(stored), len(requested), added, tuple(results))
 
 
-def check_other_settings(stored: dict[str, Any], asked: dict[str, Any], where: str) -> None:
+def check_other_settings(stored: dict[str, Any], requested: dict[str, Any], where: str) -> None:
     """Raise SettingsMismatchError naming the settings that differ between a stored run and this request."""
-    was, now = flat_settings(stored), flat_settings(asked)
+    was, now = flat_settings(stored), flat_settings(requested)
     different = [key for key in sorted(was | now) if was.get(key) != now.get(key)]
     if different:
         lines = [f"  {key}: stored {was.get(key)!r}, asked {now.get(key)!r}" for key in different]

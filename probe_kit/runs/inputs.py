@@ -64,7 +64,7 @@ class StoredInputs:
         self._store, self._numbers = store, numbers
         self.kinds: tuple[str, ...] = tuple(dataset["inputs"])
         self.columns: tuple[str, ...] = tuple(dataset["columns"])
-        self.names: dict[str, tuple[str, ...]] = {name: tuple(own) for name, own in dataset["names"].items()}
+        self.names: dict[str, tuple[str, ...]] = {name: tuple(names) for name, names in dataset["names"].items()}
         self.truths: tuple[str, ...] = self.names.pop(TRUTHS, ())
 
     def read(self, kind: str) -> NDArray[Any]:
@@ -78,5 +78,5 @@ class StoredInputs:
         """(E, C) one column of the data set. Raises KeyError."""
         if name not in self.columns:
             raise KeyError(name)
-        found: NDArray[np.float64] = self.read("columns")[..., self.columns.index(name)]
-        return found
+        values: NDArray[np.float64] = self.read("columns")[..., self.columns.index(name)]
+        return values

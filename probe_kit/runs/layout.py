@@ -87,9 +87,9 @@ OTHER_ACTIONS = "other_actions"
 
 
 def stored_inputs_of(settings: Mapping[str, Any]) -> Mapping[str, Any]:
-    """What settings say of recordings or environment, with shapes and names of `inputs`; empty for scenes."""
-    found: Mapping[str, Any] = settings.get(DATASET) or settings.get(ENVIRONMENT) or {}
-    return found
+    """Return the settings of recordings or environment, with shapes and names of `inputs`; empty for scenes."""
+    described: Mapping[str, Any] = settings.get(DATASET) or settings.get(ENVIRONMENT) or {}
+    return described
 
 
 def _is_count(value: Any) -> bool:
@@ -126,7 +126,7 @@ _STREAM_PARTS: Mapping[str, Callable[[Any], bool]] = {
 
 @dataclass(frozen=True)
 class StoredStream:
-    """How one stream lies in the store.
+    """The storage of one stream.
 
     tokens: sequence length T as the model packs it; views: the pooled views V, in storage order.
     """
@@ -159,7 +159,7 @@ class StoredStream:
         return cls(**{**values, **lists})
 
     def to_json(self) -> dict[str, Any]:
-        """As stored in `run.json`."""
+        """Return the values as stored in `run.json`."""
         return {**asdict(self), "views": list(self.views), "quantities": list(self.quantities)}
 
     @property
@@ -210,5 +210,5 @@ class StoredStream:
     def raw_bytes(self, with_tokens: bool, calls: int = 1, later_views: LaterViews = "all") -> int:
         """Uncompressed bytes of the captured inferences of an episode."""
         cells = int(np.prod(self.lead)) * self.width
-        one = cells * len(self.views) * 4 + (cells * self.tokens * 2 if with_tokens else 0)
-        return one * calls if later_views == "all" else one + cells * 2 * (calls - 1)
+        per_call = cells * len(self.views) * 4 + (cells * self.tokens * 2 if with_tokens else 0)
+        return per_call * calls if later_views == "all" else per_call + cells * 2 * (calls - 1)

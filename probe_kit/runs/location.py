@@ -30,7 +30,7 @@ def check_size(key: str, size: int, where: object) -> None:
 
 
 class Location(ABC):
-    """Where a run lies. `str()` gives what the user called it."""
+    """The place of a run. `str()` gives what the user called it."""
 
     @property
     @abstractmethod

@@ -19,8 +19,8 @@ def judged(
     """A row per episode with the fields of `Judgement`; scene: `SceneSpec.to_json()`. Raises UsageError."""
     by = rule_of(rule, scene)
     rows = [
-        judge(seen, by, side, last_steps, scene["max_steps"])
-        for seen, side in zip(trajectories, sides, strict=True)
+        judge(trajectory, by, side, last_steps, scene["max_steps"])
+        for trajectory, side in zip(trajectories, sides, strict=True)
     ]
     return pd.DataFrame([asdict(row) for row in rows])
 
@@ -44,7 +44,7 @@ def with_outcomes(episodes: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFram
 
 @dataclass(frozen=True)
 class Watched:
-    """What trajectories say of every episode: `Judgement` by rule, at the last step, and `Behaviour`."""
+    """The content of the trajectories of all episodes: `Judgement` by rule, at the last step, and `Behaviour`."""
 
     verdicts: Mapping[str, pd.DataFrame]
     behaviour: pd.DataFrame
@@ -60,8 +60,8 @@ def watch(trajectories: Iterable[Trajectory], sides: Iterable[Side], scene: Mapp
     rules = {name: rule_of(name, scene) for name in RULES}
     verdicts: dict[str, list[dict[str, Any]]] = {name: [] for name in rules}
     acts: list[dict[str, Any]] = []
-    for seen, side in zip(trajectories, sides, strict=True):
+    for trajectory, side in zip(trajectories, sides, strict=True):
         for name, rule in rules.items():
-            verdicts[name].append(asdict(judge(seen, rule, side, 1, scene["max_steps"])))
-        acts.append(asdict(behaviour_of(seen, side, half, scene["moved"])))
+            verdicts[name].append(asdict(judge(trajectory, rule, side, 1, scene["max_steps"])))
+        acts.append(asdict(behaviour_of(trajectory, side, half, scene["moved"])))
     return Watched({name: pd.DataFrame(rows) for name, rows in verdicts.items()}, pd.DataFrame(acts))

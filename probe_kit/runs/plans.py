@@ -81,15 +81,15 @@ def grown_record(
     run: identity. rows: of all episodes in their order; numbers of new ones are given here.
     """
     numbers = {row["episode_id"]: row["episode"] for row in before.rows}
-    further = [row for row in rows if row["episode_id"] not in numbers]
-    numbers |= {row["episode_id"]: len(before.rows) + place for place, row in enumerate(further)}
+    added = [row for row in rows if row["episode_id"] not in numbers]
+    numbers |= {row["episode_id"]: len(before.rows) + position for position, row in enumerate(added)}
     return PlanRecord(
         run=run,
         record=len(before.extents),
         selection=dict(selection),
         suite_parent=suite_parent,
         tokens={name: max(length, before.tokens.get(name, 0)) for name, length in tokens.items()},
-        episodes=[{**row, "episode": numbers[row["episode_id"]]} for row in further],
+        episodes=[{**row, "episode": numbers[row["episode_id"]]} for row in added],
         order=[numbers[row["episode_id"]] for row in rows],
     )
 

@@ -36,7 +36,7 @@ DECISIVE = (
 
 
 def provenance_here(device: str = "cpu", dtype: str | None = None) -> dict[str, Any]:
-    """That of this process when it computes on `device` in `dtype`."""
+    """Return the provenance of this process when it computes on `device` in `dtype`."""
     kind = device.partition(":")[0]
     return {
         "device": kind,
@@ -57,13 +57,13 @@ def _gpu_name(device: str) -> str | None:
 
 
 def _versions() -> dict[str, str | None]:
-    found: dict[str, str | None] = {}
+    versions: dict[str, str | None] = {}
     for name in _LIBRARIES:
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
-            found[name] = None
-    return found
+            versions[name] = None
+    return versions
 
 
 @cache
@@ -108,9 +108,9 @@ def read_provenances(root: Root) -> dict[str, Provenance]:
     return provenances
 
 
-def check_provenances(stored: Mapping[str, Provenance], named: Iterable[str], location: Location) -> None:
+def check_provenances(stored: Mapping[str, Provenance], names: Iterable[str], location: Location) -> None:
     """Raise RunDamagedError unless all provenances that commits name are stored."""
-    if missing := sorted({*named} - {*stored}):
+    if missing := sorted({*names} - {*stored}):
         raise RunDamagedError(
             f"{location}/{PROVENANCE}/{missing[0]}.json is missing, though episodes name it; it was there when "
             f"they were committed. {RESTORE}"
@@ -119,8 +119,8 @@ def check_provenances(stored: Mapping[str, Provenance], named: Iterable[str], lo
 
 def differences(provenances: Iterable[Provenance]) -> tuple[str, ...]:
     """The decisive parts that are not the same in all of them, such as `versions.torch`."""
-    seen = [dict(_decisive(provenance)) for provenance in provenances]
-    return tuple(part for part in DECISIVE if len({one[part] for one in seen}) > 1)
+    decisive = [dict(_decisive(provenance)) for provenance in provenances]
+    return tuple(part for part in DECISIVE if len({parts[part] for parts in decisive}) > 1)
 
 
 def _decisive(provenance: Provenance) -> Iterable[tuple[str, Any]]:
@@ -129,11 +129,11 @@ def _decisive(provenance: Provenance) -> Iterable[tuple[str, Any]]:
         yield part, provenance.get(outer, {}).get(inner) if inner else provenance.get(outer)
 
 
-def check_other_provenance(stored: Iterable[Provenance], here: Provenance, where: str) -> None:
+def check_other_provenance(stored: Iterable[Provenance], current: Provenance, where: str) -> None:
     """Raise SettingsMismatchError naming what differs here from what made the episodes of a run so far."""
-    for one in stored:
-        if different := differences([one, here]):
-            was, now = dict(_decisive(one)), dict(_decisive(here))
+    for former in stored:
+        if different := differences([former, current]):
+            was, now = dict(_decisive(former)), dict(_decisive(current))
             lines = [f"  {part}: stored {was[part]!r}, here {now[part]!r}" for part in different]
             raise SettingsMismatchError(
                 f"{where} holds episodes that were made elsewhere, and this changes numbers:\n"

@@ -45,11 +45,11 @@ class Sum(NamedTuple):
 
     @classmethod
     def of(cls, content: bytes) -> "Sum":
-        """That of an object that is always read at once."""
+        """Return the sum of an object that is always read at once."""
         return cls(len(content), digest(content))
 
     def to_json(self) -> list[int | str]:
-        """As stored: blocks only where there are any."""
+        """Return the sum as stored: blocks only where there are any."""
         return list(self) if self.blocks else [self.length, self.digest]
 
     def size_problem(self, size: int | None) -> str | None:
@@ -109,7 +109,7 @@ class Record(BaseModel):
         identity.
         """
         content = read_record(raw, name, advice)
-        own = content.pop(HASH)
+        carried = content.pop(HASH)
         try:
             record = cls.model_validate(content)
         except ValidationError as error:
@@ -120,7 +120,7 @@ class Record(BaseModel):
                 ", ".join(f"{part} {values.get(part)}" for part in other) for values in (content, expected)
             )
             raise RunDamagedError(f"{name} is the {cls.kind} of {stored}; here belongs that of {right}. {advice}")
-        record._hash = own
+        record._hash = carried
         return record
 
     @classmethod
@@ -137,8 +137,8 @@ class Record(BaseModel):
 def first_error(error: ValidationError) -> str:
     """The first complaint of pydantic, with the place and the value."""
     first = error.errors(include_url=False)[0]
-    place = ".".join(map(str, first["loc"]))
-    return f"{place or 'it'} is {str(first['input'])[:40]!r} ({first['msg']})"
+    path = ".".join(map(str, first["loc"]))
+    return f"{path or 'it'} is {str(first['input'])[:40]!r} ({first['msg']})"
 
 
 def is_hash_name(name: str) -> bool:
@@ -197,12 +197,12 @@ def read_record(raw: bytes, name: str, advice: str) -> dict[str, Any]:
     content = read_plain(raw, name, advice)
     carried = content.pop(HASH, None)
     try:
-        own = digest(canonical(content))
+        computed = digest(canonical(content))
     except RecursionError:
         raise RunDamagedError(f"{name} was changed after it was written: it nests too deeply. {advice}") from None
-    if carried != own:
+    if carried != computed:
         raise RunDamagedError(f"{name} was changed after it was written: its hash is another one. {advice}")
-    return {HASH: own, **content}
+    return {HASH: computed, **content}
 
 
 def read_plain(raw: bytes, name: str, advice: str) -> dict[str, Any]:
@@ -223,5 +223,5 @@ def expect(content: Mapping[str, Any], parts: Mapping[str, type], name: str, adv
     """Raise RunDamagedError unless `content` has these parts, each of its type."""
     for part, kind in parts.items():
         if type(content.get(part)) is not kind:  # a boolean is no number
-            held = type(content[part]).__name__ if part in content else "nothing"
-            raise RunDamagedError(f"{name} has {held} as {part!r}; expected {kind.__name__}. {advice}")
+            actual = type(content[part]).__name__ if part in content else "nothing"
+            raise RunDamagedError(f"{name} has {actual} as {part!r}; expected {kind.__name__}. {advice}")

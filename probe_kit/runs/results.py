@@ -138,11 +138,11 @@ class Bundle:
             raise self.head_damaged(f"has format {stored}; this version of probe_kit reads format {words}")
 
     def head_damaged(self, problem: str) -> RunDamagedError:
-        """What is raised about the head."""
+        """Return the error about the head."""
         return RunDamagedError(f"{self.location}/{self.folder}/{HEAD} {problem}. {advice_for(self.folder)}")
 
     def damaged(self, name: str, problem: str) -> RunDamagedError:
-        """What is raised about one file."""
+        """Return the error about one file."""
         return RunDamagedError(f"{self.location}/{self._place(name)} {problem}. {advice_for(self.folder)}")
 
 
@@ -180,26 +180,26 @@ def _write_bundle(
     folder, run = f"{home}/{key}", _identity(location)
     before = read_bundle(location, home, key) if location.exists(f"{folder}/{HEAD}") else None
     former = dict(before.files) if before else {}
-    named = dict(former)
+    files_now = dict(former)
     for name, content in files.items():
-        known = Sum.of(content)
-        if name not in former or former[name][1] != known:
-            actual = name if before is None else _renamed(name, known)
+        content_sum = Sum.of(content)
+        if name not in former or former[name][1] != content_sum:
+            actual = name if before is None else _renamed(name, content_sum)
             location.write(f"{folder}/{actual}", content)
-            named[name] = actual, known
+            files_now[name] = actual, content_sum
     location.write(f"{folder}/{TIMES}", Times.model_validate({**times, "key": key, "run": run}).to_bytes())
-    stored = {name: [actual, *known.to_json()] for name, (actual, known) in named.items()}
+    stored = {name: [actual, *content_sum.to_json()] for name, (actual, content_sum) in files_now.items()}
     record = Head.model_validate({**head, "key": key, "run": run, "files": stored}).to_bytes()
     if before is None or location.read(f"{folder}/{HEAD}") != record:
         location.write(f"{folder}/{HEAD}", record)
     for name, (actual, _) in former.items():
-        if named[name][0] != actual:
+        if files_now[name][0] != actual:
             location.delete(f"{folder}/{actual}")
 
 
-def _renamed(name: str, known: Sum) -> str:
+def _renamed(name: str, content_sum: Sum) -> str:
     path = PurePosixPath(name)
-    return f"{path.stem}-{known.digest[:_SHORT]}{path.suffix}"
+    return f"{path.stem}-{content_sum.digest[:_SHORT]}{path.suffix}"
 
 
 def read_bundle(location: Location, home: str, key: str) -> Bundle:
@@ -215,15 +215,15 @@ def read_bundle(location: Location, home: str, key: str) -> Bundle:
             f"{location}/{folder}/{HEAD} names {strange[0]!r}, which is not a file in the same folder. "
             f"{advice_for(folder)}"
         )
-    own = {part: value for part, value in head.content.items() if part not in ("key", "run", "files")}
-    return Bundle(location, home, key, own, times.model_extra or {}, head.files)
+    parts = {part: value for part, value in head.content.items() if part not in ("key", "run", "files")}
+    return Bundle(location, home, key, parts, times.model_extra or {}, head.files)
 
 
 def bundle_keys(location: Location, home: str) -> list[str]:
     """Keys of the bundles that should be there: folders of that form, but for those that are being filled."""
     parts = [key.split("/") for key in location.keys(home)]
-    names = dict.fromkeys(own[1] for own in parts if len(own) > 2)
-    complete = {own[1] for own in parts if own[2:] == [HEAD]}
+    names = dict.fromkeys(path[1] for path in parts if len(path) > 2)
+    complete = {path[1] for path in parts if path[2:] == [HEAD]}
     return [
         name for name in names if _KEY.fullmatch(name) and (name in complete or f".{name}{PARTIAL}" not in names)
     ]
@@ -234,12 +234,15 @@ def complete_key(key: str, stored: Collection[str], location: Location, kind: st
 
     Raises UsageError if there is none, or if there are several.
     """
-    found = [name for name in stored if name == key] or [name for name in stored if key and name.startswith(key)]
-    if len(found) != 1:
+    matching = [name for name in stored if name == key] or [
+        name for name in stored if key and name.startswith(key)
+    ]
+    if len(matching) != 1:
         raise UsageError(
-            f"{location} has {'several' if found else 'no'} {kind} {key!r}; it has: {', '.join(stored) or 'none'}"
+            f"{location} has {'several' if matching else 'no'} {kind} {key!r}; it has: "
+            f"{', '.join(stored) or 'none'}"
         )
-    return found[0]
+    return matching[0]
 
 
 def read_bundles(location: Location, home: str) -> dict[str, Bundle]:
@@ -248,7 +251,7 @@ def read_bundles(location: Location, home: str) -> dict[str, Bundle]:
 
 
 def _identity(location: Location) -> str | None:
-    """That of the run; None for one that nothing protects.
+    """The identity of the run; None for one that nothing protects.
 
     Bundles may also lie where there is no run, beside arrays in memory.
     """

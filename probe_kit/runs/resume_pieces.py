@@ -20,7 +20,7 @@ _HEX = 2 * DIGEST_BYTES
 
 @dataclass(frozen=True)
 class Pieces:
-    """What is kept in `<home>/.<key>.partial/` until the bundle `key` is complete.
+    """The content of `<home>/.<key>.partial/` until the bundle `key` is complete.
 
     stamp: hash of the commits that the work reads. redo: what to do about a damaged piece, for the message.
     """
@@ -32,7 +32,7 @@ class Pieces:
 
     @classmethod
     def of(cls, run: Location, home: str, key: str, stamp: str, redo: str) -> "Pieces":
-        """Those of the bundle that will be stored as `home`/`key`."""
+        """Return the pieces of the bundle that will be stored as `home`/`key`."""
         return cls(run, f"{home}/.{key}{PARTIAL}", stamp, redo)
 
     def read(self, name: str) -> dict[str, NDArray[Any]] | None:

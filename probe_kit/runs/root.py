@@ -174,25 +174,29 @@ class Root:
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """Those of the run and of the selection that it has now: suite, categories, items and wordings."""
+        """The settings of the run and of the selection that it has now: suite, categories, items and wordings."""
         selection = self.stored_plan.selection
         suite = {**self.own_settings.get("suite", {}), **selection.get("suite", {})}
         return {**self.own_settings, **selection, **({"suite": suite} if suite else {})}
 
     @cached_property
     def streams(self) -> Mapping[str, StoredStream]:
-        """How the streams lie in the store, by name.
+        """The storage of every stream, by name.
 
         Raises RunDamagedError if the plan lacks the number of tokens of one.
         """
         tokens = self.stored_plan.tokens
-        lacking = [one["name"] for one in self.card.streams if "tokens" not in one and one["name"] not in tokens]
+        lacking = [
+            stream["name"]
+            for stream in self.card.streams
+            if "tokens" not in stream and stream["name"] not in tokens
+        ]
         if lacking and self.plan:
             name = f"{self.location}/{plan_key(len(self.stored_plan.extents) - 1)}"
             raise RunDamagedError(f"{name} says no number of tokens of {lacking[0]}. {RESTORE}")
         return {
-            name: replace(one, tokens=tokens[name]) if name in tokens else one
-            for name, one in self.own_streams.items()
+            name: replace(stream, tokens=tokens[name]) if name in tokens else stream
+            for name, stream in self.own_streams.items()
         }
 
     def _check_row(self, row: Any, name: str) -> None:
@@ -217,7 +221,7 @@ class Root:
         with_tokens = self.own_settings["tokens"] == "all"
         streams = self.own_streams.values()
         arrays = {
-            name: axes for one in streams for name, axes in one.arrays(with_tokens, self.later_views).items()
+            name: axes for stream in streams for name, axes in stream.arrays(with_tokens, self.later_views).items()
         }
         shapes = stored_inputs_of(self.own_settings).get("inputs", {})
         return {**arrays, **{f"{INPUTS}/{name}": 2 + len(shape) for name, shape in shapes.items()}}
@@ -287,8 +291,8 @@ def find_root(location: Location) -> Root | None:
 
 
 def _check_settings(settings: Mapping[str, Any], name: str) -> None:
-    further = {part: kind for part, kind in _FURTHER.items() if part in settings}
-    expect(settings, {**_SETTINGS, **further}, f"{name}: the settings", RESTORE)
+    optional = {part: kind for part, kind in _FURTHER.items() if part in settings}
+    expect(settings, {**_SETTINGS, **optional}, f"{name}: the settings", RESTORE)
     for source, parts in _OF_SOURCES.items():
         if source in settings:
             expect(settings, {source: dict}, f"{name}: the settings", RESTORE)
@@ -297,7 +301,7 @@ def _check_settings(settings: Mapping[str, Any], name: str) -> None:
 
 def _read_streams(stored: list[Any], name: str) -> dict[str, StoredStream]:
     try:
-        streams = [StoredStream.from_json({"tokens": 1, **one}) for one in stored]
+        streams = [StoredStream.from_json({"tokens": 1, **entry}) for entry in stored]
     except (TypeError, ValueError, KeyError) as error:
         raise RunDamagedError(f"{name} describes its streams wrongly: {error!r}. {RESTORE}") from error
     if len({stream.name for stream in streams}) < len(streams):

@@ -103,12 +103,12 @@ def token_blocks(rows: Rows, at: tuple[int, ...], mask: NDArray[np.bool_], block
     Reads only the inner chunks it needs, one block of all episodes at a time.
     """
     for start in range(0, mask.shape[1], block):
-        chosen = mask[:, start : start + block]
-        if not chosen.any():
+        block_mask = mask[:, start : start + block]
+        if not block_mask.any():
             continue
-        values = np.zeros((*chosen.shape, rows.array.shape[-1]), np.float32)
-        for position in np.flatnonzero(chosen.any(axis=1)):
+        values = np.zeros((*block_mask.shape, rows.array.shape[-1]), np.float32)
+        for position in np.flatnonzero(block_mask.any(axis=1)):
             bits = rows.read(position, (*at, slice(start, start + block)))
             # Not a product: padding may hold NaN or infinity, and NaN times 0 is NaN.
-            values[position] = np.where(chosen[position, :, None], decode_bfloat16(bits), 0)
-        yield TokenBlock(start, values, chosen)
+            values[position] = np.where(block_mask[position, :, None], decode_bfloat16(bits), 0)
+        yield TokenBlock(start, values, block_mask)

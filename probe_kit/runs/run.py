@@ -84,12 +84,12 @@ def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
     """
     run = read_run(locate(path))
     run.check_records()
-    done = len(run.episodes)
-    if done < run.planned and not allow_partial:
+    committed = len(run.episodes)
+    if committed < run.planned and not allow_partial:
         failed = f" ({len(run.failed)} failed: {', '.join(run.failed)})" if run.failed else ""
         raise RunIncompleteError(
-            f"{path} has {done} of {run.planned} episodes{failed}. Finish it with the same `probe-kit extract`, "
-            "or accept what is there (--partial, allow_partial=True)"
+            f"{path} has {committed} of {run.planned} episodes{failed}. Finish it with the same "
+            "`probe-kit extract`, or accept what is there (--partial, allow_partial=True)"
         )
     return run
 
@@ -158,7 +158,7 @@ class Run:
 
     @cached_property
     def label(self) -> str:
-        """What tables and legends call the run: the model and what sets it apart, or as it was named.
+        """The name of the run in tables and legends: the model and what sets it apart, or as it was named.
 
         It may be changed, see `label_run`. Raises RunDamagedError if its record is missing or was changed.
         """
@@ -240,7 +240,7 @@ class Run:
         """
         names = {name: name for name in ("item_id", "category", "group_id", "pair_id")}
         names["item_content_sha256"] = "content_sha256"
-        rows = {one["item_id"]: [one.get(name) for name in names] for one in self._plan_of_items}
+        rows = {row["item_id"]: [row.get(name) for name in names] for row in self._plan_of_items}
         return pd.DataFrame(list(rows.values()), columns=list(names.values()))
 
     @cached_property
@@ -249,7 +249,7 @@ class Run:
 
     @cached_property
     def certificate(self) -> dict[str, Any]:
-        """What was loaded and checked: the first process's record, then what every process measured.
+        """The record of what was loaded and checked: the first process's, then what every process measured.
 
         `processes` are the records of all of them, `hooks_on_equals_hooks_off` whether in each the actions or
         answers with and without capture have one hash, `mixed` what changes numbers and was not the same for all
@@ -273,11 +273,11 @@ class Run:
         if not self._commits:
             return ()
         certificate, processes = self._certificates
-        found: list[RunSources] = []
+        sources_of_run: list[RunSources] = []
         for record in (certificate, *processes):
-            if (sources := RunSources.of_record(record)) not in found:
-                found.append(sources)
-        return tuple(found)
+            if (sources := RunSources.of_record(record)) not in sources_of_run:
+                sources_of_run.append(sources)
+        return tuple(sources_of_run)
 
     @cached_property
     def provenances(self) -> dict[str, Provenance]:
@@ -286,13 +286,13 @@ class Run:
         Raises RunDamagedError if a commit names one that is not there.
         """
         stored = read_provenances(self.root)
-        named = sorted({commit.provenance for commit in self.commits()})
-        check_provenances(stored, named, self.location)
-        return {name: stored[name] for name in named}
+        names = sorted({commit.provenance for commit in self.commits()})
+        check_provenances(stored, names, self.location)
+        return {name: stored[name] for name in names}
 
     @property
     def mixed(self) -> tuple[str, ...]:
-        """What changes numbers and is not the same for all episodes, such as `versions.torch`; mostly nothing."""
+        """The parts that change numbers and differ between episodes, such as `versions.torch`; mostly none."""
         return differences(self.provenances.values())
 
     # -- wordings --------------------------------------------------------------------------------------
@@ -310,11 +310,13 @@ class Run:
         """
         if wording is None and not self.wordings:
             return self
-        chosen = self.wordings[0] if wording is None else wording
-        if chosen not in self.wordings:
-            there = ", ".join(self.wordings) or "the items' own words only (it was extracted without --wordings)"
-            raise UsageError(f"{self.location} has no wording {chosen!r}; it has {there}")
-        return self._showing(chosen, self.item_ids)
+        name = self.wordings[0] if wording is None else wording
+        if name not in self.wordings:
+            available = (
+                ", ".join(self.wordings) or "the items' own words only (it was extracted without --wordings)"
+            )
+            raise UsageError(f"{self.location} has no wording {name!r}; it has {available}")
+        return self._showing(name, self.item_ids)
 
     @property
     def whole(self) -> "Run":
@@ -332,8 +334,8 @@ class Run:
         """
         if categories is None and items is None:
             return self
-        chosen = select_items(self.items, categories, items, str(self.location))
-        return self._showing(self.wording, frozenset(chosen))
+        item_ids = select_items(self.items, categories, items, str(self.location))
+        return self._showing(self.wording, frozenset(item_ids))
 
     def _showing(self, wording: str | None, item_ids: frozenset[str] | None) -> "Run":
         return Run(self.location, wording, item_ids).under(self.rule, self.last_steps)
@@ -378,7 +380,7 @@ class Run:
     @cached_property
     def planned_items(self) -> Mapping[str, str]:
         """Category of every item of the plan by its id, whatever is shown of the run: its suite has them all."""
-        return {str(one["item_id"]): str(one["category"]) for one in self.root.plan}
+        return {str(row["item_id"]): str(row["category"]) for row in self.root.plan}
 
     @cached_property
     def _plan_of_items(self) -> list[dict[str, Any]]:
@@ -391,7 +393,7 @@ class Run:
 
     @cached_property
     def _columns_rows(self) -> NDArray[np.intp] | slice:
-        """Which rows of the columns, which hold every committed episode, are those of `episodes`."""
+        """The rows of the columns, which hold every committed episode, that are those of `episodes`."""
         if self.wording is None and self.item_ids is None:
             return slice(None)
         sealed = [planned["episode"] for planned in self.root.plan if planned["episode"] in self._commits]
@@ -430,9 +432,11 @@ class Run:
         nothing moves (`ask`, or without acting) has one inference, at step 0.
         """
         stored = [commit.control_steps for commit in self.commits()]
-        steps = np.full((len(stored), max((len(own) for own in stored), default=0)), -1, np.int64)
-        for row, own in enumerate(stored):
-            steps[row, : len(own)] = own
+        steps = np.full(
+            (len(stored), max((len(episode_steps) for episode_steps in stored), default=0)), -1, np.int64
+        )
+        for row, episode_steps in enumerate(stored):
+            steps[row, : len(episode_steps)] = episode_steps
         return steps
 
     @cached_property
@@ -446,7 +450,7 @@ class Run:
         layers = max(map(len, stored), default=0)
         if not layers:
             return None
-        return np.array([own or [np.nan] * layers for own in stored], np.float64)
+        return np.array([margins or [np.nan] * layers for margins in stored], np.float64)
 
     # -- trajectories ----------------------------------------------------------------------------------
 
@@ -462,7 +466,7 @@ class Run:
 
     @cached_property
     def trajectories(self) -> Trajectories:
-        """What happened in every episode, in the order of `episodes`. Raises NoTrajectoryError without any."""
+        """The trajectories of all episodes, in the order of `episodes`. Raises NoTrajectoryError without any."""
         if not self.has_trajectories:
             raise NoTrajectoryError(
                 f"{self.location} keeps no trajectories; it was made before they were stored, or is a copy "
@@ -472,7 +476,7 @@ class Run:
         return Trajectories(rows, self.episodes["steps"].astype(int).tolist(), str(self.location))
 
     def trajectory(self, episode: str | int) -> "Trajectory":
-        """What happened in one episode, frame by frame; `.to_xarray()` labels it.
+        """Return the trajectory of one episode, frame by frame; `.to_xarray()` labels it.
 
         episode: its id, such as `color-0001:o`, or its row in `episodes`. Raises NoTrajectoryError if the run
         keeps none, UsageError for an unknown episode, RunDamagedError if stored bytes are missing or changed.
@@ -537,10 +541,10 @@ class Run:
         return {name: stored.stream for name, stored in self._streams.items()}
 
     def stored(self, stream: str) -> StoredStream:
-        """How one stream lies in the store. Raises UnknownSiteError."""
+        """Return the storage of one stream. Raises UnknownSiteError."""
         if stream not in self._streams:
-            known = ", ".join(self._streams) or "none (a scripted run has no activations)"
-            raise UnknownSiteError(f"{self.location} has no stream {stream!r}; stored: {known}")
+            streams = ", ".join(self._streams) or "none (a scripted run has no activations)"
+            raise UnknownSiteError(f"{self.location} has no stream {stream!r}; stored: {streams}")
         return self._streams[stream]
 
     def views(self, stream: str, call: int = 0) -> tuple[str, ...]:
@@ -593,9 +597,9 @@ class Run:
         if self.columns is None and f"{site.stream}/pooled" in self.root.left_out:
             self.root.refuse_left_out(f"there is no column of {site}")
         view = resolve_view(view, stored.views)
-        if view not in (known := self.views(site.stream, call)):
+        if view not in (views := self.views(site.stream, call)):
             at = f" at inference {call}, with --later-views mean" if self._keeps_mean_of(call) else ""
-            raise UnknownSiteError(f"no view {view!r} of {site.stream}{at}; stored: {', '.join(known)}")
+            raise UnknownSiteError(f"no view {view!r} of {site.stream}{at}; stored: {', '.join(views)}")
         if self.columns is None:
             self._note_slow_reading()
             return self._column_of_rows(stored, site, view, call)
@@ -649,7 +653,7 @@ class Run:
         return committed_sums(self.root, self._commits)
 
     def _advice(self, key: str) -> str:
-        """What to do about a damaged object of `data.zarr`."""
+        """The remedy for a damaged object of `data.zarr`."""
         of = next((number for number, commit in self._commits.items() if key in commit.objects), None)
         return RESTORE if of is None else redo(of)
 
@@ -680,12 +684,12 @@ class Run:
                 array = xr.DataArray(self._kept(name, "pooled"), dims=dimensions)
             else:
                 array = self.columns.xarray(name).isel(episode=self._columns_rows)
-            own = {dimension: f"{name}_{dimension}" for dimension in (*stored.dimensions, "view", "feature")}
-            array = array.rename(own).transpose("episode", "call", *own.values())
+            renamed = {dimension: f"{name}_{dimension}" for dimension in (*stored.dimensions, "view", "feature")}
+            array = array.rename(renamed).transpose("episode", "call", *renamed.values())
             arrays[f"{name}_pooled"] = array.assign_coords({f"{name}_view": list(stored.views)})
         labels = ("episode_id", "category", "layout", "side_correct", "outcome")
-        there = [label for label in labels if label in self.episodes]
-        return xr.Dataset(arrays, coords={label: ("episode", self.episodes[label]) for label in there})
+        available = [label for label in labels if label in self.episodes]
+        return xr.Dataset(arrays, coords={label: ("episode", self.episodes[label]) for label in available})
 
     # -- tokens ----------------------------------------------------------------------------------------
 
@@ -735,9 +739,9 @@ class Run:
         if self.settings["tokens"] != "all":
             raise UnknownSiteError(f"{self.location} stores pooled views only; extract with --tokens all")
         calls = [commit.roles for commit in self.commits()]
-        spans = [own[call][site.stream] if call < len(own) else [] for own in calls]
+        spans = [episode_roles[call][site.stream] if call < len(episode_roles) else [] for episode_roles in calls]
         mask = role_mask(spans, stored.stored_tokens, role)
         if not mask[self.reached(call)].any(axis=1).all():
-            known = sorted({name for episode in spans for name, _, _ in episode})
-            raise UnknownSiteError(f"not every episode has a token of role {role!r} at {site}; roles: {known}")
+            roles = sorted({name for episode in spans for name, _, _ in episode})
+            raise UnknownSiteError(f"not every episode has a token of role {role!r} at {site}; roles: {roles}")
         return mask

@@ -3,10 +3,10 @@
 from probe_kit.errors import UsageError
 
 
-def check_scene_run(run: object, wanted: str) -> None:
+def check_scene_run(run: object, purpose: str) -> None:
     """Raise UsageError for a run on recordings or in an environment of the user's own.
 
-    wanted: what is not possible with it, in a word.
+    purpose: what is not possible with it, in a word.
     """
     if getattr(run, "recorded", False):
         reason = "shows recordings ({}), and its model did not act. There are no sides and no success rate"
@@ -14,8 +14,8 @@ def check_scene_run(run: object, wanted: str) -> None:
         reason = "plays an environment of your own ({}). There are no sides and no scene of the protocol"
     else:
         return
-    where, shown = getattr(run, "location", run), getattr(run, "suite", "")
+    where, source = getattr(run, "location", run), getattr(run, "suite", "")
     raise UsageError(
-        f"{where} {reason.format(shown)}, so {wanted} is not possible. Decode labels of your own: "
+        f"{where} {reason.format(source)}, so {purpose} is not possible. Decode labels of your own: "
         "`probe-kit train RUN --labels FILE --target COLUMN`, then `probe-kit retention RUN --target COLUMN`"
     )

@@ -43,8 +43,8 @@ def _seal(run: Run) -> bool:
         _remove_former_seals(run)
         return False
     run.location.remove(SEALED)  # nothing counts that is not whole
-    with run.location.rebuilding(COLUMNS, run.stamp) as place:
-        store = RecordingStore(place)
+    with run.location.rebuilding(COLUMNS, run.stamp) as built:
+        store = RecordingStore(built)
         group = zarr.open_group(store, mode="w", zarr_format=3)
         for name in run.streams:
             for kind in run.root.vector_kinds:
@@ -101,9 +101,9 @@ def columns_of_rows(
         stop = min(start + _block(episodes), episodes)
         for slab in _slabs(cells, (stop - start) * stored.width * size):
             values = np.empty((len(slab), stop - start, stored.width), rows.array.dtype)
-            for place, stored_row in enumerate(rows.between(start, stop)):
+            for position, stored_row in enumerate(rows.between(start, stop)):
                 row = np.moveaxis(stored_row, -2, 1) if kind == "pooled" else stored_row
-                values[:, place] = row[tuple(np.transpose(slab))]
+                values[:, position] = row[tuple(np.transpose(slab))]
             for cell, column in zip(slab, values, strict=True):
                 yield (*cell, slice(start, stop)), column
 

@@ -64,7 +64,7 @@ def write_seconds(root: Root, number: int, seconds: Seconds) -> None:
 
 
 def read_seconds(root: Root, commits: Mapping[int, Commit]) -> dict[int, Seconds]:
-    """By episode number, NaN for all where none are stored. Raises RunDamagedError for the first that is wrong."""
+    """Read the seconds by episode number, NaN where none are stored. Raises RunDamagedError for a wrong one."""
     records = {number: _parse(root, number, key, raw) for number, key, raw in numbered(root.location, TIMES)}
     if problem := next(_missing(root, commits, records), None):
         raise RunDamagedError(problem)

@@ -18,22 +18,22 @@ def select_items(
     items: as `Run.items`. categories: slugs, all by default. where: the run, for messages.
     Raises UnknownCategoryError and UsageError, see `Run.only`.
     """
-    there = list(dict.fromkeys(items["category"].astype(str)))
-    wanted = there if categories is None else check_categories(categories, there)
-    if not wanted:
+    categories_of_run = list(dict.fromkeys(items["category"].astype(str)))
+    selected = categories_of_run if categories is None else check_categories(categories, categories_of_run)
+    if not selected:
         raise UsageError("no category selected. Name at least one, or leave `categories` out for all.")
-    chosen: list[str] = []
-    for category in wanted:
-        own = items[items["category"] == category]
-        count = len(own) if per_category is None else per_category
-        if not 0 < count <= len(own):
+    item_ids: list[str] = []
+    for category in selected:
+        planned = items[items["category"] == category]
+        count = len(planned) if per_category is None else per_category
+        if not 0 < count <= len(planned):
             raise UsageError(
-                f"items is {count}, but {where} plans {len(own)} items of {category!r}; give a number from 1 to "
-                f"{len(own)}, or play more with `probe-kit extract`"
+                f"items is {count}, but {where} plans {len(planned)} items of {category!r}; give a number from 1 "
+                f"to {len(planned)}, or play more with `probe-kit extract`"
             )
-        _check_twins(own, count, category)
-        chosen += own["item_id"].iloc[:count].tolist()
-    return chosen
+        _check_twins(planned, count, category)
+        item_ids += planned["item_id"].iloc[:count].tolist()
+    return item_ids
 
 
 def _check_twins(items: "pd.DataFrame", count: int, category: str) -> None:

@@ -23,7 +23,7 @@ class DescribedRun(Protocol):
 
     @property
     def location(self) -> "Location":
-        """Where the run lies; probe results go to `probes` there. For a folder: `locate(folder)`."""
+        """The place of the run; probe results go to `probes` there. For a folder: `locate(folder)`."""
 
     @property
     def model(self) -> str:
@@ -72,7 +72,7 @@ def run_text(run: Summarised) -> str:
 
 
 def run_html(run: Summarised) -> str:
-    """What it is a run of, how it went, and what its folder is called."""
+    """Describe the run, how it went, and its folder."""
     weights = "scripted, no weights" if run.weights_sha256 is None else f"sha256 {run.weights_sha256[:12]}"
     facts = {
         "suite": run.suite,
@@ -86,8 +86,8 @@ def run_html(run: Summarised) -> str:
 
 
 def _episodes(run: Summarised) -> str:
-    done = len(run.episodes)
-    return f"{done} episodes" if done == run.planned else f"{done} of {run.planned} episodes"
+    committed = len(run.episodes)
+    return f"{committed} episodes" if committed == run.planned else f"{committed} of {run.planned} episodes"
 
 
 def _outcomes(run: Summarised) -> dict[str, int]:
@@ -101,13 +101,13 @@ MOST = 12
 
 
 def what_to_open(address: str) -> str:
-    """What to do where there is no run: the runs inside, one of nearly that name, or how to make one."""
+    """Advise what to do where there is no run: open one inside, one of nearly that name, or make one."""
     folder = Path(address).expanduser()
     if "://" not in address:
         if inside := runs_in(folder):
             more = f" and {len(inside) - MOST} more" if len(inside) > MOST else ""
             return f"It holds {counted(len(inside), 'run')}: {', '.join(map(str, inside[:MOST]))}{more}"
-        beside = {path.name: path for path in runs_in(folder.parent, deep=False)}
-        if near := get_close_matches(folder.name, beside, n=1):
-            return f"Did you mean {beside[near[0]]}?"
+        neighbours = {path.name: path for path in runs_in(folder.parent, deep=False)}
+        if near := get_close_matches(folder.name, neighbours, n=1):
+            return f"Did you mean {neighbours[near[0]]}?"
     return "Make one with `probe-kit extract`"

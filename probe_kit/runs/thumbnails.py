@@ -71,8 +71,8 @@ def read_thumbnail(run: Path | Location, number: int) -> bytes | None:
     sheet = read_sheet(run, number)
     if sheet is None or sheet.count is None:
         return None if sheet is None else sheet.content
-    first, *further = decode_frames(sheet.content, sheet.count)
-    return as_thumbnail(tuple(shrink(frame) for frame in (first, *further[-1:])))
+    first, *later = decode_frames(sheet.content, sheet.count)
+    return as_thumbnail(tuple(shrink(frame) for frame in (first, *later[-1:])))
 
 
 def read_sheet(run: Path | Location, number: int) -> FrameSheet | None:
@@ -99,5 +99,5 @@ def read_sheet(run: Path | Location, number: int) -> FrameSheet | None:
 
 
 def thumbnail_key(number: int) -> str:
-    """Where the thumbnail of episode `number` lies."""
+    """Return the key of the thumbnail of episode `number`."""
     return f"{FRAMES}/{number:08d}.webp"

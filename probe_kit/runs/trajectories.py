@@ -72,7 +72,7 @@ class Trajectories:
         return len(self._steps)
 
     def __getitem__(self, position: int) -> Trajectory:
-        """That of one episode. Raises RunDamagedError if stored bytes are missing, changed or too few."""
+        """Return that of one episode. Raises RunDamagedError if stored bytes are missing, changed or too few."""
         return self._trajectory(self._rows[position], self._steps[position])
 
     def __iter__(self) -> Iterator[Trajectory]:

@@ -163,10 +163,10 @@ def _content_problems(location: Location, objects: Iterable[StoredObject]) -> It
 
     def problem(stored: StoredObject) -> str | None:
         try:
-            length, digest = digest_of(location.pieces(stored.key), stored.known.length)
+            length, digest = digest_of(location.pieces(stored.key), stored.stored_sum.length)
         except FileNotFoundError:
             return None
-        if length != stored.known.length or digest == stored.known.digest:
+        if length != stored.stored_sum.length or digest == stored.stored_sum.digest:
             return None
         return f"{stored.key}{stored.owner} has other bytes than were written. {stored.advice}"
 

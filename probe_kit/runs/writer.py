@@ -78,7 +78,7 @@ class WrittenPlan(Protocol):
 
     @property
     def selection(self) -> dict[str, Any]:
-        """What was selected; no part of the run's identity."""
+        """The selection; no part of the run's identity."""
 
     def to_json(self) -> dict[str, Any]:
         """`episodes` as flat columns, and `suite_parent`."""
@@ -141,7 +141,7 @@ class RunWriter[PlanT: WrittenPlan]:
 
     @property
     def streams(self) -> list[StoredStream]:
-        """How the streams lie in the run, which may have room for longer sequences than this plan needs."""
+        """The storage of the streams in the run, which may have room for longer sequences than this plan needs."""
         return [self.root.streams[stream.name] for stream in self.plan.streams]
 
     @property
@@ -169,8 +169,8 @@ class RunWriter[PlanT: WrittenPlan]:
 
     def _without_length(self, stream: StoredStream) -> dict[str, Any]:
         """A stream as `run.json` has it: without its number of tokens, unless arrays are as long as that."""
-        kept = stream.to_json()
-        return kept if self._with_tokens else {name: value for name, value in kept.items() if name != "tokens"}
+        entry = stream.to_json()
+        return entry if self._with_tokens else {name: value for name, value in entry.items() if name != "tokens"}
 
     def _continued(self) -> Root:
         """The root of the run that is there, whose plan now holds the one of this writer."""
@@ -255,8 +255,8 @@ class RunWriter[PlanT: WrittenPlan]:
 
     def remaining(self) -> list[int]:
         """Numbers of the episodes that are not committed; objects of the committed ones are checked."""
-        done = while_growing(self.location, lambda: read_commits(read_root(self.location)))
-        return [episode.index for episode in self.plan.episodes if episode.index not in done]
+        committed = while_growing(self.location, lambda: read_commits(read_root(self.location)))
+        return [episode.index for episode in self.plan.episodes if episode.index not in committed]
 
     def write(self, episode: EpisodeRecord) -> None:
         """Store one episode: first its arrays, then the commit that makes it count.

@@ -28,7 +28,10 @@ def pairs(source: SceneSource, vary: str, seed: int = 0) -> list[Pair]:
         return list(source.pairs(vary, draw, rows))
     frames = frames_of(source.play(Played()), rows)
     moved = [
-        replace(frame, seen=replace(frame.seen, state=frame.seen.state + np.float32(0.01 * number)))
+        replace(
+            frame,
+            observation=replace(frame.observation, state=frame.observation.state + np.float32(0.01 * number)),
+        )
         for number, frame in enumerate(frames)
     ]
     return list(pairs_of(moved, vary, draw))

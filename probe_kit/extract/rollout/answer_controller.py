@@ -108,22 +108,24 @@ class AnswerController:
 
     def _asked(self, turns: Sequence[Turn]) -> list[dict[str, Any]]:
         self._choose_positions()
-        shown = [self._shown(turn) for turn in turns]
+        observations = [self._shown(turn) for turn in turns]
         phrases_asked = [self._phrases[turn.row.content.item.item_id] for turn in turns]
         buffers = {row: turn.buffers for row, turn in enumerate(turns)} if self.streams else {}
         spoken: list[list[str]] = []
         forced: list[list[Forced]] = []
         for order in self.template.orders:
-            questions = self._questions(shown, phrases_asked, order)
+            questions = self._questions(observations, phrases_asked, order)
             reading = self._read(questions, buffers if order == "original" else {})
             spoken.append(self.model.speak(reading, self.template.tokens))
             forced.append(self._forced(questions, reading, order))
             if buffers and order == "original":
                 self._record_lens(turns, reading)
-        first = self._questions(shown, phrases_asked, "original")
+        first = self._questions(observations, phrases_asked, "original")
         sizes = self._sizes(first)
         return [
-            self._outcome(turn, first[row].text, [own[row] for own in spoken], [own[row] for own in forced])
+            self._outcome(
+                turn, first[row].text, [by_row[row] for by_row in spoken], [by_row[row] for by_row in forced]
+            )
             | sizes[row]
             for row, turn in enumerate(turns)
         ]
@@ -134,31 +136,38 @@ class AnswerController:
         return None if ids is None else tuple(map(int, ids[0]))
 
     def _choose_positions(self) -> None:
-        """Those of the backbone's stream; the model may serve other prompts too."""
+        """Choose the positions of the backbone's stream; the model may serve other prompts too."""
         self.model.match_policies(self.template.is_instruction)
 
     # -- what is asked -----------------------------------------------------------------------------------
 
     def _shown(self, turn: Turn) -> Observation:
-        (seen,) = copied([turn.seen])
+        (observation,) = copied([turn.observation])
         if self._settings.task.picture != "side-by-side":
-            return seen
+            return observation
         picture = side_by_side(turn.row.content, self._settings.scene.picture_shape)
-        return replace(seen, image=picture)
+        return replace(observation, image=picture)
 
-    def _questions(self, shown: Sequence[Observation], named: Sequence[Phrase], order: Order) -> list["Prompt"]:
-        """As the answer is spoken; the logits of its options are those of how it begins."""
+    def _questions(
+        self, observations: Sequence[Observation], objects: Sequence[Phrase], order: Order
+    ) -> list["Prompt"]:
+        """The questions as the answer is spoken; the logits of the options are those of how it begins."""
         from probe_kit.hooks import Prompt
 
         pictured = self._settings.task.picture != "none"
         options = tuple(self._spoken_options(order))
         return [
-            Prompt(seen, self.template.render(phrase, order, seen.instruction), options, pictured=pictured)
-            for seen, phrase in zip(shown, named, strict=True)
+            Prompt(
+                observation,
+                self.template.render(phrase, order, observation.instruction),
+                options,
+                pictured=pictured,
+            )
+            for observation, phrase in zip(observations, objects, strict=True)
         ]
 
     def _spoken_options(self, order: Order) -> dict[str, Said]:
-        """What an answer may begin with, and what that says."""
+        """The meaning of an answer by its beginning."""
         lead = self.model.lead
         if not self.template.lettered:
             return {f"{lead}Yes": "yes", f"{lead}No": "no"}
@@ -180,8 +189,10 @@ class AnswerController:
         meaning: Mapping[str, Said] = self._spoken_options(order)
         if self._form is not None:
             meaning = self._form.options
-            asked = [replace(own, options=tuple(meaning), begun=self._form.begun) for own in questions]
-            reading = self.model.read(asked)
+            forced_questions = [
+                replace(question, options=tuple(meaning), begun=self._form.begun) for question in questions
+            ]
+            reading = self.model.read(forced_questions)
         if np.isnan(reading.option_logits).any():
             raise PolicyFailedError(
                 "the model gave NaN as the logit of an answer; expected numbers for all of them"
@@ -189,7 +200,7 @@ class AnswerController:
         ties = self.model.near_ties(reading)
         return [
             Forced(
-                {said: float(logit) for said, logit in zip(meaning.values(), row, strict=True)},
+                {statement: float(logit) for statement, logit in zip(meaning.values(), row, strict=True)},
                 float(reading.option_mass[number]),
                 bool(ties[number]),
             )
@@ -223,24 +234,27 @@ class AnswerController:
     ) -> dict[str, Any]:
         episode = turn.row.content
         expected = side_expected(self._settings.task.query, episode.side_correct)
-        choice = Choice([own.logits for own in forced])
+        choice = Choice([forced_choice.logits for forced_choice in forced])
         columns: dict[str, Any] = {}
         for order, text in zip(self.template.orders, spoken, strict=True):
             read = read_answer(text, self.template, order)
             mark = "" if order == "original" else "_swapped"
             columns |= {
-                f"outcome{mark}": outcome_of(read.said, expected),
-                f"side_placed{mark}": side_said(read.said),
+                f"outcome{mark}": outcome_of(read.meaning, expected),
+                f"side_placed{mark}": side_said(read.meaning),
                 f"answer{mark}": text,
-                f"said{mark}": read.said,
+                f"said{mark}": read.meaning,
                 f"parse{mark}": read.rule,
                 f"parse_tier{mark}": read.tier or "none",
             }
-        for order, own in zip(self.template.orders, forced, strict=True):
+        for order, forced_choice in zip(self.template.orders, forced, strict=True):
             mark = "" if order == "original" else "_swapped"
-            columns |= {f"logit_{said}{mark}": logit for said, logit in own.logits.items()}
-            columns |= {f"option_mass{mark}": own.mass, f"near_tie{mark}": own.near_tie}
-        columns |= {f"margin{mark}": own for mark, own in zip(("", "_swapped"), choice.margins, strict=False)}
+            columns |= {f"logit_{statement}{mark}": logit for statement, logit in forced_choice.logits.items()}
+            columns |= {f"option_mass{mark}": forced_choice.mass, f"near_tie{mark}": forced_choice.near_tie}
+        columns |= {
+            f"margin{mark}": forced_choice
+            for mark, forced_choice in zip(("", "_swapped"), choice.margins, strict=False)
+        }
         phrase = self._phrases[episode.item.item_id]
         return columns | {
             "content": choice.content,
@@ -254,7 +268,7 @@ class AnswerController:
         }
 
     def _sizes(self, questions: Sequence["Prompt"]) -> list[dict[str, int]]:
-        """How long each prompt was; its last position can lie outside the backbone's stream."""
+        """The length of each prompt; its last position can lie outside the backbone's stream."""
         rows, after = self._backbone_roles(questions), int(not self.model.whole_prompt)
         return [
             {"prompt_tokens": int(row.valid.sum()) + after, "picture_tokens": int(row.mask("image").sum())}
@@ -262,17 +276,17 @@ class AnswerController:
         ]
 
     def _backbone_roles(self, questions: Sequence["Prompt"]) -> "list[Roles]":
-        backbone = next(name for name, own in self.model.streams.items() if own.part == "backbone")
+        backbone = next(name for name, stream in self.model.streams.items() if stream.part == "backbone")
         return self.model.asked_roles(questions)[backbone]
 
     # -- beforehand --------------------------------------------------------------------------------------
 
     def _blank_questions(self, blank: Observation) -> list["Prompt"]:
-        named = sorted(set(self._phrases.values()), key=lambda phrase: (phrase.text, phrase.article))
+        objects = sorted(set(self._phrases.values()), key=lambda phrase: (phrase.text, phrase.article))
         if self.template.is_instruction:
             blanks = [replace(blank, instruction=text) for text in self._instructions]
-            return self._questions(blanks, named[:1] * len(blanks), "original")
-        return self._questions([blank] * len(named), named, "original")
+            return self._questions(blanks, objects[:1] * len(blanks), "original")
+        return self._questions([blank] * len(objects), objects, "original")
 
     def _streams(self, blank: Observation) -> list[StoredStream]:
         """At the longest prompt; a prompt without a picture has no view of one."""
@@ -313,10 +327,10 @@ def asked_rows(rows: Sequence[Row], source: SceneSource, settings: AskSettings) 
 
     Raises UsageError for items without such a phrase.
     """
-    named = phrases(source.suite, settings.task.query, settings.seed)
+    objects_by_item = phrases(source.suite, settings.task.query, settings.seed)
     if settings.task.query == "target":
         return tuple(rows)
-    objects = {item: phrase.with_article for item, phrase in named.items()}
+    objects = {item: phrase.with_article for item, phrase in objects_by_item.items()}
     return tuple(
         replace(row, columns={**row.columns, "asked_object": objects[row.columns["item_id"]]}) for row in rows
     )

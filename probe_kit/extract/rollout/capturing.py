@@ -44,7 +44,7 @@ class Capturer:
         buffers: "Mapping[int, EpisodeBuffers]",
         around: Callable[[], AbstractContextManager[None]] = nullcontext,
     ) -> Result:
-        """What `infer` gives, its activations kept for the rows that have buffers.
+        """Return the result of `infer`, whose activations are kept for the rows that have buffers.
 
         output_of: the numbers that a capture must not change. around: what is done to the model at every
         inference. Raises CaptureChangedActionError as `_prove_harmless` does, and what `capture` raises.
@@ -66,8 +66,8 @@ class Capturer:
         if not self.fires:
             self._prove_harmless(infer, output_of, output_of(result), around)
         self.fires = tape.fires
-        for row, own in buffers.items():
-            self._keep(tape, row, {name: rows[row] for name, rows in roles.items()}, own)
+        for row, episode_buffers in buffers.items():
+            self._keep(tape, row, {name: rows[row] for name, rows in roles.items()}, episode_buffers)
         return result
 
     def _prove_harmless[Result](
@@ -112,14 +112,14 @@ class Capturer:
 
         buffers.keep_roles(roles)
         for stored in self._streams:
-            own = roles[stored.name]
-            kept = torch.stack([tape[site][row] for site in stored.stream.sites()])
+            stream_roles = roles[stored.name]
+            values = torch.stack([tape[site][row] for site in stored.stream.sites()])
             if self._with_tokens:
-                valid = torch.from_numpy(own.valid).to(kept.device)
-                bits = (kept * valid[:, None]).to(torch.bfloat16).view(torch.int16)
+                valid = torch.from_numpy(stream_roles.valid).to(values.device)
+                bits = (values * valid[:, None]).to(torch.bfloat16).view(torch.int16)
                 buffers.keep_tokens(stored.name, bits.reshape(*stored.lead, *bits.shape[1:]))
-                kept = torch.stack([_pool_rows(site[None], [own], stored.views)[0] for site in kept])
-            buffers.keep_pooled(stored.name, kept)
+                values = torch.stack([_pool_rows(site[None], [stream_roles], stored.views)[0] for site in values])
+            buffers.keep_pooled(stored.name, values)
 
 
 def stored_streams(
@@ -137,7 +137,7 @@ def stored_streams(
 
 
 def _sha256(outputs: NDArray[np.float32]) -> str:
-    """Of shape, type and every bit."""
+    """Hash shape, type and every bit."""
     return sha256(
         f"{outputs.dtype} {outputs.shape}".encode() + np.ascontiguousarray(outputs).tobytes()
     ).hexdigest()
@@ -149,4 +149,6 @@ def _pool_rows(activation: "Tensor", roles: "Sequence[Roles]", views: Sequence[s
 
     from probe_kit.hooks import pool
 
-    return torch.stack([pool(tokens, own, views) for tokens, own in zip(activation, roles, strict=True)])
+    return torch.stack(
+        [pool(tokens, row_roles, views) for tokens, row_roles in zip(activation, roles, strict=True)]
+    )

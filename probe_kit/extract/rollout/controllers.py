@@ -36,14 +36,14 @@ SCRIPTED = {
 
 
 def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: str) -> int:
-    """How many words at the end of an instruction do not reach the network, because its prompt is cut.
+    """Count the words at the end of an instruction that do not reach the network, because its prompt is cut.
 
     pack: the ids that the network is delivered, None if unknown. A word is lost if they stay the same without it.
     """
-    whole, words = pack(instruction), instruction.split()
+    ids, words = pack(instruction), instruction.split()
     lost = 0
     try:
-        while whole is not None and lost + 1 < len(words) and pack(" ".join(words[: -lost - 1])) == whole:
+        while ids is not None and lost + 1 < len(words) and pack(" ".join(words[: -lost - 1])) == ids:
             lost += 1
     except ProbeKitError:  # a shorter text is no instruction of the model
         return lost
@@ -65,7 +65,7 @@ class Turn:
     chunks of the inferences before, oldest first, which the controller keeps where a policy averages them.
     """
 
-    seen: Observation
+    observation: Observation
     row: Row
     call: int
     buffers: "EpisodeBuffers"
@@ -78,7 +78,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class Inference:
-    """What one inference leads to.
+    """The result of one inference.
 
     actions: (n, D) float32 to execute, n >= 1; None ends the episode. flagged: whether it put out no valid action;
     None if that is unknown. columns: of the episode's outcome.
@@ -110,7 +110,7 @@ class Controller(Protocol):
         """The ids that the network is delivered as this instruction; None if it reads none or cannot say."""
 
     def certificate(self) -> dict[str, Any]:
-        """What was checked so far, for the run's certificate."""
+        """Return the checks so far, for the run's certificate."""
 
 
 class ScriptedController:
@@ -191,7 +191,7 @@ class PolicyController:
 
     def _captured(self, turns: Sequence[Turn]) -> NDArray[np.float32]:
         """(B, chunk, D) of one call, whose activations are kept for the turns that are captured."""
-        observations = copied([turn.seen for turn in turns])
+        observations = copied([turn.observation for turn in turns])
         seeds = [turn.derived_seed("inference") for turn in turns]
         captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
         if not captured:
@@ -207,7 +207,7 @@ class PolicyController:
 
     def _chunks(self, turns: Sequence[Turn], seeds: Sequence[int]) -> NDArray[np.float32]:
         """The policy's answer about observations that it may write to, and cannot change later."""
-        chunks = self._called([turn.seen for turn in turns], seeds)
+        chunks = self._called([turn.observation for turn in turns], seeds)
         if self._source.own_units:
             check_predictions(chunks, len(turns))
         elif not self.capture_only:
@@ -272,13 +272,13 @@ def _check_chunks(chunks: NDArray[np.float32], count: int) -> None:
 
     Actions that are NaN cost their own episode only, so the environment is left to say that.
     """
-    given = chunks if isinstance(chunks, np.ndarray) else None
-    shape = () if given is None else given.shape
+    array = chunks if isinstance(chunks, np.ndarray) else None
+    shape = () if array is None else array.shape
     fits = len(shape) == 3 and shape[0] == count and shape[1] >= 1 and shape[2] == ACTION_SIZE
-    if given is None or not fits or given.dtype != np.float32:
-        seen = type(chunks).__name__ if given is None else f"ndarray of shape {shape} and {given.dtype}"
+    if array is None or not fits or array.dtype != np.float32:
+        described = type(chunks).__name__ if array is None else f"ndarray of shape {shape} and {array.dtype}"
         raise PolicyFailedError(
-            f"the policy gave a {seen} for {count} observations; expected a numpy array "
+            f"the policy gave a {described} for {count} observations; expected a numpy array "
             f"({count}, chunk, {ACTION_SIZE}) of float32 actions"
         )
 

@@ -66,7 +66,9 @@ class EpisodeBuffers:
 
     def keep_roles(self, roles: "dict[str, Roles]") -> None:
         """Begin the next captured inference."""
-        self.roles.append({name: [(s.role, s.start, s.stop) for s in own.spans] for name, own in roles.items()})
+        self.roles.append(
+            {name: [(s.role, s.start, s.stop) for s in stream_roles.spans] for name, stream_roles in roles.items()}
+        )
 
     def keep_pooled(self, stream: str, values: "Tensor") -> None:
         """Copy (sites, V, D) of the last inference begun, or what is stored of it."""
@@ -148,8 +150,8 @@ class BufferPool:
 
     def __init__(self, buffers: Sequence[EpisodeBuffers]) -> None:
         self._free: SimpleQueue[EpisodeBuffers] = SimpleQueue()
-        for one in buffers:
-            self._free.put(one)
+        for free in buffers:
+            self._free.put(free)
 
     def take(self) -> EpisodeBuffers:
         """Empty buffers; waits until some are given back."""

@@ -23,7 +23,7 @@ from probe_kit.runs.writer import EpisodeRecord
 
 @dataclass(frozen=True)
 class Rollout:
-    """What one episode left: its outcome record, its activations, and its frames and small frames if asked for.
+    """The result of one episode: its outcome record, its activations, and its frames if requested.
 
     trajectory: (T + 1, C) float32 frames of the whole episode. instruction_ids: what the policy was delivered
     as its instruction, None if it reads none or cannot say. control_steps: of every inference, how many actions of
@@ -43,7 +43,7 @@ class Rollout:
 
     @property
     def record(self) -> EpisodeRecord:
-        """What of it the run stores."""
+        """The part that the run stores."""
         buffers = self.buffers
         arrays: dict[str, dict[str, NDArray[Any]]] = {
             "pooled": {**buffers.pooled}, "tokens": {**buffers.tokens}, LATER: {**buffers.later},
@@ -131,7 +131,7 @@ class EpisodeSlot:
 
     @property
     def counts(self) -> dict[str, int]:
-        """What the outcome record says of the policy's steps, where the policy can tell, and of lost words."""
+        """The counts of the outcome record: flagged steps, where the policy can tell, and lost words."""
         flagged = {} if self.flagged is None else {"inferences": self.calls, "flagged_steps": self.flagged}
         return flagged | ({"lost_words": self.lost_words} if self.lost_words else {})
 
@@ -181,7 +181,7 @@ class EpisodeLoop:
         return "begin", (planned, self._film(planned))
 
     def _then(self, slot: EpisodeSlot) -> Request | None:
-        """What the slot's player is to begin if its episode ends now."""
+        """The request that the slot's player is to begin with if its episode ends now."""
         if slot.following is None:
             slot.following = self._next_episode()
         return None if slot.following is None else self._beginning(slot.following)
@@ -225,8 +225,10 @@ class EpisodeLoop:
             seconds = (perf_counter() - started) / len(turns)
             for slot, turn in zip(due, turns, strict=True):
                 if turn.call == 0:
-                    slot.instruction_ids = self._controller.instruction_ids(turn.seen.instruction)
-                    slot.lost_words = count_lost_words(self._controller.instruction_ids, turn.seen.instruction)
+                    slot.instruction_ids = self._controller.instruction_ids(turn.observation.instruction)
+                    slot.lost_words = count_lost_words(
+                        self._controller.instruction_ids, turn.observation.instruction
+                    )
         except EPISODE_ERRORS as error:
             for slot in due:
                 yield self._give_up(slot, error)

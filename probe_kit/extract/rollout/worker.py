@@ -68,10 +68,10 @@ class Worker:
         self._opened.close()
 
     def _open_player(self, position: int, stack: ExitStack) -> AskablePlayer:
-        wanted = self._settings.machine.env_workers
-        if wanted is None:
-            wanted = 2 * self._settings.machine.observations if self._episodes >= WORTH_PROCESSES else 0
-        kind = ProcessPlayer if position < wanted else LocalPlayer
+        processes = self._settings.machine.env_workers
+        if processes is None:
+            processes = 2 * self._settings.machine.observations if self._episodes >= WORTH_PROCESSES else 0
+        kind = ProcessPlayer if position < processes else LocalPlayer
         player = kind(self._opens)
         stack.callback(player.close)
         return player
@@ -134,12 +134,12 @@ class Worker:
     def _pictures(self, rollout: Rollout) -> dict[str, bytes]:
         """Content by key of what is kept for people."""
         small = rollout.small_frames
-        kept = (
+        thumbnails = (
             {thumbnail_key(rollout.planned.index): as_thumbnail(small, self._settings.machine.frames)}
             if small
             else {}
         )
-        return kept | (dict([_film(rollout)]) if rollout.frames else {})
+        return thumbnails | (dict([_film(rollout)]) if rollout.frames else {})
 
     def _frame_count(self, rollout: Rollout) -> int | None:
         return len(rollout.small_frames) or None if self._settings.machine.frames == "all" else None
@@ -152,7 +152,7 @@ class Worker:
 
 @contextmanager
 def torch_threads(count: int | None) -> Iterator[None]:
-    """So many threads for torch while the body runs; None for its own choice. Other threads, other roundings."""
+    """Let torch use so many threads in the body; None for its own choice. Other threads, other roundings."""
     if count is None:
         yield
         return

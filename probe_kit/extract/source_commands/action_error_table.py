@@ -29,7 +29,7 @@ def show_action_errors(run: str, partial: bool, as_json: bool) -> None:
 def _plain(frame: "pd.DataFrame") -> list[dict[str, Any]]:
     """The lines of a frame as JSON has them: NaN is null."""
     rows = frame.to_dict("records")
-    return [{str(name): None if own != own else own for name, own in row.items()} for row in rows]
+    return [{str(name): None if value != value else value for name, value in row.items()} for row in rows]
 
 
 def _print_errors(errors: "ActionErrors") -> None:
@@ -41,8 +41,8 @@ def _print_errors(errors: "ActionErrors") -> None:
     for heading in ("number", "recorded deviation", "bias", "error, first action", "error, whole chunk"):
         table.add_column(heading, justify="left" if heading == "number" else "right")
     for row in _plain(errors.by_number):
-        own = [row["bias"], row["first"], row["chunk"]]
-        cells = ["constant" if one is None else f"{one:.2f}" for one in own]
+        errors_of_number = [row["bias"], row["first"], row["chunk"]]
+        cells = ["constant" if error is None else f"{error:.2f}" for error in errors_of_number]
         table.add_row(terminal_safe(row["number"]), f"{row['deviation']:.3g}", *cells)
     out.print(table)
     ordered = _plain(episodes.sort_values("first").dropna())

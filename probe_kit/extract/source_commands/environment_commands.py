@@ -44,8 +44,8 @@ def check_environment(
                 out.print(marked("         [dim]seen[/] {}", terminal_safe(check.problem)), soft_wrap=True)
     failed = sum(not check.passed for check in checks)
     if as_json:
-        found = [{**asdict(check), "passed": check.passed} for check in checks]
-        print_json({"environment": environment, "passed": not failed, "checks": found})
+        listed = [{**asdict(check), "passed": check.passed} for check in checks]
+        print_json({"environment": environment, "passed": not failed, "checks": listed})
     elif failed:
         out.print(f"{len(checks) - failed} passed, {failed} failed")
     else:

@@ -76,7 +76,7 @@ class _Trial:
         _check_equal(self._played[0], again, "the same episode, played again behind another one")
 
     def repeats_elsewhere(self) -> None:
-        """In a new environment, as each process opens its own."""
+        """Repeat the first episode in a new environment, as each process opens its own."""
         other = open_environment(self.source)
         try:
             again = self._play(other, self._chosen[0])
@@ -185,22 +185,22 @@ def check_environment(source: EnvSource | str) -> Iterator[EnvironmentCheck]:
 
 
 def _shapes(step: Step) -> dict[str, tuple[int, ...]]:
-    seen = step.observation
-    further = {f"the camera {name!r}": picture.shape for name, picture in seen.cameras.items()}
-    return {"the picture": seen.image.shape, "the state": seen.state.shape, **further}
+    observation = step.observation
+    cameras = {f"the camera {name!r}": picture.shape for name, picture in observation.cameras.items()}
+    return {"the picture": observation.image.shape, "the state": observation.state.shape, **cameras}
 
 
 def _check_equal(first: list[Step], again: list[Step], which: str) -> None:
     if len(first) != len(again):
         raise _BrokenError(f"{which} ended after {len(again) - 1} actions, before after {len(first) - 1}")
     for number, (was, now) in enumerate(zip(first, again, strict=True)):
-        one, two = was.observation, now.observation
+        before, after = was.observation, now.observation
         different = [
             name
             for name, equal in (
-                ("the picture", np.array_equal(one.image, two.image)),
-                ("the state", np.array_equal(one.state, two.state)),
-                ("a further camera", _equal_pictures(one.cameras, two.cameras)),
+                ("the picture", np.array_equal(before.image, after.image)),
+                ("the state", np.array_equal(before.state, after.state)),
+                ("a further camera", _equal_pictures(before.cameras, after.cameras)),
                 ("a fact", dict(was.facts) == dict(now.facts)),
                 ("done", was.done == now.done),
             )
@@ -213,8 +213,8 @@ def _check_equal(first: list[Step], again: list[Step], which: str) -> None:
             )
 
 
-def _equal_pictures(one: object, two: object) -> bool:
-    assert hasattr(one, "items")
-    assert hasattr(two, "items")
-    first, second = dict(one.items()), dict(two.items())
+def _equal_pictures(before: object, after: object) -> bool:
+    assert hasattr(before, "items")
+    assert hasattr(after, "items")
+    first, second = dict(before.items()), dict(after.items())
     return first.keys() == second.keys() and all(np.array_equal(first[name], second[name]) for name in first)

@@ -29,7 +29,7 @@ class EnvEpisode:
 
 @dataclass(frozen=True)
 class Step:
-    """What an environment shows after an action.
+    """The state of an environment after an action.
 
     done: whether the episode is over. facts: numbers or truth values by name, which become labels of the next
     inference; every step of every episode has the same names. `success` becomes the outcome.

@@ -145,8 +145,8 @@ class EnvironmentSource(Source[EnvSource]):
         check_units(unusual, self._state_names, f"{name}, the state after reset()", policy, accept_units)
         return self, policy
 
-    def _with_cameras(self, policy: "Policy", seen: Observation) -> "Policy":
-        self.cameras = [*policy.card.cameras[:1], *seen.cameras]
+    def _with_cameras(self, policy: "Policy", observation: Observation) -> "Policy":
+        self.cameras = [*policy.card.cameras[:1], *observation.cameras]
         try:
             return policy.with_cameras(self.cameras)
         except ObservationError as error:
@@ -155,18 +155,18 @@ class EnvironmentSource(Source[EnvSource]):
                 "`Observation.cameras` as the model does"
             ) from error
 
-    def _check_state(self, policy: "Policy", seen: Observation) -> None:
+    def _check_state(self, policy: "Policy", observation: Observation) -> None:
         expected = policy.state_numbers
-        if expected is not None and seen.state.shape != (expected,):
+        if expected is not None and observation.state.shape != (expected,):
             raise OwnEnvironmentError(
-                f"{self.name} has a state of {seen.state.size} numbers; {policy.card.checkpoint} reads {expected}"
-                ". Take a checkpoint of this environment"
+                f"{self.name} has a state of {observation.state.size} numbers; {policy.card.checkpoint} reads "
+                f"{expected}. Take a checkpoint of this environment"
             )
 
-    def _predicted(self, policy: "Policy", seen: Observation) -> NDArray[np.float32]:
+    def _predicted(self, policy: "Policy", observation: Observation) -> NDArray[np.float32]:
         """(chunk, D) of one prediction. Raises OwnEnvironmentError for actions of another width or order."""
         with while_acting(policy.card.family, policy.card.checkpoint):
-            chunks = policy.predict(copied([seen]), [0])
+            chunks = policy.predict(copied([observation]), [0])
             check_predictions(chunks, 1)
         if chunks.shape[2] != len(self.actions):
             raise OwnEnvironmentError(
@@ -195,18 +195,18 @@ class EnvironmentSource(Source[EnvSource]):
 
     @property
     def _state_names(self) -> list[str]:
-        return [] if self.seen is None else [str(place) for place in range(self.seen.state.size)]
+        return [] if self.seen is None else [str(position) for position in range(self.seen.state.size)]
 
     def identity(self, execute: int) -> dict[str, Any]:
         """The environment by its revision, and what it shows; empty before a model is loaded."""
         if self.seen is None:
             return {ENVIRONMENT: {}}
-        settings, seen = self.settings, self.seen
+        settings, observation = self.settings, self.seen
         shapes: dict[str, list[int]] = {
             "action": [execute, len(self.actions)],
             **({"columns": [len(self.columns)]} if self.columns else {}),
-            "state": [int(seen.state.size)],
-            **({"pixels": [1 + len(seen.cameras), SIDE, SIDE, 3]} if settings.pixels else {}),
+            "state": [int(observation.state.size)],
+            **({"pixels": [1 + len(observation.cameras), SIDE, SIDE, 3]} if settings.pixels else {}),
         }
         environment = {
             "kind": "env",
@@ -226,7 +226,7 @@ class EnvironmentSource(Source[EnvSource]):
         return {ENVIRONMENT: environment}
 
     def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """Which episodes were chosen."""
+        """Return the numbers of the selected episodes."""
         return {"played": {"name": self.name, "episodes": [row.columns["env_episode"] for row in rows]}}
 
     def targets(self) -> tuple[str, ...]:
@@ -286,15 +286,15 @@ class EnvironmentPlayer(InputsPlayer):
             self._environment.close()
 
     def _see(self, step: Step) -> Observation:
-        seen, most = step.observation, self._played.calls
-        self._keep_pictures([seen.image, *seen.cameras.values()], self._settings.pixels, most)
-        self._keep("state", seen.state, most)
+        observation, most = step.observation, self._played.calls
+        self._keep_pictures([observation.image, *observation.cameras.values()], self._settings.pixels, most)
+        self._keep("state", observation.state, most)
         where = f"{self._settings.name}, step() {self._steps}"
         unknown = self._steps == 0 and not step.facts  # nothing is said of the beginning
         facts = [np.nan] * len(self._facts) if unknown else fact_values(step.facts, self._facts, where)
         if self._facts:
             self._keep("columns", np.array(facts, np.float64), most)
-        return seen
+        return observation
 
     def _end(self, step: Step) -> Ending:
         fact_values(step.facts, self._facts, f"{self._settings.name}, step() {self._steps}")

@@ -77,5 +77,5 @@ def _digest(opened: BinaryIO) -> tuple[str, _Stamp]:
 
 
 def _stamp(opened: BinaryIO) -> _Stamp:
-    found = os.fstat(opened.fileno())
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
+    status = os.fstat(opened.fileno())
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns

@@ -31,13 +31,13 @@ def with_input(clean: Observation, vary: str, donor: Observation) -> Observation
     return _with_pictures(clean, vary, partial(_picture, donor))
 
 
-def same_input(one: Observation, other: Observation, vary: str) -> bool:
+def same_input(first: Observation, second: Observation, vary: str) -> bool:
     """Return whether two observations hold the same of one input."""
     if vary == INSTRUCTION:
-        return one.instruction == other.instruction
+        return first.instruction == second.instruction
     if vary == STATE:
-        return np.array_equal(one.state, other.state)
-    return all(np.array_equal(_picture(one, name), _picture(other, name)) for name in _cameras(one, vary))
+        return np.array_equal(first.state, second.state)
+    return all(np.array_equal(_picture(first, name), _picture(second, name)) for name in _cameras(first, vary))
 
 
 def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating], words: str = "") -> Observation:
@@ -57,17 +57,17 @@ def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating], 
 
 def _with_pictures(clean: Observation, vary: str, picture: Callable[[str], Picture]) -> Observation:
     """The observation with other pictures of the cameras that an input names. picture: by the camera's name."""
-    others = {name: picture(name) for name in _cameras(clean, vary)}
-    image = others.pop(FIRST, clean.image)
-    return replace(clean, image=image, cameras={**clean.cameras, **others})
+    pictures = {name: picture(name) for name in _cameras(clean, vary)}
+    image = pictures.pop(FIRST, clean.image)
+    return replace(clean, image=image, cameras={**clean.cameras, **pictures})
 
 
-def _cameras(seen: Observation, vary: str) -> tuple[str, ...]:
+def _cameras(observation: Observation, vary: str) -> tuple[str, ...]:
     camera = vary.partition(".")[2]
     if not camera:
-        return FIRST, *seen.cameras
-    return (camera,) if camera in seen.cameras else (FIRST,)
+        return FIRST, *observation.cameras
+    return (camera,) if camera in observation.cameras else (FIRST,)
 
 
-def _picture(seen: Observation, camera: str) -> Picture:
-    return seen.cameras[camera] if camera else seen.image
+def _picture(observation: Observation, camera: str) -> Picture:
+    return observation.cameras[camera] if camera else observation.image

@@ -41,18 +41,18 @@ class LeRobotEnvironment:
         self._tasks = self._created()
         self._environment: Any = None
         first = next(iter(self._tasks.values()))
-        self.action_names = tuple(str(place) for place in range(int(first.action_space.shape[-1])))
+        self.action_names = tuple(str(position) for position in range(int(first.action_space.shape[-1])))
         self.revision = f"lerobot {version('lerobot')}, {kind} {self._config.task or ''}".strip() + _simulator(
             kind
         )
 
     def _created(self) -> dict[str, Any]:
-        """By task, its only environment, not vectorised."""
+        """The only environment of every task, not vectorised."""
         with _naming_simulator(self._kind):
-            made = self._config.create_envs(n_envs=1, use_async_envs=False)
+            suites = self._config.create_envs(n_envs=1, use_async_envs=False)
         return {
             f"{suite}-{number}": vector.envs[0]
-            for suite, tasks in made.items()
+            for suite, tasks in suites.items()
             for number, vector in tasks.items()
         }
 
@@ -76,42 +76,46 @@ class LeRobotEnvironment:
         if hasattr(inner, "init_state_id"):
             inner.init_state_id = episode.seed
         with _naming_simulator(self._kind):  # some are imported at the first reset
-            seen, _ = self._environment.reset(seed=episode.seed)
-        return Step(self._observed(seen))
+            observation, _ = self._environment.reset(seed=episode.seed)
+        return Step(self._observed(observation))
 
     def step(self, action: NDArray[np.float32]) -> Step:
         """Execute an action behind lerobot's processor of actions."""
         import torch
 
         passed = self._after({"action": torch.from_numpy(action)[None]})["action"]
-        seen, reward, terminated, truncated, info = self._environment.step(np.asarray(passed[0], np.float32))
+        observation, reward, terminated, truncated, info = self._environment.step(
+            np.asarray(passed[0], np.float32)
+        )
         facts = {"reward": float(reward), SUCCESS: bool(info.get("is_success", False))}
-        return Step(self._observed(seen), bool(terminated or truncated), facts)
+        return Step(self._observed(observation), bool(terminated or truncated), facts)
 
     def close(self) -> None:
         """Close every task."""
         for environment in self._tasks.values():
             environment.close()
 
-    def _observed(self, seen: Mapping[str, Any]) -> Observation:
-        """What lerobot shows its policies: its names, its order of states, its turned pictures."""
+    def _observed(self, observation: Mapping[str, Any]) -> Observation:
+        """An observation as lerobot shows its policies: its names, its order of states, its turned pictures."""
         from lerobot.envs.utils import preprocess_observation
 
-        found = self._before(preprocess_observation(_batched(seen)))
-        pictures = {name: _picture(found[name]) for name in found if name == IMAGE or name.startswith(IMAGES)}
-        if not pictures or STATE not in found:
+        features = self._before(preprocess_observation(_batched(observation)))
+        pictures = {
+            name: _picture(features[name]) for name in features if name == IMAGE or name.startswith(IMAGES)
+        }
+        if not pictures or STATE not in features:
             raise OwnEnvironmentError(
-                f"lerobot:{self._kind} shows {', '.join(sorted(found))}; expected pictures and {STATE}"
+                f"lerobot:{self._kind} shows {', '.join(sorted(features))}; expected pictures and {STATE}"
             )
-        first, *others = pictures
-        further = {name.removeprefix(IMAGES): pictures[name] for name in others}
-        state = np.asarray(found[STATE][0], np.float32)
-        return Observation(pictures[first], state, self._episode.instruction, None, further)
+        first, *other_cameras = pictures
+        cameras = {name.removeprefix(IMAGES): pictures[name] for name in other_cameras}
+        state = np.asarray(features[STATE][0], np.float32)
+        return Observation(pictures[first], state, self._episode.instruction, None, cameras)
 
 
 @contextmanager
 def _naming_simulator(kind: str) -> Iterator[None]:
-    """What lerobot prints goes to stderr. Raises MissingExtraError naming a simulator that is not installed."""
+    """Print to stderr what lerobot prints. Raises MissingExtraError naming a simulator that is not installed."""
     try:
         with redirect_stdout(sys.stderr):
             yield
@@ -126,20 +130,20 @@ def _configuration(kind: str, options: Mapping[str, Any]) -> Any:
     require("lerobot", "lerobot")
     from lerobot.envs.configs import EnvConfig, HubEnvConfig
 
-    known = EnvConfig.get_known_choices()
-    if kind not in known:
+    kinds = EnvConfig.get_known_choices()
+    if kind not in kinds:
         raise UsageError(
-            f"--env lerobot:{kind}: lerobot has no such environment; it has {', '.join(sorted(known))}"
+            f"--env lerobot:{kind}: lerobot has no such environment; it has {', '.join(sorted(kinds))}"
         )
-    chosen = known[kind]
-    if issubclass(chosen, HubEnvConfig):
+    configuration = kinds[kind]
+    if issubclass(configuration, HubEnvConfig):
         raise UsageError(
             f"--env lerobot:{kind} would run code from the hub; write an environment of your own for it"
         )
-    if not hasattr(chosen, "create_envs") or kind == "gym_manipulator":
-        raise UsageError(f"--env lerobot:{kind} is no simulation; choose one of {', '.join(sorted(known))}")
+    if not hasattr(configuration, "create_envs") or kind == "gym_manipulator":
+        raise UsageError(f"--env lerobot:{kind} is no simulation; choose one of {', '.join(sorted(kinds))}")
     try:
-        return chosen(**options)
+        return configuration(**options)
     except (TypeError, ValueError) as error:
         raise UsageError(f"--env lerobot:{kind} cannot be configured so: {error}. Change --env-option") from error
 
@@ -166,15 +170,15 @@ def _simulator(kind: str) -> str:
 
 def _text(environment: Any) -> str | None:
     inner = environment.unwrapped
-    found = getattr(inner, "task_description", None) or getattr(inner, "task", None)
-    return str(found) if found else None
+    task = getattr(inner, "task_description", None) or getattr(inner, "task", None)
+    return str(task) if task else None
 
 
-def _batched(seen: Any) -> Any:
+def _batched(observation: Any) -> Any:
     """The arrays of an observation with a first axis of one, as lerobot's processors expect."""
-    if isinstance(seen, Mapping):
-        return {name: _batched(value) for name, value in seen.items()}
-    return np.asarray(seen)[None]
+    if isinstance(observation, Mapping):
+        return {name: _batched(value) for name, value in observation.items()}
+    return np.asarray(observation)[None]
 
 
 def _picture(floats: Any) -> NDArray[np.uint8]:

@@ -53,8 +53,8 @@ class LeRobotFolder:
         """Features of one number each, without those that lead to other tables."""
         return [
             name
-            for name, own in self.features.items()
-            if own["dtype"] in NUMERIC and tuple(own["shape"]) == (1,) and name not in KEYS
+            for name, feature in self.features.items()
+            if feature["dtype"] in NUMERIC and tuple(feature["shape"]) == (1,) and name not in KEYS
         ]
 
     def width(self, feature: str) -> int | None:
@@ -70,7 +70,7 @@ class LeRobotFolder:
         return int(shape[0])
 
     def names(self, feature: str) -> list[str]:
-        """What the numbers of a feature are called; their positions where the data set names none."""
+        """The names of the numbers of a feature; their positions where the data set names none."""
         return list(self.meta.names(feature) or map(str, range(self.width(feature) or 0)))
 
     def picture_shape(self, feature: str) -> tuple[int, int]:
@@ -81,26 +81,26 @@ class LeRobotFolder:
         return int(shape[0]), int(shape[1])
 
     def encoding(self, feature: str) -> str:
-        """How pictures of a camera are stored: `image`, or the codec of its video."""
-        own = self.features[feature]
-        info = own.get("info") or own.get("video_info") or {}
-        return IMAGE if own["dtype"] == IMAGE else str(info.get("video.codec", "video"))
+        """The storage of a camera's pictures: `image`, or the codec of its video."""
+        entry = self.features[feature]
+        info = entry.get("info") or entry.get("video_info") or {}
+        return IMAGE if entry["dtype"] == IMAGE else str(info.get("video.codec", "video"))
 
     @cached_property
     def lengths(self) -> list[int]:
         """Frames of every episode."""
-        return [one.length for one in self.meta.episodes]
+        return [episode.length for episode in self.meta.episodes]
 
     @cached_property
     def by_file(self) -> Mapping[Path, list[EpisodeMeta]]:
         """The episodes of every data file."""
-        found: dict[Path, list[EpisodeMeta]] = {}
-        for one in self.meta.episodes:
-            found.setdefault(self.path / one.file, []).append(one)
-        return found
+        by_file: dict[Path, list[EpisodeMeta]] = {}
+        for episode in self.meta.episodes:
+            by_file.setdefault(self.path / episode.file, []).append(episode)
+        return by_file
 
     def episode(self, number: int) -> EpisodeMeta:
-        """What meta says of an episode."""
+        """The meta of an episode."""
         return self.meta.episodes[number]
 
     def task(self, number: int) -> str:
@@ -111,25 +111,25 @@ class LeRobotFolder:
 
     @cached_property
     def meta_blake2b(self) -> str:
-        """Of names and bytes of all files in `meta`."""
+        """The hash of names and bytes of all files in `meta`."""
         return self.opened.hash_of(sorted(path for path in (self.path / "meta").rglob("*") if path.is_file()))
 
     def content_blake2b(self, episode: int, cameras: Sequence[str]) -> str:
-        """Of the files that hold the numbers of an episode, and the pictures of some cameras."""
+        """The hash of the files that hold the numbers of an episode, and the pictures of some cameras."""
         return self.opened.hash_of(self.files(episode, cameras))
 
     def files(self, episode: int, cameras: Sequence[str]) -> list[Path]:
         """The files that hold an episode and the videos of some cameras."""
-        own = self.episode(episode)
-        videos = [own.videos[key].file for key in cameras if self.meta.is_video(key)]
-        return [self.path / one for one in (own.file, *videos)]
+        meta = self.episode(episode)
+        videos = [meta.videos[key].file for key in cameras if self.meta.is_video(key)]
+        return [self.path / file for file in (meta.file, *videos)]
 
     # -- checks ----------------------------------------------------------------------------------------
 
     def chosen(self, episodes: Sequence[int] | None) -> list[int]:
         """The episodes that were asked for, all for None. Raises RecordingError for one that is not there."""
         count = len(self.lengths)
-        if outside := [one for one in episodes or () if one >= count]:
+        if outside := [number for number in episodes or () if number >= count]:
             raise RecordingError(
                 f"{self.path.name} has {count} episodes, counted from 0; asked for {outside[0]}. Give episodes "
                 f"within 0:{count}"
@@ -149,10 +149,12 @@ class LeRobotFolder:
 
     def _check_unnamed(self) -> None:
         """Raise RecordingError for a Parquet file of data that no episode is in; hidden files are none."""
-        named = set(self.by_file)
-        folders = {self.path / one.file.parts[0] for one in self.meta.episodes if len(one.file.parts) > 1}
+        listed = set(self.by_file)
+        folders = {
+            self.path / episode.file.parts[0] for episode in self.meta.episodes if len(episode.file.parts) > 1
+        }
         present = {path for folder in folders for path in folder.rglob("*.parquet") if path.name[0] != "."}
-        if unnamed := sorted(present - named - set((self.path / "meta").rglob("*.parquet"))):
+        if unnamed := sorted(present - listed - set((self.path / "meta").rglob("*.parquet"))):
             raise RecordingError(
                 f"{self.path.name} holds {unnamed[0].relative_to(self.path)}, in which meta/episodes names no "
                 "episode; expected no other files of data. Move it out of the data set, or copy the data set again"
@@ -190,23 +192,25 @@ def resolved_commit(repo: str, revision: str) -> str:
     from huggingface_hub.errors import HfHubHTTPError
 
     try:
-        found = HfApi().dataset_info(repo, revision=revision or None).sha
+        commit = HfApi().dataset_info(repo, revision=revision or None).sha
     except HfHubHTTPError as error:
         raise UsageError(
             f"the hub gives no data set {repo} at {revision or 'main'} ({hub_reason(error)}). {way_out(error)}"
         ) from error
-    if found is None:
+    if commit is None:
         raise UsageError(f"the hub names no commit of {repo}; give {repo}@COMMIT with 40 digits")
-    return str(found)
+    return str(commit)
 
 
 def fetched(folder: LeRobotFolder, episodes: Sequence[int], cameras: Sequence[str]) -> None:
     """Download the files of some episodes, if the data set is one of the hub."""
     if folder.repo is not None and folder.revision is not None:
-        wanted = {
-            file.relative_to(folder.path).as_posix() for one in episodes for file in folder.files(one, cameras)
+        names = {
+            file.relative_to(folder.path).as_posix()
+            for episode in episodes
+            for file in folder.files(episode, cameras)
         }
-        _download(folder.repo, folder.revision, sorted(map(glob.escape, wanted)))
+        _download(folder.repo, folder.revision, sorted(map(glob.escape, names)))
 
 
 def _download(repo: str, commit: str, patterns: list[str]) -> Path:

@@ -61,11 +61,11 @@ class LeRobotFrames:
 
         Raises RecordingError if the frames are not a grid, or a feature has other numbers than meta says.
         """
-        wanted = list(dict.fromkeys((*features, "frame_index", "timestamp")))
-        table = self._rows(episode, wanted)
-        found = {name: self._values(episode, name, table.column(name)) for name in wanted}
-        self._check_grid(episode, found["frame_index"][:, 0], found["timestamp"][:, 0])
-        return found
+        columns = list(dict.fromkeys((*features, "frame_index", "timestamp")))
+        table = self._rows(episode, columns)
+        values = {name: self._values(episode, name, table.column(name)) for name in columns}
+        self._check_grid(episode, values["frame_index"][:, 0], values["timestamp"][:, 0])
+        return values
 
     def check(self, episodes: Sequence[int], cameras: Sequence[str]) -> None:
         """Raise RecordingError for what the numbers or the files of these episodes cannot be shown for.
@@ -84,13 +84,13 @@ class LeRobotFrames:
 
     def _rows(self, episode: int, columns: Sequence[str]) -> Any:
         """The table (T rows) of an episode. Row groups are kept until another one is read with these columns."""
-        own, key = self.folder.episode(episode), tuple(columns)
-        data = self._data_file(self.folder.path / own.file)
+        meta, key = self.folder.episode(episode), tuple(columns)
+        data = self._data_file(self.folder.path / meta.file)
         first = data.first[episode]
         latest, begin = data.latest.get(key, (None, 0))
-        if latest is None or not begin <= first <= first + own.length <= begin + latest.num_rows:
-            latest, begin = data.latest[key] = self._read(data.path, key, first, first + own.length)
-        return latest.slice(first - begin, own.length)
+        if latest is None or not begin <= first <= first + meta.length <= begin + latest.num_rows:
+            latest, begin = data.latest[key] = self._read(data.path, key, first, first + meta.length)
+        return latest.slice(first - begin, meta.length)
 
     def _read(self, path: Path, columns: Sequence[str], first: int, end: int) -> tuple[Any, int]:
         """Row groups that hold rows `first` to `end`, or all where they are small, and the first row of them."""
@@ -117,27 +117,27 @@ class LeRobotFrames:
                 )
             table = read_parquet(parquet, [_EPISODE, _INDEX])
         episodes, indices = (np.asarray(table.column(name).to_pylist(), np.float64) for name in (_EPISODE, _INDEX))
-        named = {one.number: one for one in self.folder.by_file[path]}
+        expected = {episode.number: episode for episode in self.folder.by_file[path]}
         begins = dict(zip(*(part.tolist() for part in np.unique(episodes, return_index=True)), strict=True))
         counts = dict(zip(*(part.tolist() for part in np.unique(episodes, return_counts=True)), strict=True))
-        if strange := [number for number in begins if number not in named]:
+        if strange := [number for number in begins if number not in expected]:
             raise RecordingError(
                 f"{self._where(path)} holds frames of episode {strange[0]:g}, which meta/episodes does not name "
-                f"in this file; expected {_listed(sorted(named))}. Copy the data set again, or repair its meta"
+                f"in this file; expected {_listed(sorted(expected))}. Copy the data set again, or repair its meta"
             )
         first = {}
-        for number, one in named.items():
-            if (count := counts.get(number, 0)) != one.length:
+        for number, episode in expected.items():
+            if (count := counts.get(number, 0)) != episode.length:
                 raise RecordingError(
                     f"{self._where(path)} holds {count} frames of episode {number}; meta/episodes says "
-                    f"{one.length}. Copy the data set again, or repair its meta"
+                    f"{episode.length}. Copy the data set again, or repair its meta"
                 )
             begin = begins[number]
-            own, due = slice(begin, begin + one.length), one.start + np.arange(one.length)
-            if off := np.flatnonzero((episodes[own] != number) | (indices[own] != due)).tolist():
+            rows, due = slice(begin, begin + episode.length), episode.start + np.arange(episode.length)
+            if off := np.flatnonzero((episodes[rows] != number) | (indices[rows] != due)).tolist():
                 raise RecordingError(
-                    f"{self._where(path)}: row {begin + off[0]} has the index {indices[own][off[0]]:g} and is of "
-                    f"episode {episodes[own][off[0]]:g}; expected the index {due[off[0]]} of episode {number}. "
+                    f"{self._where(path)}: row {begin + off[0]} has the index {indices[rows][off[0]]:g} and is of "
+                    f"episode {episodes[rows][off[0]]:g}; expected the index {due[off[0]]} of episode {number}. "
                     "Copy the data set again, or repair its indices"
                 )
             first[number] = begin
@@ -145,8 +145,8 @@ class LeRobotFrames:
 
     def _values(self, episode: int, name: str, column: Any) -> NDArray[np.float64]:
         """(T, D) of one column, in the type that meta says."""
-        own, length = self.folder.features.get(name), self.folder.lengths[episode]
-        width = 1 if own is None else int(np.prod(own["shape"]))
+        feature, length = self.folder.features.get(name), self.folder.lengths[episode]
+        width = 1 if feature is None else int(np.prod(feature["shape"]))
         where = f"{self.folder.path.name}, episode {episode}: {name}"
         cells = column.to_pylist()
         if sizes := {len(cell) for cell in cells if isinstance(cell, list)} - {width}:
@@ -155,13 +155,15 @@ class LeRobotFrames:
                 "same. Copy the data set again, or repair its meta"
             )
         try:
-            found = np.asarray(cells, np.float64).reshape(length, width)
+            values = np.asarray(cells, np.float64).reshape(length, width)
         except (TypeError, ValueError) as error:
             raise RecordingError(
-                f"{where} holds no numbers ({str(error)[:200]}); meta/info.json says {own and own['dtype']}. "
-                "Copy the data set again, or repair its meta"
+                f"{where} holds no numbers ({str(error)[:200]}); meta/info.json says "
+                f"{feature and feature['dtype']}. Copy the data set again, or repair its meta"
             ) from error
-        return found.astype(np.float32).astype(np.float64) if own and own["dtype"] == "float32" else found
+        return (
+            values.astype(np.float32).astype(np.float64) if feature and feature["dtype"] == "float32" else values
+        )
 
     def _check_grid(self, episode: int, frames: NDArray[np.float64], timestamps: NDArray[np.float64]) -> None:
         due = np.arange(len(frames))
@@ -169,10 +171,10 @@ class LeRobotFrames:
             ~((frames == due) & (np.abs(timestamps - due / self.folder.fps) <= OFF_GRID_S * (1 + due / 1e4)))
         )
         if off.size:
-            place = int(off[0])
+            line = int(off[0])
             raise RecordingError(
-                f"{self.folder.path.name}, episode {episode}: line {place} is frame {frames[place]:g} at "
-                f"{timestamps[place]:.4f} s; expected frame {place} at {place / self.folder.fps:.4f} s "
+                f"{self.folder.path.name}, episode {episode}: line {line} is frame {frames[line]:g} at "
+                f"{timestamps[line]:.4f} s; expected frame {line} at {line / self.folder.fps:.4f} s "
                 f"({self.folder.fps:g} frames per second). Repair the timestamps, or leave the episode out"
             )
 
@@ -193,8 +195,8 @@ class LeRobotFrames:
         return np.asarray(decode_bytes(content, f"{where}:", RecordingError, "Copy the data set again.")).copy()
 
     def _of_video(self, episode: int, frame: int, camera: str) -> NDArray[np.uint8]:
-        own = self.folder.episode(episode)
-        part = own.videos[camera]
+        meta = self.folder.episode(episode)
+        part = meta.videos[camera]
         path = self.folder.path / part.file
         self.folder.opened.check(path)
         moment = part.begin + float(self.numbers(episode, ())["timestamp"][frame, 0])

@@ -55,7 +55,7 @@ class EpisodeMeta:
 
 @dataclass(frozen=True)
 class LeRobotMeta:
-    """What `meta` says. name: of the data set, for errors. tasks: (number, text) of every line of the table."""
+    """The content of `meta`. name: of the data set, for errors. tasks: (number, text) of each line."""
 
     name: str
     info: Mapping[str, Any]
@@ -75,11 +75,11 @@ class LeRobotMeta:
         _check_info(root, info)
         tasks = _read_tasks(root, files)
         episodes = tuple(_read_episodes(root, files, info))
-        found = cls(root.name, info, tasks, episodes)
-        found._check_totals()
-        found._check_names()
-        found._check_videos()
-        return found
+        meta = cls(root.name, info, tasks, episodes)
+        meta._check_totals()
+        meta._check_names()
+        meta._check_videos()
+        return meta
 
     @cached_property
     def fps(self) -> float:
@@ -95,7 +95,11 @@ class LeRobotMeta:
     @property
     def cameras(self) -> list[str]:
         """Features that are colour pictures."""
-        return [name for name, own in self.features.items() if own["dtype"] in (IMAGE, VIDEO) and not _depth(own)]
+        return [
+            name
+            for name, feature in self.features.items()
+            if feature["dtype"] in (IMAGE, VIDEO) and not _depth(feature)
+        ]
 
     def is_video(self, feature: str) -> bool:
         """Whether the pictures of a camera lie in video files."""
@@ -103,8 +107,8 @@ class LeRobotMeta:
 
     def names(self, feature: str) -> tuple[str, ...] | None:
         """The names of the numbers of a feature; None where the data set names none, or not all."""
-        named = _flat_names(self.features[feature].get("names"))
-        return named if named is not None and (len(named),) == tuple(self.features[feature]["shape"]) else None
+        names = _flat_names(self.features[feature].get("names"))
+        return names if names is not None and (len(names),) == tuple(self.features[feature]["shape"]) else None
 
     def task(self, number: int) -> str:
         """The text of a task. Raises RecordingError for a number that is not named once, or that has no text."""
@@ -123,16 +127,16 @@ class LeRobotMeta:
 
     @cached_property
     def _texts(self) -> dict[Any, list[Any]]:
-        found: dict[Any, list[Any]] = {}
+        texts: dict[Any, list[Any]] = {}
         for number, text in self.tasks:
-            found.setdefault(number, []).append(text)
-        return found
+            texts.setdefault(number, []).append(text)
+        return texts
 
     # -- contradictions --------------------------------------------------------------------------------
 
     def _check_totals(self) -> None:
         """Raise RecordingError unless numbers, ranges and totals of the episodes fit each other."""
-        numbers = [one.number for one in self.episodes]
+        numbers = [episode.number for episode in self.episodes]
         if twice := [number for number, count in Counter(numbers).items() if count > 1]:
             raise RecordingError(
                 f"{self.name}: {EPISODES} has {numbers.count(twice[0])} lines of episode {twice[0]}; expected "
@@ -146,13 +150,13 @@ class LeRobotMeta:
                 "the data set as it was before an episode was removed"
             )
         expected = 0
-        for one in self.episodes:
-            if one.start != expected:
+        for episode in self.episodes:
+            if episode.start != expected:
                 raise RecordingError(
-                    f"{self.name}: {EPISODES} says that episode {one.number} begins at index {one.start}; "
+                    f"{self.name}: {EPISODES} says that episode {episode.number} begins at index {episode.start}; "
                     f"expected {expected}, where the one before it ends. {_AGAIN}"
                 )
-            expected += one.length
+            expected += episode.length
         for total_name, count in (
             ("total_episodes", len(numbers)),
             ("total_frames", expected),
@@ -185,15 +189,15 @@ class LeRobotMeta:
                 )
             slack = HALF / self.fps
             by_file: dict[Path, list[tuple[VideoRange, int]]] = {}
-            for one in self.episodes:
-                part = one.videos[camera]
-                if not abs(part.end - part.begin - one.length / self.fps) <= slack or part.begin < -slack:
+            for episode in self.episodes:
+                part = episode.videos[camera]
+                if not abs(part.end - part.begin - episode.length / self.fps) <= slack or part.begin < -slack:
                     raise RecordingError(
                         f"{self.name}: {EPISODES} says that {part.begin:.4f} to {part.end:.4f} s of {part.file} "
-                        f"show episode {one.number}, of {one.length} frames; expected "
-                        f"{one.length / self.fps:.4f} s at {self.fps:g} frames per second. {_AGAIN}"
+                        f"show episode {episode.number}, of {episode.length} frames; expected "
+                        f"{episode.length / self.fps:.4f} s at {self.fps:g} frames per second. {_AGAIN}"
                     )
-                by_file.setdefault(part.file, []).append((part, one.number))
+                by_file.setdefault(part.file, []).append((part, episode.number))
             for file, parts in by_file.items():
                 parts.sort(key=lambda pair: pair[0].begin)
                 for (before, first), (after, second) in pairwise(parts):
@@ -205,29 +209,29 @@ class LeRobotMeta:
                         )
 
 
-def _equal_rates(one: Any, other: float) -> bool:
+def _equal_rates(rate: Any, other: float) -> bool:
     """Whether two rates are equal but for the rounding of one such as 30000 / 1001."""
-    return isinstance(one, int | float) and abs(one - other) <= RATE_ROUNDING * other
+    return isinstance(rate, int | float) and abs(rate - other) <= RATE_ROUNDING * other
 
 
 def _depth(feature: Mapping[str, Any]) -> bool:
     info, video = feature.get("info") or {}, feature.get("video_info") or {}
-    told = info.get("is_depth_map"), info.get("video.is_depth_map"), video.get("video.is_depth_map")
-    return any(told)
+    flags = info.get("is_depth_map"), info.get("video.is_depth_map"), video.get("video.is_depth_map")
+    return any(flags)
 
 
-def _flat_names(named: Any) -> tuple[str, ...] | None:
+def _flat_names(names: Any) -> tuple[str, ...] | None:
     """Names as a list: of {"motors": […]}, of groups of names, or of places by name."""
-    if isinstance(named, Mapping):
-        places = list(named.values())
+    if isinstance(names, Mapping):
+        places = list(names.values())
         if sorted(map(repr, places)) == sorted(map(repr, range(len(places)))):
-            return tuple(sorted(named, key=lambda name: named[name]))
+            return tuple(sorted(names, key=lambda name: names[name]))
         if any(isinstance(part, str) or not isinstance(part, Sequence) for part in places):
             return None
-        named = [name for part in places for name in part]
-    if isinstance(named, str) or not isinstance(named, Sequence):
+        names = [name for part in places for name in part]
+    if isinstance(names, str) or not isinstance(names, Sequence):
         return None
-    return tuple(map(str, named))
+    return tuple(map(str, names))
 
 
 def _read_info(root: Path, files: HashedFiles) -> Mapping[str, Any]:
@@ -263,12 +267,12 @@ def _check_info(root: Path, info: Mapping[str, Any]) -> None:
         raise RecordingError(f"{root.name}: {INFO} has no features with dtype and shape each. {_AGAIN}")
 
 
-def _is_feature(own: Any) -> bool:
+def _is_feature(feature: Any) -> bool:
     return (
-        isinstance(own, Mapping)
-        and isinstance(own.get("dtype"), str)
-        and isinstance(own.get("shape"), Sequence)
-        and all(type(size) is int for size in own["shape"])
+        isinstance(feature, Mapping)
+        and isinstance(feature.get("dtype"), str)
+        and isinstance(feature.get("shape"), Sequence)
+        and all(type(size) is int for size in feature["shape"])
     )
 
 
@@ -302,7 +306,7 @@ def _read_tasks(root: Path, files: HashedFiles) -> tuple[tuple[Any, Any], ...]:
 
 def _read_episodes(root: Path, files: HashedFiles, info: Mapping[str, Any]) -> Iterator[EpisodeMeta]:
     """Every line of `meta/episodes`, by number."""
-    cameras = [name for name, own in info["features"].items() if own["dtype"] == VIDEO]
+    cameras = [name for name, feature in info["features"].items() if feature["dtype"] == VIDEO]
     parts = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
     columns = [_NUMBER, _LENGTH, _FROM, _TO, _CHUNK, _FILE]
     columns += [f"videos/{camera}/{part}" for camera in cameras for part in parts]

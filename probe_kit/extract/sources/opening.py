@@ -33,8 +33,8 @@ def naming_environment(name: str, doing: str) -> Iterator[None]:
     except ProbeKitError:
         raise
     except (Exception, SystemExit) as error:
-        said = f"{type(error).__name__}: {str(error)[:500]}"
-        raise OwnEnvironmentError(f"{name} failed in {doing}: {said}. Correct the environment") from error
+        reason = f"{type(error).__name__}: {str(error)[:500]}"
+        raise OwnEnvironmentError(f"{name} failed in {doing}: {reason}. Correct the environment") from error
 
 
 def factory_of(name: str) -> Callable[..., Any]:
@@ -50,17 +50,17 @@ def factory_of(name: str) -> Callable[..., Any]:
 
         return partial(LeRobotEnvironment, attribute)
     if not colon:
-        found = {one.name: one for one in entry_points(group=ENTRY_POINTS)}
-        if name not in found:
+        installed = {entry_point.name: entry_point for entry_point in entry_points(group=ENTRY_POINTS)}
+        if name not in installed:
             raise UsageError(
                 f"--env {name!r}: expected MODULE:CLASS such as kitchen:Kitchen, lerobot:TYPE, or an installed "
-                f"entry point ({', '.join(sorted(found)) or 'there is none'})"
+                f"entry point ({', '.join(sorted(installed)) or 'there is none'})"
             )
         with naming_environment(name, "its import"):
-            loaded: Callable[..., Any] = found[name].load()
+            loaded: Callable[..., Any] = installed[name].load()
         return loaded
-    if (here := str(Path.cwd())) not in sys.path:
-        sys.path.append(here)  # a command does not have it; behind all others, so that it hides nothing
+    if (folder := str(Path.cwd())) not in sys.path:
+        sys.path.append(folder)  # a command does not have it; behind all others, so that it hides nothing
     try:
         with naming_environment(name, "its import"):
             opened = import_module(module)
@@ -74,8 +74,8 @@ def factory_of(name: str) -> Callable[..., Any]:
     factory = getattr(opened, attribute, None)
     if not callable(factory):
         raise UsageError(f"--env {name}: {module} has no class {attribute!r}")
-    made: Callable[..., Any] = factory
-    return made
+    typed_factory: Callable[..., Any] = factory
+    return typed_factory
 
 
 def open_environment(source: EnvSource) -> OwnEnvironment:
@@ -107,28 +107,28 @@ def check_members(environment: object, name: str) -> None:
 
 def listed_episodes(environment: OwnEnvironment, source: EnvSource) -> list[tuple[int, EnvEpisode]]:
     """The chosen episodes with their indices. Raises OwnEnvironmentError for equal ids."""
-    chosen = source.episodes
-    most = MOST_EPISODES if chosen is None else chosen[-1] + 1
+    indices = source.episodes
+    most = MOST_EPISODES if indices is None else indices[-1] + 1
     with naming_environment(source.name, "episodes()"):
-        found = list(islice(environment.episodes(), most + (chosen is None)))
-    if len(found) > MOST_EPISODES:
+        episodes = list(islice(environment.episodes(), most + (indices is None)))
+    if len(episodes) > MOST_EPISODES:
         raise OwnEnvironmentError(
             f"{source.name} has more than {MOST_EPISODES:,} episodes; choose with --episodes"
         )
-    for number, episode in enumerate(found):
+    for number, episode in enumerate(episodes):
         _check_episode(episode, f"{source.name}, episode {number}")
-    ids = [episode.id for episode in found]
+    ids = [episode.id for episode in episodes]
     if len(set(ids)) < len(ids):
-        twice = next(one for one in ids if ids.count(one) > 1)
+        twice = next(episode_id for episode_id in ids if ids.count(episode_id) > 1)
         raise OwnEnvironmentError(f"{source.name} has two episodes of the id {twice!r}; expected each once")
-    if chosen is not None and chosen[-1] >= len(found):
+    if indices is not None and indices[-1] >= len(episodes):
         raise UsageError(
-            f"{source.name} has {len(found)} episodes, counted from 0; asked for {chosen[-1]}. Give episodes "
-            f"within 0:{len(found)}"
+            f"{source.name} has {len(episodes)} episodes, counted from 0; asked for {indices[-1]}. Give episodes "
+            f"within 0:{len(episodes)}"
         )
-    if not found:
+    if not episodes:
         raise OwnEnvironmentError(f"{source.name} has no episode; expected at least one")
-    return [(number, found[number]) for number in (range(len(found)) if chosen is None else chosen)]
+    return [(number, episodes[number]) for number in (range(len(episodes)) if indices is None else indices)]
 
 
 def _check_episode(episode: object, where: str) -> None:
@@ -160,8 +160,8 @@ def checked_step(answer: object, episode: EnvEpisode, where: str) -> Step:
     An environment may write into its arrays afterwards. Raises OwnEnvironmentError.
     """
     if not isinstance(answer, Step) or not isinstance(answer.observation, Observation):
-        seen = type(answer.observation if isinstance(answer, Step) else answer).__name__
-        raise OwnEnvironmentError(f"{where} gave a {seen}; expected a Step with an Observation")
+        kind = type(answer.observation if isinstance(answer, Step) else answer).__name__
+        raise OwnEnvironmentError(f"{where} gave a {kind}; expected a Step with an Observation")
     seen_now = answer.observation
     try:
         for picture in (seen_now.image, *seen_now.cameras.values()):
@@ -171,8 +171,8 @@ def checked_step(answer: object, episode: EnvEpisode, where: str) -> Step:
     state = seen_now.state
     if not isinstance(state, np.ndarray) or state.dtype != np.float32 or state.ndim != 1:
         is_array = isinstance(state, np.ndarray)
-        shown = f"{state.dtype} {state.shape}" if is_array else type(state).__name__
-        raise OwnEnvironmentError(f"{where}: the state is {shown}; expected float32 (D,)")
+        described = f"{state.dtype} {state.shape}" if is_array else type(state).__name__
+        raise OwnEnvironmentError(f"{where}: the state is {described}; expected float32 (D,)")
     if not np.isfinite(state).all():
         raise OwnEnvironmentError(f"{where}: the state holds NaN or infinity; expected finite numbers")
     if seen_now.instruction != episode.instruction:
@@ -197,10 +197,16 @@ def checked_step(answer: object, episode: EnvEpisode, where: str) -> Step:
 
 
 def _copied(step: Step) -> Step:
-    seen = step.observation
-    cameras = {name: np.array(picture) for name, picture in seen.cameras.items()}
-    lens = None if seen.intrinsics is None else np.array(seen.intrinsics)
-    copy = replace(seen, image=np.array(seen.image), state=np.array(seen.state), intrinsics=lens, cameras=cameras)
+    observation = step.observation
+    cameras = {name: np.array(picture) for name, picture in observation.cameras.items()}
+    lens = None if observation.intrinsics is None else np.array(observation.intrinsics)
+    copy = replace(
+        observation,
+        image=np.array(observation.image),
+        state=np.array(observation.state),
+        intrinsics=lens,
+        cameras=cameras,
+    )
     return Step(copy, bool(step.done), dict(step.facts))
 
 

@@ -28,7 +28,7 @@ class Frame:
     """The first observation of a row."""
 
     row: Row
-    seen: Observation
+    observation: Observation
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,12 @@ def frames_of(opens: Opens, rows: Sequence[Row]) -> list[Frame]:
     frames = []
     try:
         for row in rows:
-            seen = player.answer("begin", (row, False))
-            assert isinstance(seen, Observation)
-            pictures = {name: np.array(picture) for name, picture in seen.cameras.items()}
-            copied = replace(seen, image=np.array(seen.image), state=np.array(seen.state), cameras=pictures)
+            observation = player.answer("begin", (row, False))
+            assert isinstance(observation, Observation)
+            pictures = {name: np.array(picture) for name, picture in observation.cameras.items()}
+            copied = replace(
+                observation, image=np.array(observation.image), state=np.array(observation.state), cameras=pictures
+            )
             frames.append(Frame(row, copied))
     finally:
         player.close()
@@ -74,21 +76,21 @@ def pairs_of(frames: Sequence[Frame], vary: str, rng: np.random.Generator) -> It
         raise UsageError(
             f"vary is {vary!r}; expected one of {', '.join(inputs_of(frames)) or 'nothing: no frames'}"
         )
-    spread = np.ptp([frame.seen.state for frame in frames], axis=0)
+    spread = np.ptp([frame.observation.state for frame in frames], axis=0)
     count = 0
     for frame in frames:
-        others = [other for other in frames if other.row.columns["group_id"] != frame.row.columns["group_id"]]
-        others = [other for other in others if not same_input(frame.seen, other.seen, vary)]
-        if not others:
+        candidates = [other for other in frames if other.row.columns["group_id"] != frame.row.columns["group_id"]]
+        candidates = [other for other in candidates if not same_input(frame.observation, other.observation, vary)]
+        if not candidates:
             continue
         count += 1
         if vary.startswith(PICTURE):
-            donor = min(others, key=lambda other: _distance(frame.seen.state, other.seen.state))
+            donor = min(candidates, key=lambda other: _distance(frame.observation.state, other.observation.state))
         else:
-            donor = others[int(rng.integers(len(others)))]
+            donor = candidates[int(rng.integers(len(candidates)))]
         yield Pair(
-            vary, frame.row, donor.row, frame.seen, with_input(frame.seen, vary, donor.seen),
-            hardly_changed(frame.seen, vary, spread), frame.row.policy_seed,
+            vary, frame.row, donor.row, frame.observation, with_input(frame.observation, vary, donor.observation),
+            hardly_changed(frame.observation, vary, spread), frame.row.policy_seed,
         )  # fmt: skip
     if not count:
         raise UsageError(f"{vary} is the same in all {len(frames)} frames of different groups; choose more rows")
@@ -98,8 +100,8 @@ def inputs_of(frames: Sequence[Frame]) -> tuple[str, ...]:
     """The inputs that the frames have: the instruction, a picture per camera, the state."""
     if not frames:
         return ()
-    return (INSTRUCTION, *(f"{PICTURE}.{name}" for name in (MAIN, *frames[0].seen.cameras)), STATE)
+    return (INSTRUCTION, *(f"{PICTURE}.{name}" for name in (MAIN, *frames[0].observation.cameras)), STATE)
 
 
-def _distance(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
-    return float(np.linalg.norm(one.astype(np.float64) - other.astype(np.float64)))
+def _distance(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
+    return float(np.linalg.norm(first.astype(np.float64) - second.astype(np.float64)))

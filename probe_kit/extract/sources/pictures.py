@@ -226,8 +226,8 @@ class PictureSource(Source[PictureFolder]):
 
     def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
         """All lines of the table."""
-        chosen = {"name": self.name, "episodes": list(range(len(rows))), RECORDED_EPISODES: len(rows)}
-        return {"recording": {**chosen, OTHER_ACTIONS: "pictures have no actions"}}
+        selected = {"name": self.name, "episodes": list(range(len(rows))), RECORDED_EPISODES: len(rows)}
+        return {"recording": {**selected, OTHER_ACTIONS: "pictures have no actions"}}
 
     def targets(self) -> tuple[str, ...]:
         """The numbers of the table."""

@@ -89,9 +89,9 @@ class InputsPlayer(Player):
 
     def _keep(self, name: str, values: Any, most: int | None = None) -> None:
         """Keep the values of one inference, unless `most` were kept already."""
-        kept = self._inputs.setdefault(name, [])
-        if most is None or len(kept) < most:
-            kept.append(np.array(values))
+        stored = self._inputs.setdefault(name, [])
+        if most is None or len(stored) < most:
+            stored.append(np.array(values))
 
     def _keep_pictures(self, pictures: list[NDArray[np.uint8]], stored: bool, most: int | None = None) -> None:
         """Hash the pictures of one inference, and keep them in small if they are stored."""

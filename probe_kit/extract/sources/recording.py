@@ -88,10 +88,10 @@ def _pairs(option: str, example: str, value: Any) -> Any:
         return tuple(value.items())
     pairs = []
     for text in value or ():
-        name, equals, chosen = text.partition("=") if isinstance(text, str) else (text[0], "=", text[1])
-        if not (name and equals and chosen):
+        name, equals, setting = text.partition("=") if isinstance(text, str) else (text[0], "=", text[1])
+        if not (name and equals and setting):
             raise UsageError(f"{option} {text!r}; expected CAMERA=VALUE, such as {option} {example}")
-        pairs.append((name, chosen))
+        pairs.append((name, setting))
     return tuple(pairs)
 
 

@@ -121,8 +121,8 @@ class RecordingSource(Source[LeRobotSource]):
         for episode in self.episodes:
             texts, content = self._texts(episode), self.folder.content_blake2b(episode, self.features)
             item, part = f"episode-{episode:06d}", 0
-            chosen = range(0, len(texts), every)
-            for text, group in groupby(chosen, key=lambda frame, texts=texts: texts[frame]):  # type: ignore[misc]
+            shown_frames = range(0, len(texts), every)
+            for text, group in groupby(shown_frames, key=lambda frame, texts=texts: texts[frame]):  # type: ignore[misc]
                 frames = list(group)
                 for start in range(0, len(frames), MOST_FRAMES):
                     stretch = frames[start : start + MOST_FRAMES]
@@ -173,9 +173,9 @@ class RecordingSource(Source[LeRobotSource]):
         width = self.folder.width(STATE)
         if expected is None or width == expected:
             return
-        seen = "no " + STATE if width is None else f"{width} numbers as {STATE}"
+        described = "no " + STATE if width is None else f"{width} numbers as {STATE}"
         raise RecordingError(
-            f"{self.folder.path.name} has {seen}; {checkpoint} reads {expected}. Take the data set's own "
+            f"{self.folder.path.name} has {described}; {checkpoint} reads {expected}. Take the data set's own "
             "checkpoint, or a data set of this robot"
         )
 
@@ -205,7 +205,7 @@ class RecordingSource(Source[LeRobotSource]):
         return fitted, policy
 
     def fitted(self, policy: "Policy") -> "tuple[Self, Policy]":
-        """As `check`, whatever the units."""
+        """Fit the source to a policy as `check` does, whatever the units."""
         card = policy.card
         raise_together(self.early_checks(card.cameras, policy.state_numbers, card.checkpoint))
         fitted = self.mapped(card.cameras)
@@ -260,7 +260,9 @@ class RecordingSource(Source[LeRobotSource]):
         if not (shares > MOST_UNUSUAL).any():
             return None
         names = self.folder.names(ACTION)
-        far = ", ".join(f"{names[place]} {shares[place]:.0%}" for place in np.flatnonzero(shares > MOST_UNUSUAL))
+        far = ", ".join(
+            f"{names[number]} {shares[number]:.0%}" for number in np.flatnonzero(shares > MOST_UNUSUAL)
+        )
         return f"recorded actions lie outside the statistics of the checkpoint ({far}), so the units differ"
 
     def example(self, instruction: str) -> Observation:
@@ -314,9 +316,9 @@ class RecordingSource(Source[LeRobotSource]):
         return {DATASET: data_set}
 
     def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """Which episodes were chosen, and whether their actions are those that the policy predicts."""
-        chosen = sorted({row.columns["source_episode"] for row in rows})
-        recording = {"name": self.name, "episodes": chosen, RECORDED_EPISODES: len(self.folder.lengths)}
+        """Return the selected episodes, and why their actions are not compared with predicted ones."""
+        episodes = sorted({row.columns["source_episode"] for row in rows})
+        recording = {"name": self.name, "episodes": episodes, RECORDED_EPISODES: len(self.folder.lengths)}
         return {"recording": {**recording, OTHER_ACTIONS: self.other_actions}}
 
     @property
@@ -344,14 +346,14 @@ class RecordingSource(Source[LeRobotSource]):
             for camera, feature in settings.cameras
         ]
         where = self.name if folder.repo is None else f"{folder.repo}@{folder.revision}"
-        shown, episodes = (
+        frames, episodes = (
             sum(row.columns["frames"] for row in rows),
             {row.columns["source_episode"] for row in rows},
         )
         return {
             "data set": f"{terminal_safe(where)}, {folder.fps:g} frames per second",
             "cameras": terminal_safe("; ".join(cameras)) or "mapped when the model is loaded",
-            "frames": f"{shown} of {len(episodes)} episodes (every:{settings.every}), in {len(rows)} rows",
+            "frames": f"{frames} of {len(episodes)} episodes (every:{settings.every}), in {len(rows)} rows",
         }
 
     def facts(self) -> dict[str, str]:
@@ -373,14 +375,14 @@ class RecordingSource(Source[LeRobotSource]):
         }
 
     def facts_of(self, policy: "Policy") -> dict[str, str]:
-        """How a policy that fits is shown the data set, in words."""
-        shown = dict(self.settings.cameras)
-        masked = [camera for camera in policy.card.cameras if camera not in shown]
+        """Describe how a policy that fits is shown the data set."""
+        mapped = dict(self.settings.cameras)
+        masked = [camera for camera in policy.card.cameras if camera not in mapped]
         chunk, width = self.prediction
         recorded = self.folder.width(ACTION)
         return {
             "model": f"{policy.card.family}  weights {policy.card.weights_sha256[:12]}",
-            "shown": "; ".join(f"{camera} from {feature}" for camera, feature in shown.items())
+            "shown": "; ".join(f"{camera} from {feature}" for camera, feature in mapped.items())
             + (f"; without a picture: {', '.join(masked)}" if masked else ""),
             "predicts": f"{chunk} actions of {width} numbers; the data set has {recorded or 'no actions'}"
             + (f" of {recorded} numbers" if recorded and recorded != width else ""),
@@ -394,7 +396,7 @@ class RecordingSource(Source[LeRobotSource]):
         if not self.unusual.size:
             return "not compared: this model normalises no state"
         names = self.folder.names(STATE)
-        shares = [f"{names[place]} {share:.0%}" for place, share in enumerate(self.unusual) if share >= NAMED]
+        shares = [f"{names[number]} {share:.0%}" for number, share in enumerate(self.unusual) if share >= NAMED]
         return "outside the checkpoint's statistics: " + (
             ", ".join(shares[:_LONGEST]) or "less than 1 % of each number"
         )
@@ -488,22 +490,22 @@ def raise_together(checks: Iterable[Callable[[], object]]) -> None:
         raise RecordingError(f"{len(errors)} things about the recordings do not fit the model:\n{listed}")
 
 
-def mapped_cameras(chosen: Pairs, model: Sequence[str], recorded: Sequence[str]) -> Pairs:
+def mapped_cameras(typed: Pairs, model: Sequence[str], recorded: Sequence[str]) -> Pairs:
     """Camera of the model and feature of the data set, in the model's order.
 
-    chosen: as the user mapped them; empty for equal names, or the only one of either. Raises RecordingError.
+    typed: as the user mapped them; empty for equal names, or the only one of either. Raises RecordingError.
     """
     both = f"the model has {', '.join(model) or 'none'}; the data set has {', '.join(recorded) or 'none'}"
     how = (
         f"Map them, such as --camera {model[0] if model else 'base'}={recorded[0] if recorded else IMAGES + 'top'}"
     )
-    for camera, feature in chosen:
+    for camera, feature in typed:
         if camera not in model:
             raise RecordingError(f"--camera {camera}=…: the model has no such camera ({both}). {how}")
         if feature not in recorded:
             raise RecordingError(f"--camera {camera}={feature}: the data set has no such picture ({both}). {how}")
-    pairs = dict(chosen)
-    if not chosen:
+    pairs = dict(typed)
+    if not typed:
         names = {feature.removeprefix(IMAGES): feature for feature in recorded}
         pairs = {camera: names[camera] for camera in model if camera in names}
         if not pairs and len(model) == len(recorded) == 1:
@@ -517,8 +519,8 @@ def observation_of(
     pictures: Mapping[str, NDArray[np.uint8]], state: NDArray[np.float32], instruction: str
 ) -> Observation:
     """The observation of pictures by camera, the first of which is the main one."""
-    first, *others = pictures
-    return Observation(pictures[first], state, instruction, None, {name: pictures[name] for name in others})
+    first, *other_cameras = pictures
+    return Observation(pictures[first], state, instruction, None, {name: pictures[name] for name in other_cameras})
 
 
 def _ahead(actions: NDArray[np.float64], frame: int, count: int) -> NDArray[np.float32]:

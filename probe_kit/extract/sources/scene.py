@@ -24,7 +24,7 @@ def _size(value: Any) -> Any:
 
 
 class SceneOptions(Part):
-    """What a command or a study changes in a scene: a preset, and fields of `SceneSpec`.
+    """The changes that a command or a study makes to a scene: a preset, and fields of `SceneSpec`.
 
     scene: the preset; None for the protocol's or the model's own. None and False leave the preset's value.
     """
@@ -119,5 +119,5 @@ class SceneSettings(SourceSettings):
 
     def files(self) -> dict[str, Path]:
         """Return the suite, where it is a folder, and the files of the scene by its field."""
-        named = {"suite": self.suite, "arm_urdf": self.scene.arm_urdf, "background": self.scene.background}
-        return {name: path for name, path in named.items() if path is not None}
+        files = {"suite": self.suite, "arm_urdf": self.scene.arm_urdf, "background": self.scene.background}
+        return {name: path for name, path in files.items() if path is not None}

@@ -52,7 +52,7 @@ class ScenePlayer(Player):
         return Seen(answer, self._facts)
 
     def look_swapped(self) -> Seen:
-        """What the item's other layout shows in the state that this episode is in; facts: its hash alone."""
+        """Show the item's other layout in the state that this episode is in; facts: its hash alone."""
         observation, frame = self._env.observe_exchanged()
         return Seen(self._observed(observation), {"first_frame_sha256": frame_sha256(frame)})
 
@@ -114,9 +114,9 @@ class ScenePlayer(Player):
     def _see(self) -> Observation:
         return self._observed(self._env.observe())
 
-    def _observed(self, seen: Mapping[str, Any]) -> Observation:
+    def _observed(self, observation: Mapping[str, Any]) -> Observation:
         instruction = self.row.content.item.instruction
-        return Observation(seen["pixels"]["image"], seen["agent_pos"], instruction, self._intrinsics)
+        return Observation(observation["pixels"]["image"], observation["agent_pos"], instruction, self._intrinsics)
 
     def _shoot(self) -> None:
         if self._film:

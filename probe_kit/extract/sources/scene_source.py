@@ -46,13 +46,13 @@ class SceneSource(Source[SceneSettings]):
     @classmethod
     def open(cls, settings: SceneSettings, selects_only: bool) -> Self:
         """The suite of some settings, its chosen items. selects_only: its first items alone are needed."""
-        chosen, count = settings.categories, settings.items
+        categories, count = settings.categories, settings.items
         if settings.suite is not None:
-            return cls(settings, load_suite(settings.suite).select(chosen, count))
+            return cls(settings, load_suite(settings.suite).select(categories, count))
         # Of a category drawn alone every item is the same: drawing all eleven takes minutes.
-        if selects_only and count is not None and not default_folder(chosen).is_dir():
-            return cls(settings, _first_items(chosen, count))
-        return cls(settings, default_suite(chosen).select(None, count))
+        if selects_only and count is not None and not default_folder(categories).is_dir():
+            return cls(settings, _first_items(categories, count))
+        return cls(settings, default_suite(categories).select(None, count))
 
     @property
     def name(self) -> str:
@@ -86,11 +86,11 @@ class SceneSource(Source[SceneSettings]):
         wordings = self.settings.wordings
         for episode in self.suite.episodes():
             yield from filter(
-                None, [episode] if wordings is None else (in_words(episode, one) for one in wordings)
+                None, [episode] if wordings is None else (in_words(episode, wording) for wording in wordings)
             )
 
     def _skipped(self, rows: Sequence[Row]) -> dict[Wording, int]:
-        """By wording, how many items have none. Raises UsageError for a wording that no item has."""
+        """Count the items that lack a wording, by wording. Raises UsageError for a wording that no item has."""
         skipped = {}
         for wording in self.settings.wordings or ():
             items = {row.columns["item_id"] for row in rows if row.columns.get("wording") == wording}
@@ -176,7 +176,7 @@ class SceneSource(Source[SceneSettings]):
         if accept_units or policy.state_numbers is None or "state" in policy.zero_filled_inputs():
             return self, policy
         states = policy.laid_out(self._first_states())
-        names = [str(place) for place in range(states.shape[1])]
+        names = [str(number) for number in range(states.shape[1])]
         where = f"the scene {self.settings.scene.name}"
         check_units(unusual_shares(policy, states), names, where, policy, accept_units)
         return self, policy
@@ -226,7 +226,7 @@ class SceneSource(Source[SceneSettings]):
         return partial(ScenePlayer, self.settings.scene, played)
 
     def pairs(self, vary: str, rng: np.random.Generator, rows: Sequence[Row]) -> Iterator[Pair]:
-        """As of every source; with `layout`, the donor has the two pictures in each other's place."""
+        """Yield pairs as every source; with `layout`, the donor has the two pictures in each other's place."""
         return self._layouts(rows) if vary == LAYOUT else super().pairs(vary, rng, rows)
 
     def _layouts(self, rows: Sequence[Row]) -> Iterator[Pair]:

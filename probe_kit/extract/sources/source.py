@@ -68,7 +68,7 @@ class SourceSettings(Part):
 
 @dataclass(frozen=True)
 class Played:
-    """What a player needs to know beside its source: frames to keep, inferences whose inputs count, a script."""
+    """A player's settings beside its source: frames to keep, inferences whose inputs count, a script."""
 
     frames: str = "none"
     calls: int = 1

@@ -37,7 +37,7 @@ def check_units(
     """
     if accepted or not (shares > MOST_UNUSUAL).any():
         return
-    worst = ", ".join(f"{names[one]} {shares[one]:.0%}" for one in np.flatnonzero(shares > MOST_UNUSUAL))
+    worst = ", ".join(f"{names[number]} {shares[number]:.0%}" for number in np.flatnonzero(shares > MOST_UNUSUAL))
     raise UnitsError(
         f"{where}: of the states many values lie outside the statistics of {policy.card.checkpoint} ({worst}); "
         f"expected at most {MOST_UNUSUAL:.0%} of each number. The units or the robot differ: take a checkpoint "
@@ -50,18 +50,20 @@ def other_order(policy: "Policy", names: Sequence[str]) -> str | None:
 
     Names are compared where both sides have any: positions such as `0`, `1` are none.
     """
-    own = policy.action_names
-    if own is None or tuple(names) == own or all(name.isdecimal() for name in names):
+    predicted = policy.action_names
+    if predicted is None or tuple(names) == predicted or all(name.isdecimal() for name in names):
         return None
-    kind = "in another order" if sorted(own) == sorted(names) else "otherwise"
-    return f"the checkpoint names its actions {', '.join(own)}, and they are named {kind}: {', '.join(names)}"
+    kind = "in another order" if sorted(predicted) == sorted(names) else "otherwise"
+    return (
+        f"the checkpoint names its actions {', '.join(predicted)}, and they are named {kind}: {', '.join(names)}"
+    )
 
 
 def exchanged_names(policy: "Policy", names: Sequence[str]) -> str | None:
-    """As `other_order`, only where a name that both sides have is at another place."""
-    own = policy.action_names or ()
-    places = {name: place for place, name in enumerate(own)}
-    moved = [name for place, name in enumerate(names) if places.get(name, place) != place]
+    """Return the reason of `other_order`, only where a name that both sides have is at another place."""
+    predicted = policy.action_names or ()
+    places = {name: position for position, name in enumerate(predicted)}
+    moved = [name for position, name in enumerate(names) if places.get(name, position) != position]
     return other_order(policy, names) if moved else None
 
 
@@ -70,7 +72,8 @@ def check_predictions(chunks: Any, count: int) -> None:
     if not (
         isinstance(chunks, np.ndarray) and chunks.ndim == 3 and len(chunks) == count and chunks.dtype == np.float32
     ):
-        seen = f"{chunks.shape} {chunks.dtype}" if isinstance(chunks, np.ndarray) else type(chunks).__name__
+        described = f"{chunks.shape} {chunks.dtype}" if isinstance(chunks, np.ndarray) else type(chunks).__name__
         raise PolicyFailedError(
-            f"the policy predicted {seen} for {count} observations; expected float32 ({count}, chunk, actions)"
+            f"the policy predicted {described} for {count} observations; expected float32 "
+            f"({count}, chunk, actions)"
         )

@@ -26,11 +26,11 @@ def letter_margins(
 
     unembedding, card = model.unembedding, model.card
     assert unembedding is not None
-    kept = torch.from_numpy(residuals).to(card.device, getattr(torch, card.dtype))
-    left, right = (int(letter) for letter in letters)
-    rows = [unembedding.logits(row[None, None])[0, 0].float() for row in kept]
-    margins = [float(row[left] - row[right]) for row in rows]
-    size = max(1.0, float(rows[-1][[left, right]].abs().max()))
+    layers = torch.from_numpy(residuals).to(card.device, getattr(torch, card.dtype))
+    left_id, right_id = (int(letter) for letter in letters)
+    rows = [unembedding.logits(row[None, None])[0, 0].float() for row in layers]
+    margins = [float(row[left_id] - row[right_id]) for row in rows]
+    size = max(1.0, float(rows[-1][[left_id, right_id]].abs().max()))
     if abs(margins[-1] - margin) > NEAR_TIE.get(card.dtype, NEAR_TIE["bfloat16"]) * size:
         raise CaptureError(
             f"the logit lens gives {margins[-1]:.4g} as the margin of {card.family}'s last layer; the model "

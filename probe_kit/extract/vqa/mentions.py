@@ -71,7 +71,7 @@ _VERB = re.compile(
 
 @dataclass
 class Mentions:
-    """What is named, and what is named and denied. letters: `A` and `B`; sides: `left`, `right`, `center`.
+    """The sides and letters of a text, and those that it denies. Letters are `A` and `B`, sides those of `Named`.
 
     has_unclear_right: whether a `right` is truth or a side.
     """
@@ -85,14 +85,14 @@ class Mentions:
 
 def mentions_of(text: str) -> Mentions:
     """All of a text, clause by clause: a denial reaches to the end of its clause. Questions are left out."""
-    found = Mentions()
+    mentions = Mentions()
     for clause in _clauses(text):
-        found.has_unclear_right |= bool(_RIGHT_MAY_BE_A_SIDE.search(_blanked(_RIGHT_IS_NO_SIDE, clause)))
+        mentions.has_unclear_right |= bool(_RIGHT_MAY_BE_A_SIDE.search(_blanked(_RIGHT_IS_NO_SIDE, clause)))
         for side, is_denied in _sides(clause):
-            (found.denied_sides if is_denied else found.sides).add(side)
+            (mentions.denied_sides if is_denied else mentions.sides).add(side)
         for letter, is_denied in _letters(clause):
-            (found.denied_letters if is_denied else found.letters).add(letter)
-    return found
+            (mentions.denied_letters if is_denied else mentions.letters).add(letter)
+    return mentions
 
 
 def _clauses(text: str) -> Iterator[str]:
@@ -107,26 +107,26 @@ def _sides(clause: str) -> Iterator[tuple[Named, bool]]:
     clean = clause
     for pattern in (_RIGHT_IS_NO_SIDE, _RIGHT_MAY_BE_A_SIDE, _LEFT_IS_NO_SIDE):
         clean = _blanked(pattern, clean)
-    for found in _SIDE.finditer(clean):
-        yield _SIDE_OF[found[1].lower()], _is_denied(clean, found)
+    for match in _SIDE.finditer(clean):
+        yield _SIDE_OF[match[1].lower()], _is_denied(clean, match)
 
 
 def _letters(clause: str) -> Iterator[tuple[str, bool]]:
     """Upper case alone; `A` in front of a noun is an article if it begins a clause without another letter."""
     letters = list(_LETTER.finditer(clause))
-    is_alone = all(found[1] == "A" for found in letters)
-    for found in letters:
-        before, behind = clause[: found.start()], clause[found.end() :]
+    is_alone = all(match[1] == "A" for match in letters)
+    for match in letters:
+        before, behind = clause[: match.start()], clause[match.end() :]
         is_before_noun = re.match(r"\s+(?:[^\W\d_]{2}|[a-z])", behind) and not _VERB.match(behind)
-        if not (found[1] == "A" and is_alone and is_before_noun and not before.strip()):
-            yield found[1], _is_denied(clause, found)
+        if not (match[1] == "A" and is_alone and is_before_noun and not before.strip()):
+            yield match[1], _is_denied(clause, match)
 
 
-def _is_denied(clause: str, found: re.Match[str]) -> bool:
-    before, behind = clause[: found.start()], clause[found.end() :]
+def _is_denied(clause: str, match: re.Match[str]) -> bool:
+    before, behind = clause[: match.start()], clause[match.end() :]
     return bool(_DENIAL.search(before) or _DENIED_BEHIND.match(behind))
 
 
 def _blanked(pattern: re.Pattern[str], text: str) -> str:
     """The text with spaces where the pattern is found, so that positions stay."""
-    return pattern.sub(lambda found: " " * len(found[0]), text)
+    return pattern.sub(lambda match: " " * len(match[0]), text)

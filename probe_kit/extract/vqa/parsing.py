@@ -57,15 +57,15 @@ _REFUSAL = re.compile(
 
 @dataclass(frozen=True)
 class Answer:
-    """What was read. rule: how, as the outcome of an episode records it. tier: None where nothing was read."""
+    """An answer as it was read. rule: as the outcome of an episode records it. tier: None for no meaning."""
 
-    said: Said
+    meaning: Said
     rule: str
     tier: Tier | None = None
 
 
 def read_answer(text: str, template: Template, order: Order = "original") -> Answer:
-    """What an answer to `template`, its sides named in `order`, says. The first rule that applies decides."""
+    """Read an answer to `template`, its sides named in `order`. The first rule that applies decides."""
     plain = _stripped(text)
     if not plain:
         return Answer("none", "empty")
@@ -94,51 +94,51 @@ def _stripped(text: str) -> str:
 
 
 def _strictly(plain: str, options: Mapping[str, Side]) -> Answer | None:
-    """Of a text that is nothing but an option or a side; None for every other."""
-    found = _STRICT.fullmatch(plain)
-    if found is None:
+    """Read a text that is nothing but an option or a side; None for every other."""
+    match = _STRICT.fullmatch(plain)
+    if match is None:
         return None
-    if found["letter"] is None:
-        mentioned = mentions_of(found["side"]).sides
+    if match["letter"] is None:
+        mentioned = mentions_of(match["side"]).sides
         (side,) = mentioned
         return Answer(side, "center" if side == "center" else "side word", "strict")
-    said = options.get(found["letter"].upper())
-    if said is None or (found["same"] or said).lower() != said:
+    meaning = options.get(match["letter"].upper())
+    if meaning is None or (match["same"] or meaning).lower() != meaning:
         return None
-    return Answer(said, "letter", "strict")
+    return Answer(meaning, "letter", "strict")
 
 
 def _by_clauses(plain: str, options: Mapping[str, Side]) -> Answer:
-    """Of what the clauses affirm, if that is one thing and is denied nowhere."""
-    found = mentions_of(plain)
+    """Read what the clauses affirm, if that is one thing and is denied nowhere."""
+    mentions = mentions_of(plain)
     if _REFUSAL.search(plain):
         return Answer("none", "refusal")
     if options:
-        lettered = _by_letter(found, options)
+        lettered = _by_letter(mentions, options)
         if lettered is not None:
             return lettered
-    if len(found.sides) > 1 or found.sides & found.denied_sides:
+    if len(mentions.sides) > 1 or mentions.sides & mentions.denied_sides:
         return Answer("none", "several sides")
-    if found.sides:
-        (side,) = found.sides
-        if found.has_unclear_right and side != "right":
+    if mentions.sides:
+        (side,) = mentions.sides
+        if mentions.has_unclear_right and side != "right":
             return Answer("none", "several sides")
         return Answer(side, "center" if side == "center" else "side word", "clause")
-    return Answer("none", "denied" if found.denied_sides else "unparsable")
+    return Answer("none", "denied" if mentions.denied_sides else "unparsable")
 
 
-def _by_letter(found: Mentions, options: Mapping[str, Side]) -> Answer | None:
+def _by_letter(mentions: Mentions, options: Mapping[str, Side]) -> Answer | None:
     """The option that is named; None where the text has no letter."""
-    if len(found.letters) > 1 or found.letters & found.denied_letters:
+    if len(mentions.letters) > 1 or mentions.letters & mentions.denied_letters:
         return Answer("none", "several sides")
-    if found.letters:
-        (letter,) = found.letters
-        said = options[letter]
-        is_other = bool(found.sides - {said}) or said in found.denied_sides
-        return Answer("none", "contradicts itself") if is_other else Answer(said, "letter", "clause")
-    denied = {options[letter] for letter in found.denied_letters}
+    if mentions.letters:
+        (letter,) = mentions.letters
+        meaning = options[letter]
+        is_other = bool(mentions.sides - {meaning}) or meaning in mentions.denied_sides
+        return Answer("none", "contradicts itself") if is_other else Answer(meaning, "letter", "clause")
+    denied = {options[letter] for letter in mentions.denied_letters}
     if not denied:
         return None
-    if not found.sides:
+    if not mentions.sides:
         return Answer("none", "denied")
-    return Answer("none", "contradicts itself") if denied & found.sides else None
+    return Answer("none", "contradicts itself") if denied & mentions.sides else None

@@ -24,7 +24,7 @@ _MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class Phrase:
-    """What an object is called. article: "the", or empty for a name that has none."""
+    """The words for an object. article: "the", or empty for a name that has none."""
 
     text: str
     article: str
@@ -36,12 +36,12 @@ class Phrase:
 
     @property
     def with_article(self) -> str:
-        """As it stands in a sentence."""
+        """The phrase as it stands in a sentence."""
         return f"{self.article} {self.text}".strip()
 
 
 def phrases(suite: Suite, query: Query, seed: int = 0) -> dict[str, Phrase]:
-    """By item, what is asked for; the same in both layouts, and the same for the same seed.
+    """Return the phrase that is asked for by item; the same in both layouts, and the same for the same seed.
 
     Other objects are those of the whole suite, so that a phrase does not depend on the number of items asked for.
     Raises UsageError naming the first items for which the suite has no such phrase.
@@ -52,8 +52,8 @@ def phrases(suite: Suite, query: Query, seed: int = 0) -> dict[str, Phrase]:
     for item in suite.whole.items:
         by_category.setdefault(item.category, []).append(item)
     choose = _distractor if query == "distractor" else _absent
-    found = {item.item_id: choose(item, by_category[item.category], seed) for item in suite.items}
-    missing = [item for item in suite.items if found[item.item_id] is None]
+    by_item = {item.item_id: choose(item, by_category[item.category], seed) for item in suite.items}
+    missing = [item for item in suite.items if by_item[item.item_id] is None]
     if missing:
         categories = ", ".join(sorted({item.category for item in missing}))
         some = ", ".join(item.item_id for item in missing[:_MOST_NAMED])
@@ -61,7 +61,7 @@ def phrases(suite: Suite, query: Query, seed: int = 0) -> dict[str, Phrase]:
             f"--query {query}: {len(missing)} of {len(suite.items)} items, in {categories}, have no phrase for it "
             f"({some} …): {_WHY[query]}. Choose other --categories"
         )
-    return {name: phrase for name, phrase in found.items() if phrase is not None}
+    return {name: phrase for name, phrase in by_item.items() if phrase is not None}
 
 
 _WHY: Mapping[Query, str] = {
@@ -70,33 +70,33 @@ _WHY: Mapping[Query, str] = {
 }
 
 
-def _distractor(item: Item, others: Sequence[Item], _seed: int) -> Phrase | None:
-    """What the item that asks for the other picture calls it: the role-exchanged twin, or any other."""
-    naming = [other for other in others if other.target_concept == item.distractor_concept]
+def _distractor(item: Item, items: Sequence[Item], _seed: int) -> Phrase | None:
+    """The phrase of the item that asks for the other picture: the role-exchanged twin, or any other."""
+    naming = [other for other in items if other.target_concept == item.distractor_concept]
     twins = [other for other in naming if other.group_id == item.group_id]
     if twins or naming:
         return Phrase.of((twins or naming)[0])
     if item.object_phrase.count(item.target_concept) == 1:
-        own = Phrase.of(item)
-        return Phrase(own.text.replace(item.target_concept, item.distractor_concept), own.article)
+        phrase = Phrase.of(item)
+        return Phrase(phrase.text.replace(item.target_concept, item.distractor_concept), phrase.article)
     return None
 
 
-def _absent(item: Item, others: Sequence[Item], seed: int) -> Phrase | None:
+def _absent(item: Item, items: Sequence[Item], seed: int) -> Phrase | None:
     """A phrase of the category whose concept is in neither picture.
 
     Comparisons, such as "less smiling person", hold of some picture of every pair of their kind: where a category
     has both kinds, an item gets a phrase of its own kind only.
     """
-    shown = {item.target_concept, item.distractor_concept}
+    concepts = {item.target_concept, item.distractor_concept}
     compares = item.polarity != "none"
     absent = {
         Phrase.of(other)
-        for other in others
-        if not shown & {other.target_concept} and (other.polarity != "none") == compares
+        for other in items
+        if not concepts & {other.target_concept} and (other.polarity != "none") == compares
     }
-    own = Phrase.of(item).text
-    listed = sorted((phrase.text, phrase.article) for phrase in absent if phrase.text != own)
+    text = Phrase.of(item).text
+    listed = sorted((phrase.text, phrase.article) for phrase in absent if phrase.text != text)
     if not listed:
         return None
     return Phrase(*listed[derive_seed(seed, "absent", item.item_id) % len(listed)])

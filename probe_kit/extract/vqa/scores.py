@@ -13,31 +13,31 @@ Outcome = Literal["correct", "wrong", "oob"]
 Placed = Literal["left", "right", "none"]
 
 
-def side_said(said: Said) -> Placed:
+def side_said(meaning: Said) -> Placed:
     """The side an answer puts the object on; none for everything else it may say."""
-    return said if said in ("left", "right") else "none"
+    return meaning if meaning in ("left", "right") else "none"
 
 
 def side_expected(query: Query, side_correct: Side) -> Side | None:
-    """Where what is query for lies; None for an object that is not there."""
+    """Return the side of the object that is asked for; None for an object that is not there."""
     if query == "absent":
         return None
     return side_correct if query == "target" else other_side(side_correct)
 
 
-def outcome_of(said: Said, expected: Side | None) -> Outcome:
-    """Whether an answer is right. Where nothing of the name is there, right is no and every place is wrong."""
+def outcome_of(meaning: Said, expected: Side | None) -> Outcome:
+    """Judge an answer. Where nothing of the name is there, right is no and every place is wrong."""
     if expected is None:
-        return "correct" if said == "no" else "oob" if said == "none" else "wrong"
-    if said not in ("left", "right"):
+        return "correct" if meaning == "no" else "oob" if meaning == "none" else "wrong"
+    if meaning not in ("left", "right"):
         return "oob"
-    return "correct" if said == expected else "wrong"
+    return "correct" if meaning == expected else "wrong"
 
 
 def likeliest(logits: Mapping[Said, float]) -> Said:
-    """What the largest logit says; none where two are equally large, never the first of them."""
+    """Return the meaning of the largest logit; none where two are equally large, never the first of them."""
     best = max(logits.values())
-    leading = [said for said, logit in logits.items() if logit == best]
+    leading = [meaning for meaning, logit in logits.items() if logit == best]
     return leading[0] if len(leading) == 1 else "none"
 
 
@@ -58,12 +58,12 @@ class Choice:
 
     @property
     def content(self) -> float:
-        """What of the margin stays when the options change places."""
+        """The part of the margin that stays when the options change places."""
         return sum(self.margins) / len(self.margins)
 
     @property
     def letter_bias(self) -> float | None:
-        """What of the margin goes with the place: above 0 for whatever is named first; None for one order."""
+        """The part of the margin that goes with the place: above 0 for what is named first; None for one order."""
         if len(self.margins) == 1:
             return None
         first, second = self.margins
@@ -77,4 +77,4 @@ class Choice:
     @property
     def debiased(self) -> Said:
         """The likeliest answer by the mean of the passes, in which a preference for a place is gone."""
-        return likeliest({said: sum(own[said] for own in self.passes) for said in self.passes[0]})
+        return likeliest({meaning: sum(logits[meaning] for logits in self.passes) for meaning in self.passes[0]})

@@ -43,17 +43,17 @@ class Template:
     text: str
 
     def __post_init__(self) -> None:
-        found = _PLACES.findall(self.text)
-        if found == ["instruction"]:
+        places = _PLACES.findall(self.text)
+        if places == ["instruction"]:
             return
-        if unknown := sorted(set(found) - {"object", "A", "B"}):
+        if unknown := sorted(set(places) - {"object", "A", "B"}):
             raise UsageError(
                 f"the prompt {self.name} has a place {{{unknown[0]}}}; expected {{object}}, {{A}} and {{B}}, or "
                 "{instruction} and no other"
             )
-        if found.count("object") != 1 or (found.count("A"), found.count("B")) not in ((0, 0), (1, 1)):
+        if places.count("object") != 1 or (places.count("A"), places.count("B")) not in ((0, 0), (1, 1)):
             raise UsageError(
-                f"the prompt {self.name} has the places {', '.join(found) or 'none'}; expected {{object}} once, "
+                f"the prompt {self.name} has the places {', '.join(places) or 'none'}; expected {{object}} once, "
                 "and {A} and {B} once each or not at all"
             )
         if self.lettered and self.text.index("{A}") > self.text.index("{B}"):
@@ -61,7 +61,7 @@ class Template:
 
     @cached_property
     def sha256(self) -> str:
-        """Of the text, places and all."""
+        """The hash of the text, places and all."""
         return sha256_text(self.text)
 
     @property
@@ -86,16 +86,16 @@ class Template:
 
     @property
     def tokens(self) -> int:
-        """How many tokens an answer may have."""
+        """The number of tokens that an answer may have."""
         return LETTER_TOKENS if self.lettered else SIDE_TOKENS
 
-    def render(self, named: Phrase, order: Order = "original", instruction: str = "") -> str:
+    def render(self, phrase: Phrase, order: Order = "original", instruction: str = "") -> str:
         """The question about an object, with the sides named in this order. instruction: of the episode."""
         if self.is_instruction:
             return self.text.replace("{instruction}", instruction)
         first, second = sides(order)
-        words = {"the {object}": named.with_article, "{object}": named.text, "{A}": first, "{B}": second}
-        return _FILLED.sub(lambda place: words[place[0]], self.text)
+        words = {"the {object}": phrase.with_article, "{object}": phrase.text, "{A}": first, "{B}": second}
+        return _FILLED.sub(lambda match: words[match[0]], self.text)
 
 
 def sides(order: Order) -> tuple[Side, Side]:

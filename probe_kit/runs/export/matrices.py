@@ -29,7 +29,7 @@ _READ_AT_ONCE, _INDEXED_AT_ONCE = 1 << 12, 1 << 18
 
 @dataclass(frozen=True)
 class RowOrigins:
-    """Where the N rows of the matrices of a stream are from, as in `Block`.
+    """The origins of the N rows of the matrices of a stream, as in `Block`.
 
     positions, inferences, tokens: (N,) int32. roles: (N,) int32, places in role_names.
     """
@@ -42,7 +42,7 @@ class RowOrigins:
 
     @classmethod
     def of(cls, count: int) -> "RowOrigins":
-        """For so many rows, which `put` fills."""
+        """Return origins for so many rows, which `put` fills."""
         positions, inferences, tokens, roles = np.zeros((4, count), np.int32)
         return cls(positions, inferences, tokens, roles, [])
 
@@ -67,14 +67,14 @@ def write_sae(
     folder.mkdir()
     scales: dict[str, Any] = {}
     for choice in choices:
-        own = folder / choice.name
-        own.mkdir()
+        stream_folder = folder / choice.name
+        stream_folder.mkdir()
         order = np.random.default_rng(derive_seed("export sae", seed)).permutation(count_vectors(run, choice))
         stored = np.dtype(np.float16 if dtype == "float16" else np.uint16)
-        rows, files = _write_matrices(run, choice, own, stored, order)
+        rows, files = _write_matrices(run, choice, stream_folder, stored, order)
         for site, file in files.items():
             scales[str(site)] = {"file": file.relative_to(folder).as_posix(), **_scale(file)}
-        _write_index(run, rows, own / INDEX)
+        _write_index(run, rows, stream_folder / INDEX)
     head = {"dtype": dtype, "seed": seed, "sites": scales, "about": json.loads(about)}
     (folder / SCALES).write_text(json.dumps(head, indent=2), encoding="utf-8", newline="\n")
 
@@ -92,16 +92,16 @@ def _write_matrices(
     }
     for file in files.values():
         _reserve(file)
-    rows, done = RowOrigins.of(count), 0
+    rows, start = RowOrigins.of(count), 0
     for block in blocks(run, [choice]):
-        end = done + block.tokens.size
-        places = order[done:end]
+        end = start + block.tokens.size
+        places = order[start:end]
         rows.put(places, block)
         for site, values in zip(choice.sites, block.values, strict=True):
             maps[site][places] = _as_stored(values, dtype, site, run)
-        done = end
-    for one in maps.values():
-        one.flush()
+        start = end
+    for memory_map in maps.values():
+        memory_map.flush()
     return rows, files
 
 

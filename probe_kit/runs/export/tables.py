@@ -20,7 +20,7 @@ ABOUT = "probe_kit"
 
 
 class Origins:
-    """Where vectors are from: columns by episode, inference and token, as Arrow arrays."""
+    """The origins of vectors: columns by episode, inference and token, as Arrow arrays."""
 
     def __init__(self, run: Run) -> None:
         self.run = run
@@ -44,12 +44,12 @@ class Origins:
     def columns(self, positions: Any, inferences: Any, tokens: Any, roles: Any) -> dict[str, Any]:
         """The columns of n vectors. positions, inferences, tokens: (n,) as in `Block`. roles: (n,)."""
         pa = self.pa
-        found = {name: self._cells[name].take(pa.array(positions)) for name in self.keys}
-        found["inference"] = pa.array(inferences, pa.int32())
-        found[self.step] = pa.array(self.steps[positions, inferences], pa.int32())
-        found["role"] = pa.array(roles, pa.string())
-        found["token"] = pa.array(tokens, pa.int32(), mask=np.asarray(tokens) == POOLED)
-        return found
+        columns = {name: self._cells[name].take(pa.array(positions)) for name in self.keys}
+        columns["inference"] = pa.array(inferences, pa.int32())
+        columns[self.step] = pa.array(self.steps[positions, inferences], pa.int32())
+        columns["role"] = pa.array(roles, pa.string())
+        columns["token"] = pa.array(tokens, pa.int32(), mask=np.asarray(tokens) == POOLED)
+        return columns
 
     @cached_property
     def _cells(self) -> dict[str, Any]:
@@ -88,7 +88,7 @@ def _table(block: Block, origins: Origins, schema: Any) -> Any:
     pa = origins.pa
     sites, count, width = block.values.shape
     rows = np.full(count, block.position), np.full(count, block.inference)
-    positions, inferences, tokens = (np.tile(one, sites) for one in (*rows, block.tokens))
+    positions, inferences, tokens = (np.tile(cells, sites) for cells in (*rows, block.tokens))
     columns = origins.columns(positions, inferences, tokens, block.roles * sites)
     columns["site"] = pa.array(np.repeat([str(site) for site in block.choice.sites], count), pa.string())
     columns["view"] = pa.array([block.view] * (sites * count), pa.string())

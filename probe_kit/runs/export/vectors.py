@@ -33,7 +33,7 @@ class StreamChoice:
 
     @property
     def name(self) -> str:
-        """Of the stream."""
+        """The name of the stream."""
         return self.stored.name
 
 
@@ -63,27 +63,29 @@ def choose(run: Run, sites: Sequence[str] | None, view: str | None) -> tuple[Str
     """
     for pattern in sites or ():
         if not any(_matches(site, [pattern]) for stream in run.streams for site in run.sites(stream)):
-            known = ", ".join(f"{run.sites(name)[0]} to {run.sites(name)[-1]}" for name in run.streams)
-            raise UnknownSiteError(f"{run.location} has no site {pattern!r}; it has {known}")
+            available = ", ".join(f"{run.sites(name)[0]} to {run.sites(name)[-1]}" for name in run.streams)
+            raise UnknownSiteError(f"{run.location} has no site {pattern!r}; it has {available}")
     if sites is not None and not sites:
         raise UsageError(
             "no sites are named; expected one or more, such as backbone.07.residual, or all by default"
         )
-    found = []
+    choices = []
     for name in run.streams:
-        own = tuple(site for site in run.sites(name) if sites is None or _matches(site, sites))
+        chosen_sites = tuple(site for site in run.sites(name) if sites is None or _matches(site, sites))
         views = _views(run, name, view)
-        if own and not views and sites is not None:
-            known = ", ".join(run.views(name))
-            raise UnknownSiteError(f"no view {view!r} of {name} in {run.location}; stored: {known}{_tokens(run)}")
-        if own and views:
-            found.append(StreamChoice(run.stored(name), own, views))
-    if not found:
-        known = "; ".join(f"{name}: {', '.join(run.views(name))}" for name in run.streams)
+        if chosen_sites and not views and sites is not None:
+            available = ", ".join(run.views(name))
+            raise UnknownSiteError(
+                f"no view {view!r} of {name} in {run.location}; stored: {available}{_tokens(run)}"
+            )
+        if chosen_sites and views:
+            choices.append(StreamChoice(run.stored(name), chosen_sites, views))
+    if not choices:
+        available = "; ".join(f"{name}: {', '.join(run.views(name))}" for name in run.streams)
         raise UnknownSiteError(
-            f"no stream of {run.location} has the view {view!r}; stored are {known}{_tokens(run)}"
+            f"no stream of {run.location} has the view {view!r}; stored are {available}{_tokens(run)}"
         )
-    return tuple(found)
+    return tuple(choices)
 
 
 def blocks(run: Run, choices: Sequence[StreamChoice]) -> Iterator[Block]:
@@ -97,11 +99,11 @@ def blocks(run: Run, choices: Sequence[StreamChoice]) -> Iterator[Block]:
     }
     for position, commit in enumerate(run.commits()):
         for choice in choices:
-            own = {kind: rows[choice.name, kind] for kind in kinds if (choice.name, kind) in rows}
+            stream_rows = {kind: rows[choice.name, kind] for kind in kinds if (choice.name, kind) in rows}
             if is_tokens(choice.views[0]):
-                yield from _token_blocks(own[TOKENS], choice, position, commit.roles)
+                yield from _token_blocks(stream_rows[TOKENS], choice, position, commit.roles)
             else:
-                yield from _pooled_blocks(run, own, choice, position, len(commit.roles))
+                yield from _pooled_blocks(run, stream_rows, choice, position, len(commit.roles))
 
 
 def count_vectors(run: Run, choice: StreamChoice) -> int:
@@ -124,19 +126,21 @@ def is_tokens(view: str) -> bool:
 
 def chosen_tokens(spans: Spans, view: str) -> tuple[NDArray[np.int32], tuple[str, ...]]:
     """(n,) positions and roles of the tokens of a view, `tokens` or `tokens:ROLE`; padding is in none."""
-    asked = view.partition(":")[2]
-    own = [
-        (place, role)
+    wanted_role = view.partition(":")[2]
+    tokens = [
+        (position, role)
         for role, start, stop in sorted(spans, key=lambda span: span[1])
-        if (plays(role, asked) if asked else role != PADDING)
-        for place in range(start, stop)
+        if (plays(role, wanted_role) if wanted_role else role != PADDING)
+        for position in range(start, stop)
     ]
-    return np.array([place for place, _ in own], np.int32), tuple(role for _, role in own)
+    return np.array([position for position, _ in tokens], np.int32), tuple(role for _, role in tokens)
 
 
 def _matches(site: Site, patterns: Sequence[str]) -> bool:
     name = str(site)
-    return any(fnmatchcase(name, one) or name.startswith((f"{one}.", f"{one}@")) for one in patterns)
+    return any(
+        fnmatchcase(name, pattern) or name.startswith((f"{pattern}.", f"{pattern}@")) for pattern in patterns
+    )
 
 
 def _views(run: Run, stream: str, view: str | None) -> tuple[str, ...]:
@@ -157,7 +161,11 @@ def _plays_any(run: Run, stream: str, view: str) -> bool:
 def _tokens(run: Run) -> str:
     if run.settings["tokens"] == "all":
         roles = {
-            role for one in run.commits() for spans in one.roles for own in spans.values() for role, *_ in own
+            role
+            for commit in run.commits()
+            for spans in commit.roles
+            for stream_spans in spans.values()
+            for role, *_ in stream_spans
         }
         return f", {TOKENS} and {TOKENS}:ROLE of {', '.join(sorted(roles - {PADDING}))}"
     return "; every token only in runs extracted with --tokens all"
@@ -167,18 +175,18 @@ def _pooled_blocks(
     run: Run, rows: Mapping[ArrayKind, Rows], choice: StreamChoice, position: int, inferences: int
 ) -> Iterator[Block]:
     full = rows["pooled"][position]
-    kept = rows["later"][position] if "later" in rows and inferences > 1 else None
+    later = rows["later"][position] if "later" in rows and inferences > 1 else None
     for inference in range(inferences):
         for view in choice.views:
             if view not in run.views(choice.name, inference):
                 continue
-            if inference and kept is not None:
+            if inference and later is not None:
                 vectors: Any = [
-                    decode_bfloat16(kept[(inference - 1, *choice.stored.at(site))]) for site in choice.sites
+                    decode_bfloat16(later[(inference - 1, *choice.stored.at(site))]) for site in choice.sites
                 ]
             else:
-                place = choice.stored.views.index(view)
-                vectors = [full[(inference, *choice.stored.at(site), place)] for site in choice.sites]
+                index = choice.stored.views.index(view)
+                vectors = [full[(inference, *choice.stored.at(site), index)] for site in choice.sites]
             role = view.removeprefix(_MEAN_OF) if view.startswith(_MEAN_OF) else ""
             none = np.array([POOLED], np.int32)
             yield Block(choice, position, inference, view, none, (role,), np.stack(vectors)[:, None])
@@ -186,13 +194,13 @@ def _pooled_blocks(
 
 def _token_blocks(rows: Rows, choice: StreamChoice, position: int, spans: Sequence[Any]) -> Iterator[Block]:
     (view,) = choice.views
-    for inference, own in enumerate(spans):
-        tokens, roles = chosen_tokens(own[choice.name], view)
+    for inference, stream_spans in enumerate(spans):
+        tokens, roles = chosen_tokens(stream_spans[choice.name], view)
         if not tokens.size:
             continue
         until = slice(int(tokens.max()) + 1)
         values = np.empty((len(choice.sites), tokens.size, choice.stored.width), np.float32)
-        for place, site in enumerate(choice.sites):
+        for index, site in enumerate(choice.sites):
             bits = rows.read(position, (inference, *choice.stored.at(site), until))
-            values[place] = decode_bfloat16(bits)[tokens]
+            values[index] = decode_bfloat16(bits)[tokens]
         yield Block(choice, position, inference, view, tokens, roles, values)

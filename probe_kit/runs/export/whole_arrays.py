@@ -73,11 +73,11 @@ class _SafeFile(io.RawIOBase):
 
     def write(self, content: Any) -> int:
         """Write all of it; after an error nothing is written."""
-        left = memoryview(content).cast("B")
-        length = len(left)
+        unwritten = memoryview(content).cast("B")
+        length = len(unwritten)
         try:
-            while left and self.error is None:
-                left = left[self._raw.write(left) or 0 :]
+            while unwritten and self.error is None:
+                unwritten = unwritten[self._raw.write(unwritten) or 0 :]
         except OSError as error:
             self.error = error
         return length

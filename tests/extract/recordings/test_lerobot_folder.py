@@ -66,7 +66,7 @@ def test_a_data_set_written_from_a_scene_run_gives_that_runs_activations_bit_for
 
     def watched(controller: PolicyController, turns: list[Turn]) -> Any:
         for turn in turns:
-            seen.setdefault(turn.row.policy_seed, []).append(turn.seen)
+            seen.setdefault(turn.row.policy_seed, []).append(turn.observation)
         return infer(controller, turns)
 
     monkeypatch.setattr(PolicyController, "infer", watched)

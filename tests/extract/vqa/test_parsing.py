@@ -68,7 +68,7 @@ WORDS = [
 
 def read(text: str, template: Template, order: Order = "original") -> tuple[Said, str]:
     found = read_answer(text, template, order)
-    return found.said, found.rule
+    return found.meaning, found.rule
 
 
 @pytest.mark.parametrize(("text", "said", "rule"), LETTERED)
@@ -120,10 +120,10 @@ UNREAD = {
 def test_what_a_person_reads_is_read_or_left_unreadable_and_never_inverted(name: str) -> None:
     cases, template, order = TABLES[name]
     wrong = {
-        text: found.said
+        text: found.meaning
         for said, texts in cases.items()
         for text in texts
-        if (found := read_answer(text, template, order)).said != said
+        if (found := read_answer(text, template, order)).meaning != said
     }
     every = {text for texts in cases.values() for text in texts}
     assert wrong == dict.fromkeys(UNREAD.get(name, AUDIT_UNREAD & every), "none")
@@ -133,7 +133,7 @@ def test_a_side_that_is_read_has_a_tier_and_nothing_else_has() -> None:
     for cases, template, order in TABLES.values():
         for text in (text for texts in cases.values() for text in texts):
             found = read_answer(text, template, order)
-            assert (found.tier is None) == (found.said == "none"), text
+            assert (found.tier is None) == (found.meaning == "none"), text
 
 
 @pytest.mark.parametrize(
