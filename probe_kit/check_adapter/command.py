@@ -73,8 +73,8 @@ def _print_outcome(outcome: "Outcome") -> None:
     line = f"{outcome.sentence} ({outcome.reason})" if outcome.reason else outcome.sentence
     out.print(marked(f"[{colours[outcome.state]}]{{}}[/] {{}}", f"{outcome.state:8}", line), soft_wrap=True)
     if outcome.state == "failed":
-        for name in ("seen", "expected", "change"):
-            out.print(marked("         [dim]{}[/] {}", f"{name:9}", getattr(outcome, name)), soft_wrap=True)
+        for label, name in (("seen", "actual"), ("expected", "expected"), ("change", "change")):
+            out.print(marked("         [dim]{}[/] {}", f"{label:9}", getattr(outcome, name)), soft_wrap=True)
 
 
 def _print_end(model: str, checkpoint: str | None, outcomes: "list[Outcome]") -> None:

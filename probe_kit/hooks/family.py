@@ -134,17 +134,17 @@ class Family:
                 )
         if self.sizes:
             names = tuple(name for name, _ in self.sizes)
-            said = f"A released size ({', '.join(names)}) instead of --checkpoint."
-            size = Option(SIZE, str, said, names[0], names)
+            help_text = f"A released size ({', '.join(names)}) instead of --checkpoint."
+            size = Option(SIZE, str, help_text, names[0], names)
             object.__setattr__(self, "options", (*self.options, size))
 
     def check_words(self, texts: Iterable[str], checkpoint: str | None = None) -> None:
         """Raise InstructionError for a text with a word that the default checkpoint does not know."""
         if not self.vocabulary or checkpoint is not None:
             return
-        own = import_module(self.vocabulary)
-        known = set(own.known_words())
-        unknown = {text: [word for word in own.words_in(text) if word not in known] for text in texts}
+        vocabulary = import_module(self.vocabulary)
+        readable = set(vocabulary.known_words())
+        unknown = {text: [word for word in vocabulary.words_in(text) if word not in readable] for text in texts}
         bad = {text: words for text, words in unknown.items() if words}
         if bad:
             text, words = next(iter(bad.items()))
@@ -156,8 +156,8 @@ class Family:
 
     def known_words(self) -> list[str]:
         """Every word that an instruction of an embedded model may hold, sorted; none of a family of any text."""
-        known = import_module(self.vocabulary).known_words() if self.vocabulary else ()
-        return sorted(word for word in known if word.strip())
+        words = import_module(self.vocabulary).known_words() if self.vocabulary else ()
+        return sorted(word for word in words if word.strip())
 
     def load(
         self,
@@ -170,12 +170,12 @@ class Family:
     ) -> "Model":
         """Load a model; `checkpoint` None means the default one.
 
-        options: by name, as text or values. weights_seed: of a untrained network's weights.
+        options: by name, as text or values. weights_seed: of an untrained network's weights.
         Switches off torch's fused encoder in this process, because hooks would change its rounding.
         Raises UsageError for an option it lacks, and for a device, dtype or seed that cannot be used.
         """
-        chosen = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
-        place = self.place(checkpoint, chosen.pop(SIZE, None))
+        loader_options = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
+        location = self.location(checkpoint, loader_options.pop(SIZE, None))
         check_machine(device, dtype)
         from probe_kit.hooks.capturing.changed_outputs import switch_off_fused_encoder
 
@@ -185,34 +185,34 @@ class Family:
         if weights_seed:
             if "weights_seed" not in inspect.signature(load).parameters:
                 raise UsageError(f"{self.name} has one untrained network only: its loader takes no weights_seed")
-            chosen["weights_seed"] = weights_seed
-        with while_loading(self.name, str(place or "what it brings")), recorded_commits() as commits:
-            model: Model = load(place, device, dtype, random_weights, **chosen)
-            _check_streams(model, str(place))
+            loader_options["weights_seed"] = weights_seed
+        with while_loading(self.name, str(location or "what it brings")), recorded_commits() as commits:
+            model: Model = load(location, device, dtype, random_weights, **loader_options)
+            _check_streams(model, str(location))
             with suppress(Exception):  # a file that is missing is named when it is needed
                 model.read_late_files()
         # Options that the adapter does not record itself are part of the identity too.
-        said = {name: str(value) for name, value in chosen.items() if name != "weights_seed"}
+        option_texts = {name: str(value) for name, value in loader_options.items() if name != "weights_seed"}
         merged = model.card.audit.get("adapter")
         model.card = replace(
             model.card,
             checkpoint=pinned(model.card.checkpoint),
-            settings={**said, **model.card.settings},
+            settings={**option_texts, **model.card.settings},
             notes=_notes((*model.card.notes, *([merged] if merged else []), *_unguarded(model))),
-            repositories=_others(commits, place),
-            **self._source_of(model.card, place),
+            repositories=_other_commits(commits, location),
+            **self._source_of(model.card, location),
         )
         return model
 
-    def _source_of(self, card: ModelCard, place: str | None) -> dict[str, Any]:
-        """What the card says of the source: a untrained network has none, a foreign checkpoint an unknown one."""
+    def _source_of(self, card: ModelCard, location: str | None) -> dict[str, Any]:
+        """The source fields of the card: an untrained network has none, a foreign checkpoint an unknown one."""
         if card.random_weights:
             return {"source": None, "source_weights": None}
-        own = without_revision(place) in (
+        is_own_checkpoint = without_revision(location) in (
             self.default_checkpoint,
             *(row.checkpoint for first in self.protocols.values() for row in first.rows),
         )
-        return {"source": self.source, "source_weights": self.source_weights if own else None}
+        return {"source": self.source, "source_weights": self.source_weights if is_own_checkpoint else None}
 
     def check(
         self,
@@ -230,10 +230,10 @@ class Family:
         are looked at, and no weights. Returns the options as the loader gets them. Raises UsageError,
         MissingExtraError, CheckpointError or WeightsError as loading would.
         """
-        chosen = check_options(self.name, self.options, options)
+        loader_options = check_options(self.name, self.options, options)
         if weights_seed and not random_weights:
             raise UsageError(
-                "weights_seed belongs to a untrained network; ask for random weights too, or leave it out"
+                "weights_seed belongs to an untrained network; ask for random weights too, or leave it out"
             )
         if dtype not in (None, *DTYPES):
             raise UsageError(f"dtype is {dtype!r}; expected one of {', '.join(DTYPES)}")
@@ -242,21 +242,27 @@ class Family:
             raise MissingExtraError(
                 f"{self.name} needs {module}, which is not installed; `{install_command(extra)}`"
             )
-        place = self.place(checkpoint, chosen.get(SIZE))
-        if place is None and self.needs_checkpoint:
+        location = self.location(checkpoint, loader_options.get(SIZE))
+        if location is None and self.needs_checkpoint:
             raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
-        if self.declared and place is not None and not is_on_hub(place) and not Path(place).exists():
-            checkpoint_folder(place)  # of the hub's families; says that it is not there, or finds the user's home
-        if place is not None and self.config_types and (fetch or not is_on_hub(place)):
-            with naming_checkpoint(self.name, place):
+        if self.declared and location is not None and not is_on_hub(location) and not Path(location).exists():
+            checkpoint_folder(
+                location
+            )  # of the hub's families; says that it is not there, or finds the user's home
+        if location is not None and self.config_types and (fetch or not is_on_hub(location)):
+            with naming_checkpoint(self.name, location):
                 weights = fetch and not random_weights
-                check_files(checkpoint_folder(place, self.files), self.config_types, weights, self.instead)
-        return self._with_own(chosen, place)
+                check_files(checkpoint_folder(location, self.files), self.config_types, weights, self.instead)
+        return self._with_defaults(loader_options, location)
 
-    def _with_own(self, chosen: Mapping[str, Any], place: str | None) -> dict[str, Any]:
+    def _with_defaults(self, loader_options: Mapping[str, Any], location: str | None) -> dict[str, Any]:
         """The options with those that belong to the default checkpoint, where it is the one."""
-        own = self.of_default if place is not None and without_revision(place) == self.default_checkpoint else {}
-        return {**own, **chosen}
+        defaults = (
+            self.of_default
+            if location is not None and without_revision(location) == self.default_checkpoint
+            else {}
+        )
+        return {**defaults, **loader_options}
 
     def declared_streams(self, options: Mapping[str, Any]) -> tuple[DeclaredStream, ...] | None:
         """The streams of the size that `options` choose; None for a family that declares none."""
@@ -288,22 +294,22 @@ class Family:
         """
         if not self.declared:
             return None
-        chosen = check_options(self.name, self.options, options)
-        place = self.place(checkpoint, chosen.pop(SIZE, None))
+        loader_options = check_options(self.name, self.options, options)
+        location = self.location(checkpoint, loader_options.pop(SIZE, None))
         with while_loading(self.name, self.loader):
             load = imported(self.loader)
-        with naming_checkpoint(self.name, str(place)):
-            return outline_of(self.name, load, place, dtype, self._with_own(chosen, place))
+        with naming_checkpoint(self.name, str(location)):
+            return outline_of(self.name, load, location, dtype, self._with_defaults(loader_options, location))
 
     def is_here(self, checkpoint: str | None, options: Mapping[str, Any]) -> bool:
         """Whether a checkpoint with its weights is in a folder or in the hub's cache. Asks no network."""
-        place = self.place(checkpoint, options.get(SIZE))
-        return place is None or is_complete(place)
+        location = self.location(checkpoint, options.get(SIZE))
+        return location is None or is_complete(location)
 
     def bytes_to_fetch(self, checkpoint: str | None, options: Mapping[str, Any]) -> int | None:
         """Bytes of the weights that have to be downloaded, as an index in the cache has them; None without one."""
-        place = self.place(checkpoint, options.get(SIZE))
-        return None if place is None else bytes_to_fetch(place)
+        location = self.location(checkpoint, options.get(SIZE))
+        return None if location is None else bytes_to_fetch(location)
 
     def check_acting(self, checkpoint: str | None, options: Mapping[str, Any] = MappingProxyType({})) -> None:
         """Raise UsageError for a checkpoint of the hub whose actions no arm here can execute, before a download.
@@ -311,12 +317,12 @@ class Family:
         Its own configuration decides where it is here, else the family's list of released checkpoints. One whose
         weights are here is left to its loading.
         """
-        place = self.place(checkpoint, options.get(SIZE))
-        if place is None or is_complete(place):
+        location = self.location(checkpoint, options.get(SIZE))
+        if location is None or is_complete(location):
             return
-        outline = self.outline(checkpoint, options) if is_configured(place) else None
+        outline = self.outline(checkpoint, options) if is_configured(location) else None
         reason = None if outline is None else outline.misfit()
-        if (outline is None or outline.model is None) and (bare := without_revision(place)) in self.not_acting:
+        if (outline is None or outline.model is None) and (bare := without_revision(location)) in self.not_acting:
             reason = f"{bare} puts out numbers that no arm here can execute"
         if reason is not None:
             raise UsageError(f"{reason}. Plan and capture it with --no-act, or pass a fine-tune as --checkpoint")
@@ -328,14 +334,14 @@ class Family:
 
         fetch: download small files that are not here; without it, nothing is checked then.
         """
-        chosen = check_options(self.name, self.options, options)
-        place = self.place(checkpoint, chosen.pop(SIZE, None))
-        if self.words is None or (not fetch and place is not None and is_on_hub(place)):
+        loader_options = check_options(self.name, self.options, options)
+        location = self.location(checkpoint, loader_options.pop(SIZE, None))
+        if self.words is None or (not fetch and location is not None and is_on_hub(location)):
             return
         with while_loading(self.name, self.words):
             check = imported(self.words)
-        with naming_checkpoint(self.name, str(place or "what it brings")):
-            check(place, instructions, **chosen)
+        with naming_checkpoint(self.name, str(location or "what it brings")):
+            check(location, instructions, **loader_options)
 
     def whose_units(
         self, checkpoint: str | None, options: Mapping[str, Any] = MappingProxyType({}), fetch: bool = True
@@ -345,14 +351,16 @@ class Family:
         fetch: download small files that are not here; without it, nothing is said of a checkpoint on the hub.
         Raises UsageError where several are there and none was chosen.
         """
-        chosen = check_options(self.name, self.options, options)
-        place = self.place(checkpoint, chosen.pop(SIZE, None))
-        if self.units is None or place is None or (not fetch and is_on_hub(place)):
+        loader_options = check_options(self.name, self.options, options)
+        location = self.location(checkpoint, loader_options.pop(SIZE, None))
+        if self.units is None or location is None or (not fetch and is_on_hub(location)):
             return ""
         with while_loading(self.name, self.units):
-            told = imported(self.units)
-        with naming_checkpoint(self.name, place):
-            return with_adapters_named(str(told(place, **self._with_own(chosen, place))))
+            describe_units = imported(self.units)
+        with naming_checkpoint(self.name, location):
+            return with_adapters_named(
+                str(describe_units(location, **self._with_defaults(loader_options, location)))
+            )
 
     def check_intervention(self, kind: InterventionKind) -> None:
         """Raises UnsupportedInterventionError, before anything is loaded, for what the family does not support."""
@@ -364,15 +372,15 @@ class Family:
         self.interventions.check(kind, self.name)
 
     def interventions_json(self) -> dict[str, Any] | None:
-        """What of the interventions is supported, as plain values; None for a family that does not act.
+        """The supported interventions as plain values; None for a family that does not act.
 
         asked_as: the same in the words of `probe-kit intervene`, values by option.
         """
-        own = self.interventions
-        return {**own.to_json(), "asked_as": own.asked_as()} if self.acts else None
+        interventions = self.interventions
+        return {**interventions.to_json(), "asked_as": interventions.asked_as()} if self.acts else None
 
-    def place(self, checkpoint: str | None, size: str | None = None) -> str | None:
-        """What is loaded: `checkpoint`, that of a `size`, or the default. Raises UsageError for both at once."""
+    def location(self, checkpoint: str | None, size: str | None = None) -> str | None:
+        """The checkpoint to load: `checkpoint`, that of a `size`, or the default. Raises UsageError for both."""
         if size is None:
             return checkpoint or self.default_checkpoint
         if checkpoint is not None:
@@ -384,9 +392,9 @@ class Family:
 
     def folder_here(self, checkpoint: str | None, options: Mapping[str, Any]) -> Path:
         """The folder that a local checkpoint has, or an embedded one; of a hub id it need not exist."""
-        place = self.place(checkpoint, options.get(SIZE))
-        if place is not None:
-            return Path(place).expanduser()
+        location = self.location(checkpoint, options.get(SIZE))
+        if location is not None:
+            return Path(location).expanduser()
         from probe_kit.models.embedded.folder import embedded_checkpoint
 
         return embedded_checkpoint(self.name)
@@ -401,15 +409,15 @@ class Family:
         self.check_purpose(purpose)
         path = getattr(self, purpose)
         with while_loading(self.name, path):
-            found: Callable[..., Any] = imported(path)
-        return found
+            function: Callable[..., Any] = imported(path)
+        return function
 
     def renames(self) -> tuple[tuple[str, str], ...]:
-        """How names of tensors in released files become the network's; empty if they are the same."""
+        """Pairs that turn names of tensors in released files into the network's; empty if they are the same."""
         return () if self.stored_names is None else tuple(imported(self.stored_names))
 
     def missing(self) -> str:
-        """What this machine lacks to run the family, its default checkpoint included; empty if it is ready."""
+        """Requirements that this machine lacks, the default checkpoint included; empty if it is ready."""
         lacking = [f"extra {extra}" for extra in dict.fromkeys(extra for _, extra in self._missing_packages())]
         if self.needs_checkpoint:
             lacking.append("a checkpoint of yours (--checkpoint)")
@@ -426,9 +434,9 @@ class Family:
         from huggingface_hub import try_to_load_from_cache
 
         name, inside, _ = hub_name(repository) or (repository, "", "")
-        found = try_to_load_from_cache(name, f"{inside}/{file}" if inside else file)
-        whole = repository == self.default_checkpoint and bool(self.config_types)
-        return not isinstance(found, str) or (whole and bool(missing_weights(Path(found).parent)))
+        cached = try_to_load_from_cache(name, f"{inside}/{file}" if inside else file)
+        needs_weights = repository == self.default_checkpoint and bool(self.config_types)
+        return not isinstance(cached, str) or (needs_weights and bool(missing_weights(Path(cached).parent)))
 
     def _missing_packages(self) -> list[tuple[str, str]]:
         return [(module, extra) for module, extra in self.packages if find_spec(module) is None]
@@ -448,19 +456,23 @@ def _notes(notes: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(map(with_adapters_named, notes)))
 
 
-def _others(commits: Mapping[str, str], place: str | None) -> dict[str, str]:
-    """The commits of repositories besides that of the checkpoint `place`, which names its own."""
-    named = None if place is None else hub_name(place)
-    return {name: commit for name, commit in sorted(commits.items()) if named is None or name != named.repository}
+def _other_commits(commits: Mapping[str, str], location: str | None) -> dict[str, str]:
+    """The commits of repositories besides that of the checkpoint at `location`, which names its own."""
+    checkpoint_name = None if location is None else hub_name(location)
+    return {
+        name: commit
+        for name, commit in sorted(commits.items())
+        if checkpoint_name is None or name != checkpoint_name.repository
+    }
 
 
-def _check_streams(model: "Model", place: str) -> None:
+def _check_streams(model: "Model", location: str) -> None:
     """Raise CheckpointError for a model that would loop without end: its counts come from files and options."""
     for name, stream in model.streams.items():
         if (most := max(stream.layers, stream.iterations or 0)) > MOST_STEPS:
             raise CheckpointError(
-                f"{place}: the stream {name} has {most} layers or iterations; expected at most {MOST_STEPS}. Take "
-                "the original file, or fewer steps"
+                f"{location}: the stream {name} has {most} layers or iterations; expected at most {MOST_STEPS}. "
+                "Take the original file, or fewer steps"
             )
 
 

@@ -53,34 +53,34 @@ class Outline:
 
 
 def outline_of(
-    name: str, load: Any, place: str | None, dtype: str | None, options: Mapping[str, Any]
+    name: str, load: Any, location: str | None, dtype: str | None, options: Mapping[str, Any]
 ) -> Outline | None:
-    """The outline of the checkpoint `place`; None where its configuration is not here.
+    """The outline of the checkpoint at `location`; None where its configuration is not here.
 
     name: of the family. load: its loader. options: as the loader gets them. No network is asked and no weights are
     read. Raises what loading raises for a checkpoint in a folder.
     """
-    folder = _folder(place)
-    if place is None or folder is None:
+    folder = _folder(location)
+    if location is None or folder is None:
         return None
-    complete = is_complete(place)
-    key = (name, place, dtype, repr(sorted(options.items())), complete, file_state(folder))
+    complete = is_complete(location)
+    key = (name, location, dtype, repr(sorted(options.items())), complete, file_state(folder))
     if key in _OUTLINES:
         return _OUTLINES[key]
-    outline = _built(load, place, dtype, options, complete)
+    outline = _built(load, location, dtype, options, complete)
     if outline.model is not None:  # what another repository lacks may arrive
         _OUTLINES[key] = outline
     return outline
 
 
-def _built(load: Any, place: str, dtype: str | None, options: Mapping[str, Any], complete: bool) -> Outline:
+def _built(load: Any, location: str, dtype: str | None, options: Mapping[str, Any], complete: bool) -> Outline:
     from probe_kit.models.sizes_only import sizes_only
 
     try:
         with without_network(), sizes_only():
-            return Outline(load(place, "meta", dtype, True, **options), complete=complete)
+            return Outline(load(location, "meta", dtype, True, **options), complete=complete)
     except ProbeKitError as error:
-        if not is_on_hub(place) and not _lacks_repository(error):
+        if not is_on_hub(location) and not _lacks_repository(error):
             raise
         return Outline(None, str(error), complete)
     except Exception as error:  # noqa: BLE001 - a network may need numbers while it is built
@@ -96,47 +96,47 @@ def _lacks_repository(error: BaseException | None) -> bool:
     return False
 
 
-def is_configured(place: str | None) -> bool:
+def is_configured(location: str | None) -> bool:
     """Whether the configuration of a checkpoint is in a folder or in the hub's cache. Asks no network."""
-    return _folder(place) is not None
+    return _folder(location) is not None
 
 
-def _folder(place: str | None) -> Path | None:
-    """Where the configuration of a checkpoint is; None where it is not here."""
-    folder = None if place is None else _local(place)
-    if place is None or folder is None:
+def _folder(location: str | None) -> Path | None:
+    """The folder with the configuration of a checkpoint; None where it is not here."""
+    folder = None if location is None else _local(location)
+    if location is None or folder is None:
         return None
-    if not is_on_hub(place):
+    if not is_on_hub(location):
         return folder if folder.exists() else None
     return folder if has_configuration(folder) or (folder / ADAPTER_FILE).is_file() else None
 
 
-def _local(place: str) -> Path | None:
+def _local(location: str) -> Path | None:
     """The folder that a path names, or that the hub's cache has of a hub id; None where it has nothing."""
-    return cached_folder(place) if is_on_hub(place) else Path(place).expanduser()
+    return cached_folder(location) if is_on_hub(location) else Path(location).expanduser()
 
 
-def is_complete(place: str) -> bool:
+def is_complete(location: str) -> bool:
     """Whether a checkpoint with its weights, and those of an adapter's base, is here. Asks no network."""
-    folder = _local(place)
+    folder = _local(location)
     if folder is None:
         return False
     if (base := _base(folder)) is None:
-        return _has_weights(place)
+        return _has_weights(location)
     return any((folder / name).is_file() for name in ADAPTER_WEIGHTS) and _has_weights(base)
 
 
-def _has_weights(place: str) -> bool:
+def _has_weights(location: str) -> bool:
     """Whether the hub's cache has the weights of a hub id; those of a path are left to its loading."""
-    if not is_on_hub(place):
+    if not is_on_hub(location):
         return True
-    folder = cached_folder(place)
+    folder = cached_folder(location)
     return folder is not None and not missing_weights(folder)
 
 
-def bytes_to_fetch(place: str) -> int | None:
+def bytes_to_fetch(location: str) -> int | None:
     """Bytes of the weights that the cache lacks, of an adapter its base's; None where no index says it."""
-    folder = _local(place)
+    folder = _local(location)
     if folder is not None and (base := _base(folder)) is not None:
         folder = _local(base)
     return None if folder is None else missing_bytes(folder)
@@ -148,8 +148,8 @@ def _base(folder: Path) -> str | None:
     It is never an adapter itself: loading refuses such a base.
     """
     try:
-        named = str(load_json(folder / ADAPTER_FILE)["base_model_name_or_path"])
+        base = str(load_json(folder / ADAPTER_FILE)["base_model_name_or_path"])
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    beside = folder / named
-    return str(beside) if beside.is_dir() else named
+    sibling = folder / base
+    return str(sibling) if sibling.is_dir() else base

@@ -55,11 +55,11 @@ def known_families() -> dict[str, Family]:
     Imports the modules of all of them, of which some import torch; `get_family` imports one. A family that cannot
     be loaded is left out with a BrokenFamilyWarning that says what to change.
     """
-    found = dict(own_families())
+    families = dict(own_families())
     for name in third_party_families():
         if (family := get_family(name)) is not None:
-            found[name] = family
-    return found
+            families[name] = family
+    return families
 
 
 @cache
@@ -101,8 +101,8 @@ def _summary(entry: EntryPoint) -> str:
     package = entry.dist
     if package is None:
         return entry.value
-    said = package.metadata.get("Summary")
-    return f"{said} ({package.name})" if said else f"of the package {package.name}"
+    summary = package.metadata.get("Summary")
+    return f"{summary} ({package.name})" if summary else f"of the package {package.name}"
 
 
 def entry_module(name: str) -> str | None:
@@ -123,14 +123,14 @@ def get_family(name: str) -> Family | None:
         return None
 
 
-def find_family(name: str, others: tuple[str, ...] = ()) -> Family:
-    """The family called `name`. `others` are further names to suggest if there is none.
+def find_family(name: str, suggestions: tuple[str, ...] = ()) -> Family:
+    """The family called `name`. suggestions: further names to suggest if there is none.
 
     Raises UnknownModelError if there is none, or if it cannot be loaded.
     """
     if (family := _get(name)) is not None:
         return family
-    names = [*family_names(), *others]
+    names = [*family_names(), *suggestions]
     near = get_close_matches(name, names, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     raise UnknownModelError(f"unknown model {name!r}; known: {', '.join(names)}.{hint}")

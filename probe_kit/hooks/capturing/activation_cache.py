@@ -25,10 +25,10 @@ class ActivationCache(Mapping[Site, Tensor]):
 
     def __getitem__(self, site: Site | str) -> Tensor:
         """Raises UnknownSiteError for a site that was not captured or a name that is none."""
-        found = self._kept.get(Site.parse(site) if isinstance(site, str) else site)
-        if found is None:
+        activation = self._kept.get(Site.parse(site) if isinstance(site, str) else site)
+        if activation is None:
             raise UnknownSiteError(f"{site} was not captured; the tape holds {self._held() or 'nothing yet'}")
-        return found
+        return activation
 
     def __iter__(self) -> Iterator[Site]:
         return iter(self._kept)
@@ -81,16 +81,16 @@ class ActivationCache(Mapping[Site, Tensor]):
 
     def _streams(self) -> list[tuple[str, str, int, int, tuple[int, ...], str]]:
         """Per stream and quantity: layers, iterations (0: none), shape of a site, dtype and device."""
-        found: dict[tuple[str, str], list[Site]] = {}
+        by_stream: dict[tuple[str, str], list[Site]] = {}
         for site in self._kept:
-            found.setdefault((site.stream, site.quantity), []).append(site)
+            by_stream.setdefault((site.stream, site.quantity), []).append(site)
         return [
             (
                 stream, quantity, len({site.layer for site in sites}),
                 len({site.iteration for site in sites} - {None}), tuple(self._kept[sites[0]].shape),
                 f"{str(self._kept[sites[0]].dtype).removeprefix('torch.')} on {self._kept[sites[0]].device}",
             )
-            for (stream, quantity), sites in found.items()
+            for (stream, quantity), sites in by_stream.items()
         ]  # fmt: skip
 
     def _held(self) -> str:

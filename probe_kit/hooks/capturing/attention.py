@@ -48,8 +48,8 @@ class AttentionMass:
                     f"{tokens.shape[-1]} tokens are asked for; attention lies on {mass.shape[2]}. Take the roles "
                     "of the observations that were acted on"
                 )
-            chosen = tokens if tokens.ndim == 1 else tokens[:, None]
-            shares[read] = np.where(chosen, mass, 0).sum(axis=2, dtype=np.float64)
+            mask = tokens if tokens.ndim == 1 else tokens[:, None]
+            shares[read] = np.where(mask, mass, 0).sum(axis=2, dtype=np.float64)
         return shares
 
     def on(self, tokens: NDArray[np.bool_]) -> dict[Read, NDArray[np.float64]]:
@@ -68,16 +68,16 @@ def capture_attention(policy: Policy) -> Iterator[AttentionMass]:
     Raises UnsupportedInterventionError for a family without attention recording, CaptureError if none occurred.
     """
     policy.interventions.check("attention", policy.card.family)
-    found = AttentionMass()
+    mass = AttentionMass()
 
     def note(block: int, iteration: int, weights: Tensor) -> None:
-        if (block, iteration) in found.by_head:
+        if (block, iteration) in mass.by_head:
             raise CaptureError(
                 f"{policy.card.family} recorded block {block} twice at iteration {iteration}; act once per context"
             )
-        found.by_head[block, iteration] = weights.detach().float().mean(dim=2).cpu().numpy()
+        mass.by_head[block, iteration] = weights.detach().float().mean(dim=2).cpu().numpy()
 
     with policy.record_attention(note):
-        yield found
-    if not found.by_head:
+        yield mass
+    if not mass.by_head:
         raise CaptureError(f"{policy.card.family} paid no attention in this context; act once inside of it")

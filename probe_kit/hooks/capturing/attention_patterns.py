@@ -45,8 +45,8 @@ def capture_patterns(
     beyond `most_bytes`, CaptureError for a pattern that does not give what the heads read, and what `capture`
     raises.
     """
-    wanted = tuple(dict.fromkeys(sites))
-    if other := [site for site in wanted if site.quantity != HEADS]:
+    head_sites = tuple(dict.fromkeys(sites))
+    if other := [site for site in head_sites if site.quantity != HEADS]:
         raise UnknownSiteError(
             f"{other[0]} has no attention pattern; expected sites of the quantity heads, such as "
             f"{other[0].stream}.{other[0].layer:02d}.{HEADS}"
@@ -59,12 +59,12 @@ def capture_patterns(
         used += pattern.numel() * 4
         if used > most_bytes:
             raise UsageError(
-                f"attention patterns of {len(wanted)} sites take more than {most_bytes / 1e9:.2f} GB, with "
+                f"attention patterns of {len(head_sites)} sites take more than {most_bytes / 1e9:.2f} GB, with "
                 f"{pattern.numel() * 4 / 1e6:.1f} MB at {site}. Capture fewer sites, or raise most_bytes"
             )
         return pattern.cpu()
 
-    with calls, capture(model, wanted, reduce=keep) as patterns:
+    with calls, capture(model, head_sites, reduce=keep) as patterns:
         yield patterns
 
 
@@ -77,19 +77,19 @@ def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Sit
     """
     stream, backbone = model.stream_of(site), first_of("backbone", model.streams.values())
     acting = first_of("action", model.streams.values())
-    own = roles.get(stream.name)
-    if own is None or backbone is None:
+    stream_roles = roles.get(stream.name)
+    if stream_roles is None or backbone is None:
         raise RolesMismatchError(f"the tokens of {stream.name} have no roles; those of {', '.join(roles)} have")
-    before, behind = roles[backbone], own
+    before, behind = roles[backbone], stream_roles
     if stream.name == backbone:
-        behind = roles.get(acting or "", own)
-    elif len(own[0]) == tokens and model.prompt_kv is None:
-        return list(own)
+        behind = roles.get(acting or "", stream_roles)
+    elif len(stream_roles[0]) == tokens and model.prompt_kv is None:
+        return list(stream_roles)
     joined = [_joined(first, last, tokens) for first, last in zip(before, behind, strict=True)]
     if any(row is None for row in joined):
         raise RolesMismatchError(
             f"{site} attends to {tokens} positions; {backbone} has {len(before[0])} and {stream.name} "
-            f"{len(own[0])}. Take the roles of the observations that were inferred"
+            f"{len(stream_roles[0])}. Take the roles of the observations that were inferred"
         )
     return [row for row in joined if row is not None]
 
@@ -97,10 +97,10 @@ def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Sit
 def _joined(before: Roles, behind: Roles, tokens: int) -> Roles | None:
     """`before`, and `behind` once or, of a single position, as often as there is room; None if they do not fit."""
     labels = _labels(before)
-    missing, own = tokens - len(labels), _labels(behind)
-    if missing < 0 or (missing not in (0, len(own)) and len(own) != 1):
+    missing, repeated = tokens - len(labels), _labels(behind)
+    if missing < 0 or (missing not in (0, len(repeated)) and len(repeated) != 1):
         return None
-    return Roles.from_labels(labels + (own if len(own) == missing else own * missing))
+    return Roles.from_labels(labels + (repeated if len(repeated) == missing else repeated * missing))
 
 
 def _labels(roles: Roles) -> list[str]:
@@ -131,12 +131,12 @@ class _AttentionCalls(TorchFunctionMode):
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         del types
-        given = kwargs or {}
-        result = func(*args, **given)
+        keywords = kwargs or {}
+        result = func(*args, **keywords)
         if self.is_paused:
             return result
         if func is _FUSED:
-            self.last = _fused(*args, **given)
+            self.last = _fused(*args, **keywords)
         elif func in _SOFTMAX and result.dim() == 4:
             self._shares = result
         elif func in _MATMUL and self._shares is not None and _is_reading(self._shares, *args[:2]):
@@ -168,11 +168,11 @@ def _fused(
         keys = _of_every_head(key, query.shape[1]).float()
         factor = query.shape[-1] ** -0.5 if scale is None else scale
         logits = query.float() @ keys.transpose(2, 3) * factor
-        seen = attn_mask
+        mask = attn_mask
         if is_causal:
-            seen = torch.ones(logits.shape[2:], dtype=torch.bool, device=logits.device).tril()
-        if seen is not None:
-            logits = logits.masked_fill(~seen, -torch.inf) if seen.dtype == torch.bool else logits + seen
+            mask = torch.ones(logits.shape[2:], dtype=torch.bool, device=logits.device).tril()
+        if mask is not None:
+            logits = logits.masked_fill(~mask, -torch.inf) if mask.dtype == torch.bool else logits + mask
         return functional.softmax(logits, dim=-1).nan_to_num(0.0)  # a position that attends to nothing
 
     return _Attention(weights, value)
@@ -194,23 +194,26 @@ def _pattern_of(model: Model, site: Site, calls: _AttentionCalls, read: Tensor) 
     calls.is_paused = True
     weights = calls.last.weights()
     values = _of_every_head(calls.last.values, weights.shape[1]).float()
-    given = tap.rows.of((weights @ values.to(weights.device)).transpose(1, 2).flatten(2))[:, tap.tokens]
+    computed = tap.rows.of((weights @ values.to(weights.device)).transpose(1, 2).flatten(2))[:, tap.tokens]
     calls.is_paused = False
-    _check_reading(site, stream, weights.shape[1], given, read)
+    _check_reading(site, stream, weights.shape[1], computed, read)
     return tap.rows.of(weights)[:, :, tap.tokens]
 
 
-def _check_reading(site: Site, stream: Stream, heads: int, given: Tensor, read: Tensor) -> None:
+def _check_reading(site: Site, stream: Stream, heads: int, computed: Tensor, read: Tensor) -> None:
     """Raise CaptureError unless what a pattern gives is what the heads read."""
-    if heads == stream.heads and given.shape == read.shape:
+    if heads == stream.heads and computed.shape == read.shape:
         limit = TOLERANCE.get(read.dtype, TOLERANCE[torch.float32]) * float(read.abs().max())
-        apart = float((given - read.float().nan_to_num(0.0)).abs().max())
+        apart = float((computed - read.float().nan_to_num(0.0)).abs().max())
         if apart <= limit:
             return
-        seen, expected = f"is off by {apart:.3g}", f"at most {limit:.3g}"
+        actual, expected = f"is off by {apart:.3g}", f"at most {limit:.3g}"
     else:
-        seen, expected = f"has {heads} heads and {tuple(given.shape)}", f"{stream.heads} and {tuple(read.shape)}"
+        actual, expected = (
+            f"has {heads} heads and {tuple(computed.shape)}",
+            f"{stream.heads} and {tuple(read.shape)}",
+        )
     raise CaptureError(
-        f"the attention in front of {site} does not give what its heads read: it {seen}; expected {expected}. The "
-        "block computes something between its attention and its output projection; correct the tap of `heads`"
+        f"the attention in front of {site} does not give what its heads read: it {actual}; expected {expected}. "
+        "The block computes something between its attention and its output projection; correct the tap of `heads`"
     )

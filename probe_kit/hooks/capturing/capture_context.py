@@ -72,8 +72,8 @@ def edit(model: Model, edits: Mapping[Site, EditFunction]) -> Iterator[None]:
 
     def write(site: Site, tap: Tap, passing: Tensor) -> None:
         activation = tap.select(passing)
-        own = activation.detach() if activation.requires_grad else activation
-        new = edits[site](own.clone())
+        detached = activation.detach() if activation.requires_grad else activation
+        new = edits[site](detached.clone())
         if new.shape != activation.shape or new.dtype != activation.dtype:
             raise CaptureError(
                 f"the edit of {site} returned {new.dtype} {tuple(new.shape)}; "
@@ -161,8 +161,8 @@ class _CountingHook:
 
 def _check_non_finite(tape: ActivationCache) -> None:
     """One question to the device for all sites, not one each: every answer waits for what it has in hand."""
-    finite = [torch.isfinite(kept).all() for kept in tape._kept.values()]
-    if not finite or bool(torch.stack([one.to(finite[0].device) for one in finite]).all()):
+    finite = [torch.isfinite(activation).all() for activation in tape._kept.values()]
+    if not finite or bool(torch.stack([flag.to(finite[0].device) for flag in finite]).all()):
         return
     for site, good in zip(tape._kept, finite, strict=True):
         if not good:

@@ -55,6 +55,6 @@ def reason_of_change(infer: Infer, plain: NDArray[np.float32], infer_captured: I
     )
 
 
-def same_bits(one: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
+def same_bits(array: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
     """Equal shape, type and bytes; NaN equals itself."""
-    return one.shape == other.shape and one.dtype == other.dtype and one.tobytes() == other.tobytes()
+    return array.shape == other.shape and array.dtype == other.dtype and array.tobytes() == other.tobytes()

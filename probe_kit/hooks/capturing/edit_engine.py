@@ -47,23 +47,23 @@ class LogEntry:
 
 @dataclass
 class EditLog:
-    """What was changed while the context was open, in the order in which it fired; complete when it is left."""
+    """A record of what was changed while the context was open, in order of firing; complete when it is left."""
 
     entries: list[LogEntry] = field(default_factory=list)
 
     @classmethod
     def sum(cls, logs: Iterable["EditLog"]) -> "EditLog":
-        """Of several inferences, or of several streams of one."""
+        """The log of several inferences, or of several streams of one."""
         return cls([entry for log in logs for entry in log.entries])
 
     @property
     def fires(self) -> int:
-        """How often an edited site fired."""
+        """The number of firings of edited sites."""
         return len(self.entries)
 
     @property
     def no_op_fires(self) -> int:
-        """Of these, the fires that moved nothing."""
+        """The number of firings that moved nothing."""
         return sum(entry.largest == 0 for entry in self.entries)
 
     def row(self) -> NDArray[np.float64]:
@@ -95,42 +95,44 @@ def apply_patches(
     from probe_kit.hooks.capturing.capture_context import edit
 
     log, active = EditLog(), _ActiveEdits()
-    with edit(model, {site: partial(active.apply, site, own) for site, own in changes.items()}):
+    with edit(model, {site: partial(active.apply, site, site_changes) for site, site_changes in changes.items()}):
         yield log
     log.entries += active.measured()
 
 
 @contextmanager
 def apply_edits(
-    model: "Model", edits: Sequence[Edit], seen: Sequence[Observation], vectors: Vectors | None = None
+    model: "Model", edits: Sequence[Edit], observations: Sequence[Observation], vectors: Vectors | None = None
 ) -> Iterator[EditLog]:
-    """Apply `edits` while the model runs once on `seen`; several at one site act in their order.
+    """Apply `edits` while the model runs once on `observations`; several at one site act in their order.
 
     Raises UsageError for a vector that is missing, has another hash or does not fit, UnknownSiteError for a site
     without roles, and what `hooks.edit` raises.
     """
-    roles, given = model.token_roles(seen), dict(vectors or {})
+    roles, arrays = model.token_roles(observations), dict(vectors or {})
     changes: dict[Site, list[tuple[TokenSelection, TokenEdit]]] = defaultdict(list)
-    for own in edits:
-        vector = _vector(own, given)
-        for site in own.sites:
+    for declared in edits:
+        vector = _vector(declared, arrays)
+        for site in declared.sites:
             model.stream_of(site)
             if site.stream not in roles:
                 raise UsageError(f"{site} has no token roles, so that no token can be chosen in it")
-            mask = np.stack([_tokens(row, own.roles) for row in roles[site.stream]])
+            mask = np.stack([_tokens(row, declared.roles) for row in roles[site.stream]])
             if mask.any():
                 tokens = TokenSelection.of(mask.ravel(), model.card.device)
-                changes[site].append((tokens, DeclaredEdit(own, vector, mask.shape[1])))
+                changes[site].append((tokens, DeclaredEdit(declared, vector, mask.shape[1])))
     with apply_patches(model, changes) as log:
         yield log
 
 
-def _vector(own: Edit, given: Vectors) -> NDArray[np.float32] | None:
-    if own.kind == "zero":
+def _vector(declared: Edit, arrays: Vectors) -> NDArray[np.float32] | None:
+    if declared.kind == "zero":
         return None
-    if own.vector not in given or vector_hash(given[own.vector]) != own.vector:
-        raise UsageError(f"the edit {own.kind!r} names vector {own.vector[:12]}; no array of that hash is given")
-    return np.asarray(given[own.vector], np.float32)
+    if declared.vector not in arrays or vector_hash(arrays[declared.vector]) != declared.vector:
+        raise UsageError(
+            f"the edit {declared.kind!r} names vector {declared.vector[:12]}; no array of that hash is given"
+        )
+    return np.asarray(arrays[declared.vector], np.float32)
 
 
 def _tokens(row: "Roles", roles: tuple[str, ...] | None) -> NDArray[np.bool_]:
@@ -183,7 +185,7 @@ class _ActiveEdits:
         by_shape: dict[torch.Size, list[int]] = {}
         for at, (_, before, _) in enumerate(self.fired):
             by_shape.setdefault(before.shape, []).append(at)
-        found: dict[int, LogEntry] = {}
+        entries: dict[int, LogEntry] = {}
         for firings in by_shape.values():
             both = torch.cat([tensor for at in firings for tensor in self.fired[at][1:]]).float()
             both[1::2].sub_(both[::2])
@@ -191,5 +193,5 @@ class _ActiveEdits:
             for at, before, moved in zip(firings, norms[::2], norms[1::2], strict=True):
                 count = len(moved)
                 entry = str(self.fired[at][0]), count, sum(before) / count, sum(moved) / count, max(moved)
-                found[at] = LogEntry(*entry)
-        return [found[at] for at in range(len(self.fired))]
+                entries[at] = LogEntry(*entry)
+        return [entries[at] for at in range(len(self.fired))]

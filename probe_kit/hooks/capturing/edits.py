@@ -50,7 +50,7 @@ class Edit:
             raise UsageError(f"the edit {self.kind!r} has strength {self.strength}; expected a finite number")
 
     def to_json(self) -> dict[str, Any]:
-        """As part of a run's identity."""
+        """Return plain values, as part of a run's identity."""
         return {**asdict(self), "sites": [str(site) for site in self.sites], "roles": list(self.roles or ())}
 
 

@@ -25,7 +25,11 @@ Metric = Callable[[Tensor], Tensor]
 
 
 def gradients_at(
-    policy: Policy, seen: Sequence[Observation], seeds: Sequence[int], sites: Iterable[Site], metric: Metric
+    policy: Policy,
+    observations: Sequence[Observation],
+    seeds: Sequence[int],
+    sites: Iterable[Site],
+    metric: Metric,
 ) -> tuple[float, ActivationCache]:
     """The metric of one inference, and its gradient at every site: (B, T, D) float32, zero where nothing reads it.
 
@@ -34,7 +38,7 @@ def gradients_at(
     """
     policy.interventions.check("gradients", policy.card.family)
     with flowing_tensors(policy, sites) as flowing:
-        value = metric(policy.differentiable(seen, seeds))
+        value = metric(policy.differentiable(observations, seeds))
     return float(value.detach()), flowing.gradients_of(value)
 
 
@@ -46,14 +50,14 @@ class FlowingTensors:
 
     def gradients_of(self, value: Tensor) -> ActivationCache:
         """The gradient of a number at every site. Frees the graph."""
-        found = ActivationCache()
+        gradients = ActivationCache()
         tensors = [tensor for _, tensor in self.passed.values()]
         slopes: Sequence[Tensor | None] = [None] * len(tensors)
         if value.requires_grad:
             slopes = torch.autograd.grad(value, tensors, allow_unused=True)
         for (site, (tap, tensor)), slope in zip(self.passed.items(), slopes, strict=True):
-            found._kept[site] = tap.select(torch.zeros_like(tensor) if slope is None else slope).float()
-        return found
+            gradients._kept[site] = tap.select(torch.zeros_like(tensor) if slope is None else slope).float()
+        return gradients
 
 
 @contextmanager
@@ -68,11 +72,11 @@ def flowing_tensors(model: Model, sites: Iterable[Site]) -> Iterator[FlowingTens
 
     def keep(site: Site, tap: Tap, passing: Tensor) -> Tensor | None:
         is_copied = tap.end == "output" or site.stream == KV_STREAM
-        own = passing.view_as(passing) if is_copied and passing.requires_grad else passing
-        if not own.requires_grad:
-            own.requires_grad_()
-        flowing.passed[site] = (tap, own)
-        return own.clone() if is_copied else None
+        tensor = passing.view_as(passing) if is_copied and passing.requires_grad else passing
+        if not tensor.requires_grad:
+            tensor.requires_grad_()
+        flowing.passed[site] = (tap, tensor)
+        return tensor.clone() if is_copied else None
 
     with ExitStack() as stack:
         hooks = _attach(model, sites, keep, stack)
@@ -83,7 +87,7 @@ def flowing_tensors(model: Model, sites: Iterable[Site]) -> Iterator[FlowingTens
 
 @contextmanager
 def frozen(network: nn.Module) -> Iterator[None]:
-    """With a graph of activations alone: no weight asks for its gradient."""
+    """Run the body with a graph of activations alone: no weight asks for its gradient."""
     trained = [weight for weight in network.parameters() if weight.requires_grad]
     for weight in trained:
         weight.requires_grad_(False)

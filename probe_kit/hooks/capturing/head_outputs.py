@@ -1,4 +1,4 @@
-"""What every attention head of a block adds, each through the block's own output projection."""
+"""The contributions of single attention heads, each through the block's own output projection."""
 
 import torch
 from torch import Tensor
@@ -16,11 +16,13 @@ def project_heads(model: Model, cache: ActivationCache, site: Site | str) -> Ten
     the site `attention`, where the family has no norm, scale or gate behind the projection. Raises
     UnknownSiteError for another quantity, or a site that was not captured.
     """
-    own = Site.parse(site) if isinstance(site, str) else site
-    if own.quantity != HEADS:
-        raise UnknownSiteError(f"{own} is not of heads; expected {own.stream}.{own.layer:02d}.{HEADS}")
-    count, projection = model.stream_of(own).heads, model.tap(own).module
-    passing = cache[own]
+    heads_site = Site.parse(site) if isinstance(site, str) else site
+    if heads_site.quantity != HEADS:
+        raise UnknownSiteError(
+            f"{heads_site} is not of heads; expected {heads_site.stream}.{heads_site.layer:02d}.{HEADS}"
+        )
+    count, projection = model.stream_of(heads_site).heads, model.tap(heads_site).module
+    passing = cache[heads_site]
     read = passing.view(*passing.shape[:2], count, -1)
     alone = torch.zeros(count, *read.shape, dtype=read.dtype, device=read.device)
     for head in range(count):

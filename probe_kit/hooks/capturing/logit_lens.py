@@ -21,7 +21,7 @@ from probe_kit.hooks.contract.sites import Site
 
 @dataclass(frozen=True)
 class LogitLens:
-    """What the layers of one stream would put out.
+    """The tokens that the layers of one stream would put out.
 
     layers: (L,) of the residuals; the last one is the output of the model, if its last residual was captured.
     ids, logits: (L, B, K) of tokens; the same tokens in every layer if they were given, else the likeliest first.
@@ -65,23 +65,23 @@ def logit_lens(
     rows = [unembedding.logits(cache[site][:, [at]])[:, 0].float().cpu().numpy() for site in sites]
     every = np.stack(rows)
     if ids is None:
-        chosen = np.argsort(-every, axis=-1, kind="stable")[..., :k]
+        token_ids = np.argsort(-every, axis=-1, kind="stable")[..., :k]
     elif ids and min(ids) >= 0 and max(ids) < every.shape[-1]:
-        chosen = np.broadcast_to(np.array(ids, np.int64), (*every.shape[:2], len(ids)))
+        token_ids = np.broadcast_to(np.array(ids, np.int64), (*every.shape[:2], len(ids)))
     else:
         raise UsageError(f"ids are {list(ids)}; expected one or more from 0 to {every.shape[-1] - 1}")
-    return LogitLens(tuple(site.layer for site in sites), chosen, np.take_along_axis(every, chosen, axis=-1))
+    return LogitLens(tuple(site.layer for site in sites), token_ids, np.take_along_axis(every, token_ids, axis=-1))
 
 
 def _residuals(cache: ActivationCache, stream: str, iteration: int | None) -> list[Site]:
     """The captured residuals of one iteration, shallow before deep."""
-    there = [site for site in cache if (site.stream, site.quantity) == (stream, "residual")]
-    steps = sorted({site.iteration for site in there if site.iteration is not None})
-    wanted = steps[0] if iteration is None and steps else iteration
-    found = sorted(site for site in there if site.iteration == wanted)
-    if not found:
+    residuals = [site for site in cache if (site.stream, site.quantity) == (stream, "residual")]
+    steps = sorted({site.iteration for site in residuals if site.iteration is not None})
+    step = steps[0] if iteration is None and steps else iteration
+    at_step = sorted(site for site in residuals if site.iteration == step)
+    if not at_step:
         raise UnknownSiteError(
-            f"no residual of {stream}{'' if wanted is None else f' at iteration {wanted}'} was captured; capture "
+            f"no residual of {stream}{'' if step is None else f' at iteration {step}'} was captured; capture "
             f"model.streams[{stream!r}].sites() first"
         )
-    return found
+    return at_step

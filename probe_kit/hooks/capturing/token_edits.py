@@ -1,4 +1,4 @@
-"""What becomes of the selected tokens of a site: token edits, for the edit engine."""
+"""Token edits: the changes of selected tokens of a site, for the edit engine."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, Self, Union
@@ -32,12 +32,12 @@ class TokenSelection:
         """mask: (T,). device: of the stream."""
         import torch
 
-        found = np.flatnonzero(mask)
-        if found.size == mask.size:
+        positions = np.flatnonzero(mask)
+        if positions.size == mask.size:
             return cls(mask.size, EVERY)
-        if found.size and found.size == found[-1] + 1 - found[0]:
-            return cls(mask.size, slice(int(found[0]), int(found[-1]) + 1))
-        return cls(mask.size, torch.from_numpy(found).to(device))
+        if positions.size and positions.size == positions[-1] + 1 - positions[0]:
+            return cls(mask.size, slice(int(positions[0]), int(positions[-1]) + 1))
+        return cls(mask.size, torch.from_numpy(positions).to(device))
 
 
 def selected(activation: "Tensor", where: TokenIndex) -> "Tensor":
@@ -48,22 +48,22 @@ def selected(activation: "Tensor", where: TokenIndex) -> "Tensor":
 
 
 class TokenEdit(Protocol):
-    """What becomes of the tokens of a site."""
+    """A change of the tokens of a site."""
 
-    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
-        """(1, T', D) float32 tokens in, as many out, and `own` left as it is. where: their positions."""
+    def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
+        """Return (1, T', D) of as many float32 tokens, and leave `activation` as it is. where: their positions."""
 
 
 @dataclass(frozen=True)
 class ReplaceWith:
-    """With the same tokens of another inference."""
+    """Replace tokens with the same tokens of another inference."""
 
     source: "ActivationCache"
     tokens: int
 
-    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
+    def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
         """The source's."""
-        del own
+        del activation
         other = self.source[site]
         if other.shape[1] != self.tokens:
             raise CaptureError(
@@ -74,25 +74,25 @@ class ReplaceWith:
 
 @dataclass(frozen=True)
 class ReplaceInSubspace:
-    """With another inference's component within a subspace; the rest stays. basis: (K, D) orthonormal.
+    """Replace the component within a subspace by another inference's. basis: (K, D) orthonormal.
 
-    rest: the other way round, with all but that component, which stays.
+    complement: the other way round: all but that component is replaced.
     """
 
     source: "ActivationCache"
     tokens: int
     basis: NDArray[np.float32]
-    rest: bool = False
+    complement: bool = False
 
-    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
-        """own + (source − own) P; with rest own + (source − own) (1 − P)."""
+    def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
+        """Return a + (source − a) P of the activation a; with complement, a + (source − a) (1 − P)."""
         import torch
 
-        apart = ReplaceWith(self.source, self.tokens)(site, own, where) - own
-        directions = torch.tensor(self.basis, device=own.device)
+        apart = ReplaceWith(self.source, self.tokens)(site, activation, where) - activation
+        directions = torch.tensor(self.basis, device=activation.device)
         within = (apart @ directions.T) @ directions
-        found: Tensor = own + (apart - within if self.rest else within)
-        return found
+        edited: Tensor = activation + (apart - within if self.complement else within)
+        return edited
 
 
 @dataclass(frozen=True)
@@ -103,13 +103,13 @@ class OfOneHead:
     head: int
     heads: int
 
-    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
-        """own, with the edit's result in the columns of the head."""
-        size = own.shape[-1] // self.heads
+    def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
+        """Return the activation with the edit's result in the columns of the head."""
+        size = activation.shape[-1] // self.heads
         columns = slice(self.head * size, (self.head + 1) * size)
-        found = own.clone()
-        found[..., columns] = self.change(site, own, where)[..., columns]
-        return found
+        edited = activation.clone()
+        edited[..., columns] = self.change(site, activation, where)[..., columns]
+        return edited
 
 
 @dataclass(frozen=True)
@@ -118,64 +118,64 @@ class AddVector:
 
     vector: NDArray[np.float32]
 
-    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
-        """own + vector. Raises CaptureError for more tokens than vectors."""
+    def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
+        """Return the activation plus the vector. Raises CaptureError for more tokens than vectors."""
         import torch
 
         del site, where
-        vector, tokens = self.vector, own.shape[1]
+        vector, tokens = self.vector, activation.shape[1]
         if vector.ndim == 2:
             if len(vector) < tokens:
                 raise CaptureError(f"there are {tokens} tokens, and vectors for {len(vector)}")
             vector = vector[:tokens]
-        found: Tensor = own + torch.tensor(vector, device=own.device)
-        return found
+        edited: Tensor = activation + torch.tensor(vector, device=activation.device)
+        return edited
 
 
 @dataclass(frozen=True)
 class Identity:
-    """As they are: written back like any other edit."""
+    """Leave tokens as they are: written back like any other edit."""
 
-    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
-        """own."""
+    def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
+        """Return the activation."""
         del site, where
-        return own
+        return activation
 
 
 @dataclass(frozen=True)
 class DeclaredEdit:
-    """What an `Edit` says. vector: (D,) or (T, D), None for `zero`. tokens: T, of every row."""
+    """The change that an `Edit` declares. vector: (D,) or (T, D), None for `zero`. tokens: T, of every row."""
 
     edit: Edit
     vector: NDArray[np.float32] | None
     tokens: int
 
-    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
+    def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
         """Raises UsageError for a vector of another shape."""
         import torch
 
         if self.vector is None:
-            return torch.zeros_like(own)
+            return torch.zeros_like(activation)
         strength, is_source = self.edit.strength, self.edit.kind == "replace"
-        fitting = (self.tokens, own.shape[2]) if is_source else (own.shape[2],)
+        fitting = (self.tokens, activation.shape[2]) if is_source else (activation.shape[2],)
         if self.vector.shape != fitting:
             raise UsageError(f"the vector of the edit of {site} has shape {self.vector.shape}; expected {fitting}")
-        other = torch.tensor(self.vector, device=own.device)
+        other = torch.tensor(self.vector, device=activation.device)
         if is_source:
-            other = self._of_rows(other, own, where)
+            other = self._of_rows(other, activation, where)
             # All the way is the source itself, bit for bit, and none of the way what was there.
-            return other if strength == 1 else own + strength * (other - own)
+            return other if strength == 1 else activation + strength * (other - activation)
         if self.edit.kind == "add":
-            return own + strength * other
+            return activation + strength * other
         direction = other / other.norm()
-        removed: Tensor = own - strength * (own @ direction)[..., None] * direction
+        removed: Tensor = activation - strength * (activation @ direction)[..., None] * direction
         return removed
 
-    def _of_rows(self, other: "Tensor", own: "Tensor", where: TokenIndex) -> "Tensor":
+    def _of_rows(self, other: "Tensor", activation: "Tensor", where: TokenIndex) -> "Tensor":
         """(1, T', D): the source's tokens at positions that count through all rows of a batch."""
         import torch
 
         if isinstance(where, slice):
             first = where.start or 0
-            where = torch.arange(first, first + own.shape[1], device=other.device)
+            where = torch.arange(first, first + activation.shape[1], device=other.device)
         return other.index_select(0, where % self.tokens)[None]

@@ -76,22 +76,22 @@ def with_adapters_named(text: str) -> str:
 def base_folder_of(folder: Path, settings: Mapping[str, Any], patterns: Sequence[str] = PATTERNS) -> Path:
     """The folder of the base of the adapter in `folder`, with these settings; see `AdapterFiles.base_folder`."""
     base = str(settings["base_model_name_or_path"])
-    beside = folder / base
+    sibling = folder / base
     try:
-        place = beside.resolve() if beside.is_dir() else plain_folder(base, patterns)
+        base_folder = sibling.resolve() if sibling.is_dir() else plain_folder(base, patterns)
     except CheckpointError as error:
         raise CheckpointError(
             f"the LoRA adapter in {folder} was trained on {base!r}: {error}. "
             f"Correct base_model_name_or_path in its {ADAPTER_FILE}"
         ) from error
-    if place.resolve() == folder.resolve():
+    if base_folder.resolve() == folder.resolve():
         return folder
-    if (place / ADAPTER_FILE).is_file():
+    if (base_folder / ADAPTER_FILE).is_file():
         raise CheckpointError(
-            f"the base {place} of the LoRA adapter in {folder} is an adapter itself. Merge the base with "
+            f"the base {base_folder} of the LoRA adapter in {folder} is an adapter itself. Merge the base with "
             "peft first, and name the merged folder as base_model_name_or_path"
         )
-    return place
+    return base_folder
 
 
 def adapter_settings(file: Path) -> dict[str, Any]:
@@ -109,16 +109,16 @@ def adapter_in(folder: Path) -> AdapterFiles | None:
     """
     folder = _JOINED.get(str(folder), folder)
     file = folder / ADAPTER_FILE
-    found = next((folder / name for name in ADAPTER_WEIGHTS if (folder / name).is_file()), None)
+    weights = next((folder / name for name in ADAPTER_WEIGHTS if (folder / name).is_file()), None)
     if not file.is_file():
-        _check_no_traces(folder, found)
+        _check_no_traces(folder, weights)
         return None
     settings = adapter_settings(file)
-    if found is None:
+    if weights is None:
         raise CheckpointError(
             f"{folder} has {ADAPTER_FILE}, but neither {' nor '.join(ADAPTER_WEIGHTS)}. Download the adapter again"
         )
-    adapter = AdapterFiles(folder, settings, found)
+    adapter = AdapterFiles(folder, settings, weights)
     if not missing_weights(folder):
         _check_own_base(adapter)
     return adapter
@@ -153,8 +153,10 @@ def _check_settings(file: Path, settings: Mapping[str, Any]) -> None:
     if not settings.get("base_model_name_or_path"):
         raise CheckpointError(f"{file} does not say its base_model_name_or_path; add it")
     plain = {*SCALING, *_COPIES, *_NAMING, *_WITHOUT_EFFECT}
-    others = {name: value for name, value in settings.items() if name not in plain}
-    wrong = [f"{name}: {value!r}" for name, value in others.items() if value not in _INERT.get(name, _NOTHING)]
+    unexplained = {name: value for name, value in settings.items() if name not in plain}
+    wrong = [
+        f"{name}: {value!r}" for name, value in unexplained.items() if value not in _INERT.get(name, _NOTHING)
+    ]
     if wrong:
         raise CheckpointError(
             f"{file} says {', '.join(wrong)}, which a merge of low-rank factors does not repeat exactly. Merge "
@@ -164,8 +166,8 @@ def _check_settings(file: Path, settings: Mapping[str, Any]) -> None:
 
 def _check_own_base(adapter: AdapterFiles) -> None:
     """Raise CheckpointError unless the weights beside the adapter are the base that it names."""
-    beside = adapter.folder / adapter.base
-    if beside.is_dir() and beside.resolve() == adapter.folder.resolve():
+    base_folder = adapter.folder / adapter.base
+    if base_folder.is_dir() and base_folder.resolve() == adapter.folder.resolve():
         return
     raise CheckpointError(
         f"{adapter.folder} holds weights and a LoRA adapter of {adapter.base!r}: no file says whether these "

@@ -64,24 +64,24 @@ def without_revision(checkpoint: str | None) -> str | None:
 
 def pinned(checkpoint: str) -> str:
     """A hub id with the commit that the cache has of its revision; anything else as it is. Asks no network."""
-    named = hub_name(checkpoint) if is_on_hub(checkpoint) else None
-    snapshot = None if named is None else _snapshot(named)
+    parts = hub_name(checkpoint) if is_on_hub(checkpoint) else None
+    snapshot = None if parts is None else _snapshot(parts)
     return checkpoint if snapshot is None else f"{without_revision(checkpoint)}@{snapshot.name}"
 
 
 def cached_folder(checkpoint: str) -> Path | None:
-    """Where the cache of the hub has a hub id; None where it has nothing of it. Asks no network."""
-    named = hub_name(checkpoint) if is_on_hub(checkpoint) else None
-    snapshot = None if named is None else _snapshot(named)
-    if named is None or snapshot is None:
+    """The folder of a hub id in the hub's cache; None where it has nothing of it. Asks no network."""
+    parts = hub_name(checkpoint) if is_on_hub(checkpoint) else None
+    snapshot = None if parts is None else _snapshot(parts)
+    if parts is None or snapshot is None:
         return None
-    folder = snapshot / named.folder
+    folder = snapshot / parts.folder
     return folder if folder.is_dir() else None
 
 
-def _snapshot(named: HubName) -> Path | None:
+def _snapshot(parts: HubName) -> Path | None:
     """The cache's folder of a revision's commit, by which it is called; None where it has none."""
-    cache, commit = _cache_of(named.repository), named.revision or "main"
+    cache, commit = _cache_of(parts.repository), parts.revision or "main"
     snapshots = cache / "snapshots"
     if len(commit) != COMMIT_DIGITS or not (snapshots / commit).is_dir():
         ref = cache / "refs" / commit
@@ -128,38 +128,38 @@ def plain_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
 
 def _fetched(checkpoint: str, patterns: Sequence[str]) -> Path:
     """The folder of a hub id, of which the cache has a copy then. Raises CheckpointError."""
-    named = hub_name(checkpoint)
-    if named is None:
+    parts = hub_name(checkpoint)
+    if parts is None:
         raise CheckpointError(_not_here(checkpoint))
-    named = _with_pin(named)
+    parts = _with_pin(parts)
     why = unreachable()
-    place = _snapshot(named) if why else _downloaded(checkpoint, named, patterns)
-    if place is None:
+    snapshot = _snapshot(parts) if why else _downloaded(checkpoint, parts, patterns)
+    if snapshot is None:
         raise CheckpointError(
             _not_fetched(checkpoint, f"{why}; the cache has no copy", OFFLINE_WAY_OUT)
-        ) from NotCachedError(named.repository)
-    record_commit(named.repository, place.name)
-    folder = place / named.folder
+        ) from NotCachedError(parts.repository)
+    record_commit(parts.repository, snapshot.name)
+    folder = snapshot / parts.folder
     if not folder.is_dir():
         raise CheckpointError(
-            f"the repository {named.repository} has no folder {named.folder!r}; look its folders up on its page"
+            f"the repository {parts.repository} has no folder {parts.folder!r}; look its folders up on its page"
         )
     return folder
 
 
-def _with_pin(named: HubName) -> HubName:
+def _with_pin(parts: HubName) -> HubName:
     """A name at the commit that a repetition reads, unless it has a revision."""
-    return named if named.revision else named._replace(revision=pinned_commit(named.repository))
+    return parts if parts.revision else parts._replace(revision=pinned_commit(parts.repository))
 
 
-def _downloaded(checkpoint: str, named: HubName, patterns: Sequence[str]) -> Path:
+def _downloaded(checkpoint: str, parts: HubName, patterns: Sequence[str]) -> Path:
     """The folder of a commit, with the files of these patterns. Raises CheckpointError."""
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
 
-    wanted = [f"{named.folder}/{pattern}" if named.folder else pattern for pattern in patterns]
+    paths = [f"{parts.folder}/{pattern}" if parts.folder else pattern for pattern in patterns]
     try:
-        return Path(snapshot_download(named.repository, revision=named.revision or None, allow_patterns=wanted))
+        return Path(snapshot_download(parts.repository, revision=parts.revision or None, allow_patterns=paths))
     except (RepositoryNotFoundError, LocalEntryNotFoundError, HfHubHTTPError, OSError, ValueError) as error:
         raise CheckpointError(_not_fetched(checkpoint, hub_reason(error), way_out(error))) from error
 
@@ -184,15 +184,15 @@ def hub_files(checkpoint: str) -> list[str]:
     Of `owner/repo/folder`, below that folder. Nothing is downloaded. Raises CheckpointError for what is no hub id,
     and for a repository that neither has.
     """
-    named = hub_name(checkpoint)
-    if named is None:
+    parts = hub_name(checkpoint)
+    if parts is None:
         raise CheckpointError(f"{checkpoint!r} is no hub id; expected owner/repo or owner/repo/folder")
-    repository, inside, revision = _with_pin(named)
+    repository, inside, revision = _with_pin(parts)
     begin = f"{inside}/" if inside else ""
     if unreachable():
         folder = plain_folder(checkpoint, ())
-        found = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
-        return sorted(found)
+        paths = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+        return sorted(paths)
     from huggingface_hub import HfApi
     from huggingface_hub.errors import HfHubHTTPError
 
@@ -236,15 +236,15 @@ def _content(file: Path) -> Any:
     return load_yaml(file)
 
 
-def chosen_dtype(asked: str | None, stored: object, offered: Collection[str]) -> str:
+def chosen_dtype(requested: str | None, stored: object, offered: Collection[str]) -> str:
     """The dtype that was asked for, or else what a checkpoint's configuration says; float32 where neither does.
 
     Raises UsageError for another one that was asked for, CheckpointError for one that is stored.
     """
-    if asked is not None:
-        if asked not in offered:
-            raise UsageError(f"dtype {asked!r} is not one of {', '.join(offered)}")
-        return asked
+    if requested is not None:
+        if requested not in offered:
+            raise UsageError(f"dtype {requested!r} is not one of {', '.join(offered)}")
+        return requested
     name = str(stored or "float32").removeprefix("torch.")
     if name not in offered:
         raise CheckpointError(
@@ -299,15 +299,15 @@ def check_unambiguous(folder: Path) -> None:
     if not (single.is_file() and index.is_file()):
         return
     try:
-        others = [name for name in listed_shards(index) if name != WEIGHTS_FILE]
+        shards = [name for name in listed_shards(index) if name != WEIGHTS_FILE]
     except ValueError as error:
         raise WeightsError(
             f"{index} is damaged ({error}), beside {WEIGHTS_FILE}. Remove the one that is not meant"
         ) from error
-    if others:
-        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+    if shards:
+        more = f" and {len(shards) - 1} more" if len(shards) > 1 else ""
         raise WeightsError(
-            f"{folder} holds two sets of weights: {WEIGHTS_FILE}, and {INDEX_FILE} with {others[0]}{more}. "
+            f"{folder} holds two sets of weights: {WEIGHTS_FILE}, and {INDEX_FILE} with {shards[0]}{more}. "
             "Nothing says which one is meant: remove the other one"
         )
 
@@ -329,7 +329,7 @@ def missing_bytes(folder: Path) -> int | None:
 
 
 def missing_weights(folder: Path) -> str:
-    """What is not there of a folder's weights; empty if all files are."""
+    """Return the names of weights that a folder lacks, as a sentence; empty if all files are there."""
     index = folder / INDEX_FILE
     if (folder / WEIGHTS_FILE).is_file() or (folder / RUN_WEIGHTS).is_file():
         return ""

@@ -27,7 +27,7 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interruptions:
-    """Whether this process was asked to end while a policy worked. A policy can raise KeyboardInterrupt itself."""
+    """Interruptions of this process while a policy worked, as policies can raise KeyboardInterrupt themselves."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -40,18 +40,18 @@ def contained(limit: float | None = None) -> Iterator[Interruptions]:
     limit: seconds after which the process is ended by SIGALRM, which no code can hold up; None for no limit.
     A process that the body forked ends here: it would play on beside its parent, into the same run.
     """
-    here = os.getpid()
+    process = os.getpid()
     try:
         with ExitStack() as stack:
             stack.enter_context(_kept_randomness())
             stack.enter_context(_kept_surroundings())
             stack.enter_context(_quoted_output())
-            seen = stack.enter_context(_noted_interruptions())
+            interruptions = stack.enter_context(_noted_interruptions())
             if limit is not None:
                 signal.setitimer(signal.ITIMER_REAL, limit)
-            yield seen
+            yield interruptions
     finally:
-        if os.getpid() != here:
+        if os.getpid() != process:
             os._exit(1)
         if limit is not None:
             signal.setitimer(signal.ITIMER_REAL, 0)
@@ -73,13 +73,13 @@ def copied(observations: Sequence[Observation]) -> list[Observation]:
     """Observations whose arrays may be written to: those of the stage stay as they are."""
     return [
         replace(
-            one,
-            image=np.array(one.image),
-            state=np.array(one.state),
-            intrinsics=None if one.intrinsics is None else np.array(one.intrinsics),
-            cameras={name: np.array(picture) for name, picture in one.cameras.items()},
+            observation,
+            image=np.array(observation.image),
+            state=np.array(observation.state),
+            intrinsics=None if observation.intrinsics is None else np.array(observation.intrinsics),
+            cameras={name: np.array(picture) for name, picture in observation.cameras.items()},
         )
-        for one in observations
+        for observation in observations
     ]
 
 
@@ -140,7 +140,7 @@ class _Quoted(TextIOBase):
 
 @contextmanager
 def _quoted_output() -> Iterator[None]:
-    """What Python code prints goes to stderr as text; stdout is for results.
+    """Redirect Python's output to stderr as text; stdout is for results.
 
     While a progress bar is drawn, both are rich's already, and what it prints ends in our consoles.
     """
@@ -155,11 +155,11 @@ def _quoted_output() -> Iterator[None]:
 @contextmanager
 def _noted_interruptions() -> Iterator[Interruptions]:
     """Record Ctrl-C and SIGTERM before their handlers run; only the main thread can."""
-    seen = Interruptions()
+    interruptions = Interruptions()
     before: dict[int, Callable[[int, FrameType | None], Any]] = {}
 
     def note(number: int, frame: FrameType | None) -> None:
-        seen.asked = True
+        interruptions.asked = True
         before[number](number, frame)
 
     try:
@@ -170,7 +170,7 @@ def _noted_interruptions() -> Iterator[Interruptions]:
     except ValueError:  # another thread, where KeyboardInterrupt comes from code alone
         before.clear()
     try:
-        yield seen
+        yield interruptions
     finally:
         for ending, handler in before.items():
             signal.signal(ending, handler)

@@ -31,20 +31,20 @@ def check_files(
     if not file.is_file():
         raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}")
     config = read_json(file, CheckpointError, "Download the checkpoint again")
-    found = _type_of(config)
-    if not isinstance(found, str) or found not in types:
-        way_out = dict(instead).get(str(found), "Pass the right --model")
-        raise CheckpointError(f"{file} holds a {found!r} model; expected {' or '.join(types)}. {way_out}")
+    model_type = _type_of(config)
+    if not isinstance(model_type, str) or model_type not in types:
+        way_out = dict(instead).get(str(model_type), "Pass the right --model")
+        raise CheckpointError(f"{file} holds a {model_type!r} model; expected {' or '.join(types)}. {way_out}")
     if not weights:
         return
-    place = folder if adapter is None else adapter.base_folder()
-    check_unambiguous(place)
-    if lacking := missing_weights(place):
-        raise WeightsError(f"no weights in {place}: {lacking}. {_way_to_weights(place)}")
+    weights_folder = folder if adapter is None else adapter.base_folder()
+    check_unambiguous(weights_folder)
+    if lacking := missing_weights(weights_folder):
+        raise WeightsError(f"no weights in {weights_folder}: {lacking}. {_way_to_weights(weights_folder)}")
 
 
 def _type_of(config: Any) -> Any:
-    """What kind of model a config.json describes; that of a training run of Prismatic has a part `model`."""
+    """The model type that a config.json describes; that of a training run of Prismatic has a part `model`."""
     if not isinstance(config, dict):
         return None
     part = config.get("model")

@@ -65,11 +65,11 @@ def has_configuration(folder: Path) -> bool:
     return any((folder / name).is_file() for name in CONFIGURATIONS)
 
 
-def file_state(place: Path) -> tuple[object, ...]:
+def file_state(path: Path) -> tuple[object, ...]:
     """A value that changes with the files of a folder, or with one file."""
-    paths = _existing(place) if place.is_dir() else [place]
-    files = [(path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in paths]
-    return (str(place.resolve()), *sorted(files))
+    files = _existing(path) if path.is_dir() else [path]
+    states = [(file.name, file.stat().st_mtime_ns, file.stat().st_size) for file in files]
+    return (str(path.resolve()), *sorted(states))
 
 
 def _existing(folder: Path) -> Iterable[Path]:
@@ -82,11 +82,11 @@ def _join(folder: Path, base: Path) -> Path:
     atexit.register(shutil.rmtree, root, ignore_errors=True)
     joined = root / (folder.resolve().name or "adapter")
     joined.mkdir()
-    own = sorted(path.name for path in _existing(folder))
+    adapter_names = sorted(path.name for path in _existing(folder))
     for path in sorted(_existing(folder)):
         (joined / path.name).symlink_to(path.resolve())
     for path in sorted(_existing(base)):
-        if not _is_left_out(path) and not _is_replaced(path.name, own):
+        if not _is_left_out(path) and not _is_replaced(path.name, adapter_names):
             (joined / path.name).symlink_to(path.resolve())
     for name in _BESIDE:
         if (base.parent / name).exists() and not (root / name).exists():
@@ -100,7 +100,7 @@ def _is_left_out(path: Path) -> bool:
     return path.name in (ADAPTER_FILE, *ADAPTER_WEIGHTS, _RUNS) or is_weights(path)
 
 
-def _is_replaced(name: str, own: Sequence[str]) -> bool:
+def _is_replaced(name: str, adapter_names: Sequence[str]) -> bool:
     """Whether the adapter has this file of the base, or one that is read together with such files."""
-    parts = (begin for heads, begin in _READ_TOGETHER if any(head in own for head in heads))
-    return name in own or any(name.startswith(begin) for begin in parts)
+    parts = (begin for heads, begin in _READ_TOGETHER if any(head in adapter_names for head in heads))
+    return name in adapter_names or any(name.startswith(begin) for begin in parts)

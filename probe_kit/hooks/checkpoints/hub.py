@@ -1,4 +1,4 @@
-"""Whether the hub can be reached, because its client retries for minutes, and why it refuses. Imports no torch."""
+"""The reachability of the hub, whose client retries for minutes, and its refusals. Imports no torch."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,11 +35,11 @@ def unreachable() -> str:
 
     if constants.HF_HUB_OFFLINE:
         return "offline mode (HF_HUB_OFFLINE)"
-    found: list[str] = []
-    asking = Thread(target=lambda: found.append(_ask(constants.ENDPOINT)), daemon=True)
+    replies: list[str] = []
+    asking = Thread(target=lambda: replies.append(_ask(constants.ENDPOINT)), daemon=True)
     asking.start()
     asking.join(PATIENCE)  # looking a name up knows no time limit of its own
-    return found[0] if found else _silence(constants.ENDPOINT)
+    return replies[0] if replies else _silence(constants.ENDPOINT)
 
 
 def _ask(address: str) -> str:
@@ -63,8 +63,8 @@ def hub_reason(error: Exception) -> str:
 
     cause = _cause(error)
     status = _status(cause)
-    said = str(getattr(cause, "server_message", None) or error)  # the hub's own words, where it answered
-    first = (said.strip().splitlines() or [type(error).__name__])[0]
+    message = str(getattr(cause, "server_message", None) or error)  # the hub's own words, where it answered
+    first = (message.strip().splitlines() or [type(error).__name__])[0]
     if isinstance(cause, errors.GatedRepoError):
         return "its authors give access on request (gated), and yours is not granted"
     if isinstance(cause, errors.DisabledRepoError):
@@ -82,7 +82,7 @@ def hub_reason(error: Exception) -> str:
 
 
 def way_out(error: Exception) -> str:
-    """What to do about a refusal of the hub."""
+    """Return advice on a refusal of the hub."""
     from huggingface_hub import errors, get_token
 
     cause = _cause(error)

@@ -37,34 +37,34 @@ class Adapter:
         return {name: self.files.settings[name] for name in SCALING if self.files.settings.get(name)}
 
     def merged(
-        self, module: nn.Module, tensors: Mapping[str, Tensor], named: Callable[[str], str] = str
+        self, module: nn.Module, tensors: Mapping[str, Tensor], name_in_module: Callable[[str], str] = str
     ) -> dict[str, Tensor]:
         """`tensors` with the adapter in them: W + s B A in float32, rounded once to the weight's own dtype.
 
         module: the network that they belong to, on any device; it stays as it is. tensors: the base's, under the
-        module's names. named: the module's name of a tensor in a file.
+        module's names. name_in_module: the module's name of a tensor in a file.
         Raises WeightsError unless every tensor of the adapter has its place in the network and every place its
         factors, and MissingExtraError without peft.
         """
         factors, copies = self._sorted()
-        found = dict(tensors)
+        merged = dict(tensors)
         for name, tensor in copies.items():
-            place = self._place(name, found, named)
-            if found[place].shape != tensor.shape:
+            target = self._place(name, merged, name_in_module)
+            if merged[target].shape != tensor.shape:
                 raise WeightsError(
-                    f"the LoRA adapter in {self.folder} replaces {name} of shape {tuple(found[place].shape)} by "
+                    f"the LoRA adapter in {self.folder} replaces {name} of shape {tuple(merged[target].shape)} by "
                     f"{tuple(tensor.shape)}; it belongs to another model"
                 )
-            found[place] = tensor.to(found[place].dtype)
-        for path, own in factors.items():
-            weight = self._place(f"{path}.weight", found, named)
+            merged[target] = tensor.to(merged[target].dtype)
+        for path, layer_factors in factors.items():
+            weight = self._place(f"{path}.weight", merged, name_in_module)
             layer = module.get_submodule(weight.removesuffix(".weight"))
             bias = f"{weight.removesuffix('.weight')}.bias"
-            parts = {"weight": found[weight], **({"bias": found[bias]} if bias in found else {})}
-            for name, tensor in self._merged_layer(path, layer, parts, own).items():
-                place = weight if name == "weight" else bias
-                found[place] = tensor.to(found[place].dtype)
-        return found
+            parts = {"weight": merged[weight], **({"bias": merged[bias]} if bias in merged else {})}
+            for name, tensor in self._merged_layer(path, layer, parts, layer_factors).items():
+                target = weight if name == "weight" else bias
+                merged[target] = tensor.to(merged[target].dtype)
+        return merged
 
     def _sorted(self) -> tuple[dict[str, dict[str, Tensor]], dict[str, Tensor]]:
         """Low-rank factors per module, and whole tensors that replace the base's. Raises WeightsError."""
@@ -86,18 +86,18 @@ class Adapter:
                 f"{self.folder} holds something else than low-rank factors: {_few(strange) or 'no tensors'}. "
                 "Merge it with the tool that made it, and pass the merged folder"
             )
-        if lost := [one for one in replaced if not any(_inside(name, (one,)) for name in copies)]:
+        if lost := [module for module in replaced if not any(_inside(name, (module,)) for name in copies)]:
             raise WeightsError(
                 f"{self.folder} has no tensors of {_few(lost)}, which its modules_to_save name. Download the "
                 "adapter again"
             )
         return factors, copies
 
-    def _place(self, name: str, tensors: Mapping[str, Tensor], named: Callable[[str], str]) -> str:
+    def _place(self, name: str, tensors: Mapping[str, Tensor], name_in_module: Callable[[str], str]) -> str:
         """The network's name of a weight that the adapter changes."""
-        for place in (name, named(name)):
-            if place in tensors:
-                return place
+        for candidate in (name, name_in_module(name)):
+            if candidate in tensors:
+                return candidate
         raise WeightsError(
             f"the LoRA adapter in {self.folder} changes {name}, which the model does not have; it belongs to "
             "another model"
@@ -124,8 +124,10 @@ class Adapter:
             raise WeightsError(f"the LoRA adapter in {self.folder} cannot be merged at {path}: {error}") from error
         placed = peft.get_peft_model_state_dict(wrapped, save_embedding_layers=False)
         expected = {name: tensor.shape for name, tensor in placed.items()}
-        own = {name: tensor.shape for name, tensor in factors.items()}
-        if wrong := sorted(name for name in expected.keys() | own.keys() if expected.get(name) != own.get(name)):
+        shapes = {name: tensor.shape for name, tensor in factors.items()}
+        if wrong := sorted(
+            name for name in expected.keys() | shapes.keys() if expected.get(name) != shapes.get(name)
+        ):
             raise WeightsError(
                 f"the LoRA adapter in {self.folder} does not fit the model: tensors missing, extra or of another "
                 f"shape: {_few(wrong)}"

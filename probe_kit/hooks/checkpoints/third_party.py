@@ -17,7 +17,7 @@ _LONGEST = 300
 
 
 @contextmanager
-def naming_checkpoint(model: str, place: str) -> Iterator[None]:
+def naming_checkpoint(model: str, location: str) -> Iterator[None]:
     """Put the model and the checkpoint's folder or hub id into the body's errors about weights, files and words.
 
     What a message already names is not said twice.
@@ -25,32 +25,32 @@ def naming_checkpoint(model: str, place: str) -> Iterator[None]:
     try:
         yield
     except (CheckpointError, WeightsError, InstructionError) as error:  # the last of a tokenizer that lacks words
-        error.args = (with_origin(str(error), model, place),)
+        error.args = (with_origin(str(error), model, location),)
         raise
 
 
-def with_origin(reason: str, model: str, place: str) -> str:
+def with_origin(reason: str, model: str, location: str) -> str:
     """A reason why a checkpoint cannot be used, with the names of its model and place unless it holds them."""
     reason = with_adapters_named(reason)
-    places = {place, str(Path(place))}
-    rest = reason
-    for one in places:
-        rest = rest.replace(one, " ")  # a folder may be called as its model is
-    lacking = [] if re.search(rf"(?<![\w-]){re.escape(model)}(?![\w-])", rest) else [model]
-    if rest == reason:
-        lacking.append(place)
+    places = {location, str(Path(location))}
+    remainder = reason
+    for spelling in places:
+        remainder = remainder.replace(spelling, " ")  # a folder may be called as its model is
+    lacking = [] if re.search(rf"(?<![\w-]){re.escape(model)}(?![\w-])", remainder) else [model]
+    if remainder == reason:
+        lacking.append(location)
     return f"{' from '.join(lacking)}: {reason}" if lacking else reason
 
 
 @contextmanager
-def while_acting(model: str, place: str, limit: float | None = None) -> Iterator[None]:
+def while_acting(model: str, location: str, limit: float | None = None) -> Iterator[None]:
     """Errors of a policy's code in the body. Raises PolicyFailedError naming the model, or an error of ours.
 
-    place: where its checkpoint lies, for what is found out about it this late. limit: as `contained` has it.
+    location: where its checkpoint lies, for what is found out about it this late. limit: as `contained` has it.
     """
     with contained(limit) as interruptions:
         try:
-            with naming_checkpoint(model, place):
+            with naming_checkpoint(model, location):
                 yield
         except ProbeKitError:
             raise
@@ -59,18 +59,18 @@ def while_acting(model: str, place: str, limit: float | None = None) -> Iterator
                 raise
             raise PolicyFailedError(
                 f"{model} failed while it acted: {in_words(error)}. Its code must give actions or raise an error "
-                f"of probe_kit; fix it, or what it read from {place}. Then run the same command to resume"
+                f"of probe_kit; fix it, or what it read from {location}. Then run the same command to resume"
             ) from error
 
 
 @contextmanager
-def while_loading(model: str, place: str) -> Iterator[None]:
+def while_loading(model: str, location: str) -> Iterator[None]:
     """Errors of a loader's code in the body. Raises CheckpointError naming model and checkpoint, or one of ours.
 
     A loader that ends the process raises PolicyFailedError.
     """
     try:
-        with _said_when_asked_for("bitsandbytes"), naming_checkpoint(model, place):
+        with _said_when_asked_for("bitsandbytes"), naming_checkpoint(model, location):
             yield
     except ProbeKitError:
         raise
@@ -78,8 +78,8 @@ def while_loading(model: str, place: str) -> Iterator[None]:
         raise PolicyFailedError(f"{model} cannot be loaded: its code called sys.exit({error.code!r})") from error
     except Exception as error:
         raise CheckpointError(
-            f"{model} cannot be loaded from {place}: {in_words(error)}. A file of the checkpoint is damaged, or "
-            "was made for another version; download it again"
+            f"{model} cannot be loaded from {location}: {in_words(error)}. A file of the checkpoint is damaged, "
+            "or was made for another version; download it again"
         ) from error
 
 

@@ -64,7 +64,7 @@ class Weights:
 
 @dataclass(frozen=True)
 class WeightsAudit:
-    """What loading proved: `tensors` in the model equal the file, the `allowed_missing` ones do not.
+    """The result of loading: `tensors` in the model equal the file, the `allowed_missing` ones do not.
 
     adapter: what was merged into the file's tensors, in words; empty for nothing.
     """
@@ -213,18 +213,18 @@ def load_weights(
     tensors: Mapping[str, Tensor],
     allowed_missing: Iterable[str] = (),
     assign: bool = False,
-    named: Callable[[str], str] = str,
+    name_in_module: Callable[[str], str] = str,
 ) -> WeightsAudit:
     """Copy `tensors` into `module` and prove that they arrived.
 
     weights: the files, which give the audit its hash. tensors: the same content under the module's names.
     allowed_missing: parameters that inference never reads and the file may lack.
     assign: make `tensors` themselves the parameters instead of copying them; for a module on the meta device.
-    named: the module's name of a tensor in a file, for the adapter that is merged.
+    name_in_module: the module's name of a tensor in a file, for the adapter that is merged.
     Raises WeightsError naming missing, extra, mis-shaped and non-finite tensors; the module is then not used.
     """
     if builds_sizes_only():
-        return WeightsAudit("", True, 0, sum(own.numel() for own in module.parameters()), ())
+        return WeightsAudit("", True, 0, sum(weight.numel() for weight in module.parameters()), ())
     state = module.state_dict()
     _refuse_wrapped(weights, tensors, state)
     allowed = set(allowed_missing) & (set(state) - set(tensors))
@@ -243,7 +243,7 @@ def load_weights(
     ]
     _refuse(weights.source, "of another kind of number", kinds)
     if weights.adapter is not None:
-        tensors = weights.adapter.merged(module, tensors, named)
+        tensors = weights.adapter.merged(module, tensors, name_in_module)
     damaged = [n for n, t in tensors.items() if t.is_floating_point() and not torch.isfinite(t).all()]
     _refuse(weights.source, "NaN or infinite", damaged)
     module.load_state_dict(dict(tensors), strict=not allowed, assign=assign)
@@ -271,16 +271,16 @@ def _refuse_wrapped(weights: Weights, tensors: Mapping[str, Tensor], state: Mapp
         )
     wrapper = _wrapper(list(weights.tensors), list(state)) if missing and strange else ""
     if wrapper:
-        held = [name for name in weights.tensors if wrapper in name]
+        wrapped = [name for name in weights.tensors if wrapper in name]
         raise WeightsError(
-            f"weights in {weights.source}: {len(held)} of {len(weights.tensors)} names hold {wrapper!r}, "
-            f"such as {min(held)}, and the model does not. A module that was compiled, distributed or part "
+            f"weights in {weights.source}: {len(wrapped)} of {len(weights.tensors)} names hold {wrapper!r}, "
+            f"such as {min(wrapped)}, and the model does not. A module that was compiled, distributed or part "
             f"of a larger one was saved: save its tensors again without {wrapper!r}. Nothing was run"
         )
 
 
 def _wrapper(stored: Sequence[str], model: Sequence[str]) -> str:
-    """What stands in the names of a file and in none of the model's; empty where nothing does.
+    """The prefix that stands in the names of a file and in none of the model's; empty where there is none.
 
     Wrappers of torch and of training libraries put their name before all names or between their parts; a module
     of a larger one has the name that it has there in front.
@@ -290,10 +290,10 @@ def _wrapper(stored: Sequence[str], model: Sequence[str]) -> str:
         for end in accumulate(common.split("."), "{}.{}".format):
             if {name.removeprefix(f"{end}.") for name in stored} & set(model):
                 return f"{end}."
-    parts, own = ({part for name in names for part in name.split(".")[:-1]} for names in (stored, model))
-    inside = [part for part in _WRAPPERS if part in parts - own]
+    parts, model_parts = ({part for name in names for part in name.split(".")[:-1]} for names in (stored, model))
+    inside = [part for part in _WRAPPERS if part in parts - model_parts]
     first = common.partition(".")[0]
-    return f"{inside[0]}." if inside else f"{first}." if first and first not in own else ""
+    return f"{inside[0]}." if inside else f"{first}." if first and first not in model_parts else ""
 
 
 def _common_path(names: Sequence[str]) -> str:
@@ -311,6 +311,6 @@ def _refuse(source: str, what: str, names: list[str]) -> None:
         )
 
 
-def _names(names: list[str], shown: int = 8) -> str:
-    more = f" and {len(names) - shown} more" if len(names) > shown else ""
-    return ", ".join(names[:shown]) + more
+def _names(names: list[str], most: int = 8) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more

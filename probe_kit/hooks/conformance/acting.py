@@ -16,8 +16,10 @@ from probe_kit.hooks.contract.model import Policy
 )
 def the_action_is_made_in_a_stream(subject: PolicySubject) -> None:
     streams, card = subject.policy.streams.values(), subject.policy.card
-    acting = [own.name for own in streams if own.part == "action" and own.probed]
-    require(bool(acting), f"streams {[own.name for own in streams]}", "one with part='action' that is probed")
+    acting = [stream.name for stream in streams if stream.part == "action" and stream.probed]
+    require(
+        bool(acting), f"streams {[stream.name for stream in streams]}", "one with part='action' that is probed"
+    )
     require(card.chunk >= card.execute >= 1, f"chunk {card.chunk}, execute {card.execute}", "chunk ≥ execute ≥ 1")
 
 
@@ -26,14 +28,14 @@ def the_action_is_made_in_a_stream(subject: PolicySubject) -> None:
     "Return float32 with seven numbers per action, and draw noise from a generator seeded with the row's seed.",
 )
 def actions_have_the_contracts_shape_and_come_from_the_seed_alone(subject: PolicySubject) -> None:
-    policy, seen = _acting(subject), subject.seen
-    seeds = [5, 6][: len(seen)]
+    policy, observations = _acting(subject), subject.batch
+    seeds = [5, 6][: len(observations)]
     torch.manual_seed(1)
-    first = policy.act(seen, seeds)
+    first = policy.act(observations, seeds)
     torch.manual_seed(2)
-    require_bits(policy.act(seen, seeds), first, "actions of the same seeds", "those of the first call")
-    wanted = (len(seen), policy.card.chunk, 7)
-    require(first.shape == wanted, f"actions of shape {first.shape}", f"{wanted}")
+    require_bits(policy.act(observations, seeds), first, "actions of the same seeds", "those of the first call")
+    shape = (len(observations), policy.card.chunk, 7)
+    require(first.shape == shape, f"actions of shape {first.shape}", f"{shape}")
     require(first.dtype == np.float32, f"actions of type {first.dtype}", "float32")
     require(bool(np.isfinite(first).all()), "actions that hold NaN or infinity", "finite numbers")
 
@@ -46,7 +48,7 @@ def another_seed_gives_another_chunk_where_noise_is_drawn(subject: PolicySubject
     policy = subject.policy
     if policy.draws_noise is None:
         raise SkipTest(f"{policy.card.family} does not say whether noise enters an inference (`draws_noise`)")
-    first, other = (subject.run_row(subject.one[0], seed) for seed in (5, 6))
+    first, other = (subject.run_row(subject.single[0], seed) for seed in (5, 6))
     if policy.draws_noise:
         require(not np.array_equal(first, other), "the same actions of two seeds", "others: the noise is ignored")
     else:
@@ -58,12 +60,12 @@ def another_seed_gives_another_chunk_where_noise_is_drawn(subject: PolicySubject
     "Let `infer_without_acting` call what `act` calls, with the same inputs.",
 )
 def inference_without_acting_equals_that_of_acting(subject: PolicySubject) -> None:
-    policy, one = _acting(subject), subject.one
+    policy, observations = _acting(subject), subject.single
     sites = policy.sites()
     with capture(policy, sites) as acting:
-        policy.act(one, [5])
+        policy.act(observations, [5])
     with capture(policy, sites) as without_acting:
-        raw = policy.infer_without_acting(one, [5])
+        raw = policy.infer_without_acting(observations, [5])
     require(raw.shape[0] == 1, f"{raw.shape[0]} rows for one observation", "1")
     for site in sites:
         equal = torch.equal(acting[site], without_acting[site])
@@ -76,7 +78,7 @@ def inference_without_acting_equals_that_of_acting(subject: PolicySubject) -> No
 )
 def every_observation_needs_its_seed(subject: PolicySubject) -> None:
     with refused("an observation without a seed", ObservationError):
-        subject.policy.act(subject.seen, [])
+        subject.policy.act(subject.batch, [])
 
 
 def _acting(subject: PolicySubject) -> Policy:

@@ -17,9 +17,9 @@ from probe_kit.hooks.contract.roles import Roles
     "Return `Reading.of(logits, options, state)` with the logits behind the prompt.",
 )
 def a_reading_has_a_logit_per_option_and_their_mass_is_a_share(subject: AnswerSubject) -> None:
-    rows, reading = len(subject.asked), subject.read(subject.asked)
-    wanted = (rows, len(subject.letters))
-    require(reading.option_logits.shape == wanted, f"logits of shape {reading.option_logits.shape}", f"{wanted}")
+    rows, reading = len(subject.questions_of_batch), subject.read(subject.questions_of_batch)
+    shape = (rows, len(subject.letters))
+    require(reading.option_logits.shape == shape, f"logits of shape {reading.option_logits.shape}", f"{shape}")
     mass = reading.option_mass
     require(mass.shape == (rows,), f"option_mass of shape {mass.shape}", f"({rows},)")
     require(bool(((mass > 0) & (mass <= 1)).all()), f"option_mass {mass.tolist()}", "shares in (0, 1]")
@@ -30,10 +30,10 @@ def a_reading_has_a_logit_per_option_and_their_mass_is_a_share(subject: AnswerSu
     "Decode greedily, and return a list of text from `speak`.",
 )
 def what_is_spoken_repeats_and_is_as_long_as_asked(subject: AnswerSubject) -> None:
-    model, asked = subject.answer_model, subject.asked
-    first, second = (model.speak(subject.read(asked), 4) for _ in range(2))
+    model, questions = subject.answer_model, subject.questions_of_batch
+    first, second = (model.speak(subject.read(questions), 4) for _ in range(2))
     require(first == second, f"{first} and then {second}", "the same text for the same questions")
-    require(len(first) == len(asked), f"{len(first)} texts", f"{len(asked)}, one per question")
+    require(len(first) == len(questions), f"{len(first)} texts", f"{len(questions)}, one per question")
     require(all(isinstance(text, str) for text in first), f"{first}", "text")
 
 
@@ -42,7 +42,7 @@ def what_is_spoken_repeats_and_is_as_long_as_asked(subject: AnswerSubject) -> No
     "Copy the cache of the reading in `speak` before tokens are appended to it.",
 )
 def speaking_does_not_use_a_reading_up(subject: AnswerSubject) -> None:
-    model, reading = subject.answer_model, subject.read(subject.asked)
+    model, reading = subject.answer_model, subject.read(subject.questions_of_batch)
     first, second = model.speak(reading, 4), model.speak(reading, 4)
     require(first == second, f"{first} and then {second} from one reading", "the same text")
     none = model.speak(reading, 0)
@@ -70,7 +70,9 @@ def a_far_longer_neighbour_changes_nothing(subject: AnswerSubject) -> None:
     longer = replace(short, text=short.text + f" {subject.instructions[0].split()[-1]}" * 6)
     together, alone = subject.ask([short, longer]), subject.ask([short])
     require_close(together[0], alone[0], subject.tolerance, "logits beside a longer question")
-    pair, single = (subject.answer_model.speak(subject.read(asked), 4)[0] for asked in ([short, longer], [short]))
+    pair, single = (
+        subject.answer_model.speak(subject.read(questions), 4)[0] for questions in ([short, longer], [short])
+    )
     require(pair == single, f"{pair!r} beside a longer question", f"{single!r}, as alone")
 
 
@@ -80,12 +82,15 @@ def a_far_longer_neighbour_changes_nothing(subject: AnswerSubject) -> None:
 )
 def without_a_picture_nothing_of_it_is_left(subject: AnswerSubject) -> None:
     """Also right behind questions about pictures: no state may stay from call to call."""
-    asked = [replace(own, pictured=False) for own in subject.asked]
-    other = [replace(own, seen=replace(own.seen, image=255 - own.seen.image)) for own in asked]
-    before = subject.ask(asked)
-    subject.read(subject.asked)
+    in_words_alone = [replace(question, pictured=False) for question in subject.questions_of_batch]
+    other = [
+        replace(question, observation=replace(question.observation, image=255 - question.observation.image))
+        for question in in_words_alone
+    ]
+    before = subject.ask(in_words_alone)
+    subject.read(subject.questions_of_batch)
     require_bits(subject.ask(other), before, "answers without a picture", "those of another hidden picture")
-    for name, rows in subject.answer_model.asked_roles(subject.led(asked)).items():
+    for name, rows in subject.answer_model.asked_roles(subject.led(in_words_alone)).items():
         pictured = any(row.mask("image").any() for row in rows)
         require(not pictured, f"{name} has positions with the role image", "none without a picture")
 
@@ -115,7 +120,7 @@ def options_that_begin_alike_are_refused(subject: AnswerSubject) -> None:
     "Leave `near_ties` as it is inherited, or compare the two largest logits with a limit for the dtype.",
 )
 def a_choice_that_rounding_decides_is_a_near_tie(subject: AnswerSubject) -> None:
-    reading = subject.read(subject.asked)
+    reading = subject.read(subject.questions_of_batch)
     apart = np.tile(np.array([[0.0, 9.0]], np.float32), (len(reading.option_logits), 1))
     ties = subject.answer_model.near_ties
     require(not ties(replace(reading, option_logits=apart)).any(), "a near tie at a margin of 9", "none")
@@ -128,24 +133,30 @@ def a_choice_that_rounding_decides_is_a_near_tie(subject: AnswerSubject) -> None
     "Slice the taps and the roles of `backbone` by the same positions in `match_policies`.",
 )
 def the_positions_of_policies_add_at_most_the_last_one(subject: AnswerSubject) -> None:
-    model, asked = subject.answer_model, subject.led(subject.asked[:1])
+    model, questions = subject.answer_model, subject.led(subject.questions_of_batch[:1])
     site = model.streams["backbone"].sites()[-1]
 
     def captured() -> tuple[torch.Tensor, Roles]:
         with capture(model, [site]) as cache:
-            model.read(asked)
-        return cache[site], model.asked_roles(asked)["backbone"][0]
+            model.read(questions)
+        return cache[site], model.asked_roles(questions)["backbone"][0]
 
-    own, own_roles = captured()
+    activation, own_roles = captured()
     model.match_policies(True)
     try:
-        (whole, roles), added = captured(), int(model.whole_prompt)
+        (matched, roles), added = captured(), int(model.whole_prompt)
     finally:
         model.match_policies(False)
-    require(len(roles) == whole.shape[1], f"{len(roles)} roles", f"{whole.shape[1]}, one per position")
-    require(whole.shape[1] == own.shape[1] + added, f"{whole.shape[1]} positions", f"{own.shape[1] + added}")
+    require(len(roles) == matched.shape[1], f"{len(roles)} roles", f"{matched.shape[1]}, one per position")
     require(
-        bool(torch.equal(whole[:, : own.shape[1]], own)), "other activations", "those without the last position"
+        matched.shape[1] == activation.shape[1] + added,
+        f"{matched.shape[1]} positions",
+        f"{activation.shape[1] + added}",
+    )
+    require(
+        bool(torch.equal(matched[:, : activation.shape[1]], activation)),
+        "other activations",
+        "those without the last position",
     )
     require(roles.spans[0] == own_roles.spans[0], f"roles {roles.spans}", f"those of {own_roles.spans}")
 

@@ -34,12 +34,12 @@ __all__ = [
 class CheckFailedError(AssertionError):
     """An adapter does not do what a check expects.
 
-    seen, expected: in words. change: what to do; empty where the advice of the check itself fits.
+    actual, expected: in words. change: what to do; empty where the advice of the check itself fits.
     """
 
-    def __init__(self, seen: str, expected: str, change: str = "") -> None:
-        super().__init__(f"seen: {seen}; expected: {expected}" + (f"; change: {change}" if change else ""))
-        self.seen, self.expected, self.change = seen, expected, change
+    def __init__(self, actual: str, expected: str, change: str = "") -> None:
+        super().__init__(f"seen: {actual}; expected: {expected}" + (f"; change: {change}" if change else ""))
+        self.actual, self.expected, self.change = actual, expected, change
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Check:
         except CheckFailedError as failed:
             if failed.change:
                 raise
-            raise CheckFailedError(failed.seen, failed.expected, self.change) from None
+            raise CheckFailedError(failed.actual, failed.expected, self.change) from None
 
 
 def check(sentence: str, change: str) -> Callable[[Callable[[Any], None]], Check]:
@@ -79,45 +79,45 @@ def check(sentence: str, change: str) -> Callable[[Callable[[Any], None]], Check
 
 def checks_of(*modules: ModuleType) -> tuple[Check, ...]:
     """The checks of modules, in the order in which they are written."""
-    return tuple(own for module in modules for own in vars(module).values() if isinstance(own, Check))
+    return tuple(value for module in modules for value in vars(module).values() if isinstance(value, Check))
 
 
-def require(kept: bool, seen: str, expected: str, change: str = "") -> None:
-    """Raise CheckFailedError unless `kept`."""
-    if not kept:
-        raise CheckFailedError(seen, expected, change)
+def require(condition: bool, actual: str, expected: str, change: str = "") -> None:
+    """Raise CheckFailedError unless `condition` holds."""
+    if not condition:
+        raise CheckFailedError(actual, expected, change)
 
 
-def require_bits(seen: NDArray[Any], expected: NDArray[Any], name: str, like: str) -> None:
+def require_bits(actual: NDArray[Any], expected: NDArray[Any], name: str, like: str) -> None:
     """Raise CheckFailedError unless two arrays are equal, bit for bit. name, like: what they are."""
-    if np.array_equal(seen, expected, equal_nan=True):
+    if np.array_equal(actual, expected, equal_nan=True):
         return
-    if seen.shape != expected.shape:
-        raise CheckFailedError(f"{name} have the shape {seen.shape}", f"{expected.shape}, as {like}")
-    apart = np.abs(seen.astype(np.float64) - expected.astype(np.float64)).max()
+    if actual.shape != expected.shape:
+        raise CheckFailedError(f"{name} have the shape {actual.shape}", f"{expected.shape}, as {like}")
+    apart = np.abs(actual.astype(np.float64) - expected.astype(np.float64)).max()
     raise CheckFailedError(f"{name} differ from {like} by up to {apart:.3g}", "no difference, bit for bit")
 
 
-def require_close(seen: NDArray[Any], expected: NDArray[Any], tolerance: float, name: str) -> None:
+def require_close(actual: NDArray[Any], expected: NDArray[Any], tolerance: float, name: str) -> None:
     """Raise CheckFailedError unless two arrays are equal within `tolerance` plus 1e-7 of what is expected."""
-    if not np.allclose(seen, expected, rtol=1e-7, atol=tolerance):
+    if not np.allclose(actual, expected, rtol=1e-7, atol=tolerance):
         raise CheckFailedError(
-            f"{name} are off by {np.abs(seen - expected).max():.3g}", f"at most {tolerance:.3g}"
+            f"{name} are off by {np.abs(actual - expected).max():.3g}", f"at most {tolerance:.3g}"
         )
 
 
 @contextmanager
-def refused(asked: str, *errors: type[Exception], says: str = "") -> Iterator[None]:
+def refused(request: str, *errors: type[Exception], says: str = "") -> Iterator[None]:
     """Raise CheckFailedError unless the body raises one of `errors`, whose message holds `says`."""
-    named = " or ".join(error.__name__ for error in errors)
+    classes = " or ".join(error.__name__ for error in errors)
     try:
         yield
     except errors as error:
         require(
-            says in str(error), f"{type(error).__name__}: {error}", f"a message about {asked} that says {says!r}"
+            says in str(error), f"{type(error).__name__}: {error}", f"a message about {request} that says {says!r}"
         )
         return
-    raise CheckFailedError(f"{asked}: no error", f"{named}" + (f" that says {says!r}" if says else ""))
+    raise CheckFailedError(f"{request}: no error", f"{classes}" + (f" that says {says!r}" if says else ""))
 
 
 # -- what came of it ---------------------------------------------------------------------------------------
@@ -128,21 +128,21 @@ _FROM_THE_ERROR = "no error"
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one check.
+    """The outcome of one check.
 
-    sentence: the promise that was checked. seen, expected, change: of a failure, in words. reason: of a skip.
+    sentence: the promise that was checked. actual, expected, change: of a failure, in words. reason: of a skip.
     """
 
     name: str
     state: State
     sentence: str
-    seen: str = ""
+    actual: str = ""
     expected: str = ""
     change: str = ""
     reason: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """As `probe-kit check-adapter --json` prints it."""
+        """Return plain values, as `probe-kit check-adapter --json` prints them."""
         return asdict(self)
 
 
@@ -157,7 +157,7 @@ def tried(name: str, sentence: str, change: str, body: Callable[[], object], pac
     except SkipTest as skipped:
         return Outcome(name, "skipped", sentence, reason=str(skipped))
     except CheckFailedError as failed:
-        return Outcome(name, "failed", sentence, failed.seen, failed.expected, failed.change or change)
+        return Outcome(name, "failed", sentence, failed.actual, failed.expected, failed.change or change)
     except BaseException as error:  # some of these end a process, and are the adapter's own here
         if isinstance(error, KeyboardInterrupt) and interruptions.asked:
             raise
@@ -170,11 +170,11 @@ def _in_words(error: BaseException, package: str) -> str:
     cause = error.__cause__
     if isinstance(error, ProbeKitError) and cause is not None and not isinstance(cause, ProbeKitError):
         return _in_words(cause, package) if place_of(cause, package) else f"{type(error).__name__}: {error}"
-    said = in_words(error)
+    text = in_words(error)
     if isinstance(error, ProbeKitError):
-        said = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
-    place = place_of(error, package)
-    return f"{said} ({place})" if place else said
+        text = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", [])])
+    line = place_of(error, package)
+    return f"{text} ({line})" if line else text
 
 
 def place_of(error: BaseException, package: str) -> str:

@@ -14,28 +14,28 @@ from probe_kit.hooks.contract.sites import Site, Stream
     "Tap the tensor that the block itself reads, not a copy: an edit is written into that tensor.",
 )
 def an_identity_edit_changes_nothing_and_zeroing_changes_the_output(subject: Subject) -> None:
-    model, seen = subject.model, subject.seen
-    plain = subject.run(seen)
+    model, observations = subject.model, subject.batch
+    plain = subject.run(observations)
     for stream in model.streams.values():
         if not stream.probed:
             continue
         site = stream.sites()[1]
         with edit(model, {site: lambda activation: activation}):
-            same = subject.run(seen)
+            same = subject.run(observations)
         require_bits(same, plain, f"outputs with {site} rewritten by itself", "those without")
         with edit(model, dict.fromkeys(_everywhere(stream, site), torch.zeros_like)):
-            changed = subject.run(seen)
+            changed = subject.run(observations)
         require(
             bool(np.abs(changed - plain).max() > 0),
             f"zeros at {site} change no output",
             "other outputs: the stream is on the way to them",
         )
-    require_bits(subject.run(seen), plain, "outputs after the edits", "those before")
+    require_bits(subject.run(observations), plain, "outputs after the edits", "those before")
 
 
 def _everywhere(stream: Stream, site: Site) -> list[Site]:
     """The site at every iteration: one action token of several may decide nothing that is printed."""
-    return [own for own in stream.sites() if own.layer == site.layer]
+    return [candidate for candidate in stream.sites() if candidate.layer == site.layer]
 
 
 @check(
@@ -45,6 +45,6 @@ def _everywhere(stream: Stream, site: Site) -> list[Site]:
 def an_edit_is_what_a_capture_inside_it_reads(subject: Subject) -> None:
     model, site = subject.model, subject.model.sites()[1]
     with edit(model, {site: torch.zeros_like}), capture(model, [site]) as tape:
-        subject.run(subject.seen)
+        subject.run(subject.batch)
     most = float(tape[site].abs().max())
     require(most == 0, f"{site} holds values up to {most:.3g} behind an edit to zeros", "zeros")

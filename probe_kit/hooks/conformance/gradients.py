@@ -30,9 +30,9 @@ _ADVICE = (
 def actions_with_a_graph_are_the_actions(subject: PolicySubject) -> None:
     policy = _differentiable(subject)
     trained = [weight.requires_grad for weight in _weights(policy)]
-    actions = policy.differentiable(subject.seen, range(len(subject.seen)))
+    actions = policy.differentiable(subject.batch, range(len(subject.batch)))
     tolerance = 1e-5 if policy.card.dtype == "float32" else 1e-2
-    require_close(actions.detach().cpu().numpy(), subject.run(subject.seen), tolerance, "actions with a graph")
+    require_close(actions.detach().cpu().numpy(), subject.run(subject.batch), tolerance, "actions with a graph")
     require(not actions.requires_grad, "a graph behind actions although no site is tapped", "none")
     same = [weight.requires_grad for weight in _weights(policy)] == trained
     require(same, "weights that ask for a gradient", "weights as they were")
@@ -40,21 +40,21 @@ def actions_with_a_graph_are_the_actions(subject: PolicySubject) -> None:
 
 @check("Gradients at sites are central differences of the action, whatever other sites are tapped.", _ADVICE)
 def gradients_at_sites_are_central_differences(subject: PolicySubject) -> None:
-    policy, one = _differentiable(subject), subject.one
+    policy, observations = _differentiable(subject), subject.single
     subject.require_float32()
     sites = _some_sites(policy)
-    _, slopes = gradients_at(policy, one, [0], sites, _lateral)
-    with capture(policy, sites) as own:
-        subject.run(one)
+    _, slopes = gradients_at(policy, observations, [0], sites, _lateral)
+    with capture(policy, sites) as activations:
+        subject.run(observations)
     for site in sites:
-        _, alone = gradients_at(policy, one, [0], [site], _lateral)
+        _, alone = gradients_at(policy, observations, [0], [site], _lateral)
         apart = float((alone[site] - slopes[site]).abs().max())
         require(
             apart <= 1e-3 * float(slopes[site].abs().max()),
             f"another gradient at {site} if it is tapped alone",
             "the same",
         )
-        _require_slope(subject, site, slopes[site], float(own[site].float().norm()))
+        _require_slope(subject, site, slopes[site], float(activations[site].float().norm()))
 
 
 def _require_slope(subject: PolicySubject, site: Site, slope: Tensor, norm: float) -> None:
@@ -62,9 +62,9 @@ def _require_slope(subject: PolicySubject, site: Site, slope: Tensor, norm: floa
     steepness = float(slope.norm())
     require(steepness > 0, f"no gradient at {site}", "one: the acting part reads it")
     direction = slope / steepness
-    found = [_difference(subject, site, direction, step * norm) for step in STEPS]
-    jumps = [abs(after - before) for before, after in pairwise(found)]
-    best = found[int(np.argmin(jumps)) + 1]
+    differences = [_difference(subject, site, direction, step * norm) for step in STEPS]
+    jumps = [abs(after - before) for before, after in pairwise(differences)]
+    best = differences[int(np.argmin(jumps)) + 1]
     require(
         abs(best / steepness - 1) <= CLOSE,
         f"at {site} a gradient of {steepness:.6g}",
@@ -77,7 +77,7 @@ def _difference(subject: PolicySubject, site: Site, direction: Tensor, step: flo
     values = []
     for sign in (1.0, -1.0):
         with edit(subject.policy, {site: partial(torch.add, sign * step * direction)}):
-            values.append(float(_lateral(torch.from_numpy(subject.run(subject.one)).double())))
+            values.append(float(_lateral(torch.from_numpy(subject.run(subject.single)).double())))
     return (values[0] - values[1]) / (2 * step)
 
 
@@ -103,7 +103,7 @@ def _differentiable(subject: PolicySubject) -> Policy:
     policy = subject.policy
     if not policy.interventions.gradients:
         with refused("differentiable actions", UnsupportedInterventionError, says=policy.card.family):
-            policy.differentiable(subject.one, [0])
+            policy.differentiable(subject.single, [0])
         raise SkipTest(f"{policy.card.family} declares no gradients, and refuses them by name")
     if policy.embodiment_mismatch() is not None:
         raise SkipTest(f"{policy.card.family} cannot act: its actions do not fit this arm")

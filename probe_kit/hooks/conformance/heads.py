@@ -31,19 +31,23 @@ _SUM_TOLERANCE = 1e-5
 )
 def heads_make_what_the_output_projection_adds(subject: Subject) -> None:
     subject.require_float32()
-    sites = [site for own in _streams_with_heads(subject) for site in (own.sites(HEADS)[0], own.sites(HEADS)[-1])]
+    sites = [
+        site
+        for stream in _streams_with_heads(subject)
+        for site in (stream.sites(HEADS)[0], stream.sites(HEADS)[-1])
+    ]
     taps = {site: subject.model.tap(site) for site in sites}
     with ExitStack() as stack:
         put_out = {site: outputs_of(tap.module, stack) for site, tap in taps.items()}
         with capture(subject.model, sites) as tape:
-            subject.run(subject.seen)
+            subject.run(subject.batch)
     for site, tap in taps.items():
-        whole = tap.rows.of(put_out[site][tap.first + (site.iteration or 0)])[:, tap.tokens]
+        projected = tap.rows.of(put_out[site][tap.first + (site.iteration or 0)])[:, tap.tokens]
         width, heads = tape[site].shape[-1], subject.model.stream_of(site).heads
         require(width % heads == 0, f"{site} has {width} features", f"a multiple of its {heads} heads")
         added, bias = project_heads(subject.model, tape, site).sum(dim=0), getattr(tap.module, "bias", None)
-        apart = float((added + (0 if bias is None else bias.detach()) - whole).abs().max())
-        limit = subject.tolerance * (1 + float(whole.abs().max()))
+        apart = float((added + (0 if bias is None else bias.detach()) - projected).abs().max())
+        limit = subject.tolerance * (1 + float(projected.abs().max()))
         require(apart <= limit, f"the heads of {site} are off by {apart:.3g}", f"at most {limit:.3g}")
 
 
@@ -53,12 +57,12 @@ def heads_make_what_the_output_projection_adds(subject: Subject) -> None:
 )
 def attention_patterns_are_the_models_own(subject: Subject) -> None:
     subject.require_float32()
-    seen, streams = subject.seen, _streams_with_heads(subject)
-    plain = subject.run(seen)
-    with capture_patterns(subject.model, [site for own in streams for site in own.sites(HEADS)]) as patterns:
-        captured = subject.run(seen)
+    observations, streams = subject.batch, _streams_with_heads(subject)
+    plain = subject.run(observations)
+    with capture_patterns(subject.model, [site for stream in streams for site in stream.sites(HEADS)]) as patterns:
+        captured = subject.run(observations)
     require_bits(captured, plain, "outputs with attention patterns captured", "those without")
-    roles = subject.roles_of(seen)
+    roles = subject.roles_of(observations)
     for site, pattern in patterns.items():
         require(bool((pattern >= 0).all()), f"{site}: negative attention", "shares from 0 on")
         if site.stream in roles:
@@ -69,12 +73,12 @@ def attention_patterns_are_the_models_own(subject: Subject) -> None:
 def _require_shares_of_valid_tokens(
     site: Site, pattern: Tensor, queries: Sequence[Roles], keys: Sequence[Roles]
 ) -> None:
-    """What a real token attends to sums to 1, and none of it is padding."""
+    """Raise CheckFailedError unless the attention of a real token sums to 1, and none of it is on padding."""
     for row, asking, attended in zip(pattern, queries, keys, strict=True):
-        own = row[:, torch.from_numpy(asking.valid)]
-        apart = float((own.sum(dim=-1) - 1).abs().max())
+        shares = row[:, torch.from_numpy(asking.valid)]
+        apart = float((shares.sum(dim=-1) - 1).abs().max())
         require(apart <= _SUM_TOLERANCE, f"{site}: sums of attention off 1 by {apart:.3g}", f"≤ {_SUM_TOLERANCE}")
-        lost = float(own[..., torch.from_numpy(~attended.valid)].sum())
+        lost = float(shares[..., torch.from_numpy(~attended.valid)].sum())
         require(lost == 0, f"{site}: {lost:.3g} of the attention lies on padding", "none")
 
 
@@ -83,7 +87,10 @@ def _require_shares_of_valid_tokens(
     "Leave `heads` out of a Stream whose blocks have no output projection that a hook can reach.",
 )
 def heads_that_are_not_declared_are_refused_by_name(subject: Subject) -> None:
-    model, none = subject.model, [own for own in subject.model.every_stream().values() if not own.heads]
+    model, none = (
+        subject.model,
+        [declared for declared in subject.model.every_stream().values() if not declared.heads],
+    )
     if not none:
         raise SkipTest(f"every stream of {model.card.family} declares heads")
     for stream in none:
@@ -112,7 +119,7 @@ def the_last_row_of_the_logit_lens_is_the_output(subject: Subject) -> None:
     with ExitStack() as stack:
         put_out = outputs_of(unembedding.head, stack)
         with capture(model, stream.sites()) as cache:
-            subject.run(subject.one)
+            subject.run(subject.single)
     for iteration in range(stream.iterations or 1):
         expected = unembedding.capped(put_out[iteration][:, -1]).float().cpu().numpy()
         every = range(expected.shape[-1])
@@ -127,7 +134,7 @@ def the_last_row_of_the_logit_lens_is_the_output(subject: Subject) -> None:
 
 def _streams_with_heads(subject: Subject) -> list[Stream]:
     """Raises SkipTest if there are none."""
-    found = [own for own in subject.model.every_stream().values() if own.heads]
-    if not found:
+    streams = [stream for stream in subject.model.every_stream().values() if stream.heads]
+    if not streams:
         raise SkipTest(f"{subject.model.card.family} declares no heads")
-    return found
+    return streams

@@ -31,20 +31,24 @@ from probe_kit.hooks.registry import find_family
     "Name one `Interventions` in the adapter and in its Family, with every stream and its quantities.",
 )
 def policy_and_family_declare_the_same(subject: PolicySubject) -> None:
-    policy, own = subject.policy, subject.policy.interventions
+    policy, interventions = subject.policy, subject.policy.interventions
     if subject.name:
         declared = find_family(subject.name).interventions
-        require(declared == own, f"the family declares {declared}", f"what the policy declares, {own}")
+        require(
+            declared == interventions,
+            f"the family declares {declared}",
+            f"what the policy declares, {interventions}",
+        )
     require(
-        own.prompt_kv == (policy.prompt_kv is not None),
-        f"interventions.prompt_kv is {own.prompt_kv}, and policy.prompt_kv {policy.prompt_kv}",
+        interventions.prompt_kv == (policy.prompt_kv is not None),
+        f"interventions.prompt_kv is {interventions.prompt_kv}, and policy.prompt_kv {policy.prompt_kv}",
         "both, or neither",
     )
-    unread, streams = set(own.unread), policy.streams
+    unread, streams = set(interventions.unread), policy.streams
     require(unread <= streams.keys(), f"unread streams {sorted(unread)}", f"some of {sorted(streams)}")
     for name, stream in streams.items():
-        if own.edits is not None:
-            listed = set(own.edits.get(name, ()))
+        if interventions.edits is not None:
+            listed = set(interventions.edits.get(name, ()))
             require(listed == set(stream.quantities), f"edits of {name}: {sorted(listed)}", f"{stream.quantities}")
 
 
@@ -55,10 +59,10 @@ def policy_and_family_declare_the_same(subject: PolicySubject) -> None:
 def rewriting_every_site_with_itself_changes_no_action_bit_for_bit(subject: PolicySubject) -> None:
     policy = subject.policy
     streams = [*policy.streams.values(), *([] if policy.prompt_kv is None else [policy.prompt_kv])]
-    sites = [site for own in streams for quantity in own.captured for site in own.sites(quantity)]
-    plain = subject.run(subject.one)
+    sites = [site for stream in streams for quantity in stream.captured for site in stream.sites(quantity)]
+    plain = subject.run(subject.single)
     with edit(policy, {site: lambda activation: activation for site in sites}):
-        same = subject.run(subject.one)
+        same = subject.run(subject.single)
     require_bits(same, plain, "actions with every site rewritten by itself", "those without")
 
 
@@ -70,11 +74,11 @@ def what_is_rewritten_in_a_block_is_read_behind_it(subject: PolicySubject) -> No
     policy = subject.policy
     for stream in policy.streams.values():
         behind = [site for site in stream.sites() if site.layer == 1]
-        plain = _captured(subject, subject.one, behind)
+        plain = _captured(subject, subject.single, behind)
         for quantity in set(stream.captured) - {"final_norm"}:
             written = [site for site in stream.sites(quantity) if site.layer == 0]
             with edit(policy, dict.fromkeys(written, torch.zeros_like)):
-                changed = _captured(subject, subject.one, behind)
+                changed = _captured(subject, subject.single, behind)
             reached = any((plain[site] != changed[site]).any() for site in behind)
             require(reached, f"zeros at {stream.name}.00.{quantity} leave layer 1 as it was", "other activations")
 
@@ -85,13 +89,13 @@ def what_is_rewritten_in_a_block_is_read_behind_it(subject: PolicySubject) -> No
 )
 def the_end_of_an_unread_stream_is_a_control(subject: PolicySubject) -> None:
     policy = subject.policy
-    plain = subject.run(subject.one)
+    plain = subject.run(subject.single)
     for name in policy.interventions.unread:
         stream = policy.streams[name]
         for quantity in {"residual", "final_norm"} & set(stream.quantities):
             site = stream.sites(quantity)[-1]
             with edit(policy, {site: torch.zeros_like}):
-                require_bits(subject.run(subject.one), plain, f"actions with zeros at {site}", "those without")
+                require_bits(subject.run(subject.single), plain, f"actions with zeros at {site}", "those without")
 
 
 @check(
@@ -119,15 +123,15 @@ def what_is_not_supported_is_refused_by_name(subject: PolicySubject) -> None:
     "Declare `prompt_kv` with the heads side by side as its width; tap keys and values with a `HeadsTap`.",
 )
 def the_prompt_has_keys_and_values_for_every_token_of_the_backbone(subject: PolicySubject) -> None:
-    kv, seen = _prompt_kv(subject), subject.seen
+    kv, observations = _prompt_kv(subject), subject.batch
     sites = _all(kv)
-    tape = _captured(subject, seen, sites)
-    tokens = len(subject.policy.token_roles(seen)[kv.name][0])
+    tape = _captured(subject, observations, sites)
+    tokens = len(subject.policy.token_roles(observations)[kv.name][0])
     require(len(tape) == len(sites), f"{len(tape)} of {len(sites)} sites fired", "all")
-    wanted = (len(seen), tokens, kv.width)
+    expected = (len(observations), tokens, kv.width)
     for site in sites:
         shape = tuple(tape[site].shape)
-        require(shape == wanted, f"{site} has the shape {shape}", f"{wanted}")
+        require(shape == expected, f"{site} has the shape {shape}", f"{expected}")
 
 
 @check(
@@ -136,17 +140,17 @@ def the_prompt_has_keys_and_values_for_every_token_of_the_backbone(subject: Poli
 )
 def all_keys_and_values_of_another_picture_give_that_pictures_actions(subject: PolicySubject) -> None:
     """State, words and noise are the same. What chose the first token goes along with it."""
-    policy, kv, one = subject.policy, _prompt_kv(subject), subject.one[0]
-    other = replace(one, image=255 - one.image)
+    policy, kv, observation = subject.policy, _prompt_kv(subject), subject.single[0]
+    other = replace(observation, image=255 - observation.image)
     acting = [site for site in policy.sites() if policy.streams[site.stream].part == "action"]
     early = [site for site in acting if (site.iteration or 0) < policy.interventions.first_affected_token]
     late = [site for site in acting if site not in early]
-    plain, source = (_captured(subject, [own], [*_all(kv), *acting]) for own in (one, other))
+    plain, source = (_captured(subject, [picture], [*_all(kv), *acting]) for picture in (observation, other))
     edits, vectors = _edits_from(source, [*_all(kv), *early])
-    with apply_edits(policy, edits, [one], vectors) as edit_log:
-        edited = _captured(subject, [one], late)
-    with apply_edits(policy, edits, [one], vectors):
-        moved = subject.run([one])
+    with apply_edits(policy, edits, [observation], vectors) as edit_log:
+        edited = _captured(subject, [observation], late)
+    with apply_edits(policy, edits, [observation], vectors):
+        moved = subject.run([observation])
     require_bits(moved, subject.run([other]), "actions with keys and values of another picture", "its own actions")
     for site in late:
         require(torch.equal(edited[site], source[site]), f"another activation at {site}", "the other picture's")
@@ -156,8 +160,8 @@ def all_keys_and_values_of_another_picture_give_that_pictures_actions(subject: P
         "other activations",
     )
     order = [entry.site for entry in edit_log.entries if entry.site.startswith(kv.name)]
-    wanted = [str(site) for layer in range(kv.layers - 1) for site in _of(kv, layer)]
-    require(order == wanted, f"edits in the order {order}", f"{wanted}")
+    expected = [str(site) for layer in range(kv.layers - 1) for site in _of(kv, layer)]
+    require(order == expected, f"edits in the order {order}", f"{expected}")
     require(sum(entry.moved for entry in edit_log.entries) > 0, "edits that move nothing", "other keys and values")
 
 
@@ -166,18 +170,18 @@ def all_keys_and_values_of_another_picture_give_that_pictures_actions(subject: P
     "Let the tokens of `kv` be those of the backbone, in the same order.",
 )
 def values_of_one_role_are_replaced_in_that_role_only(subject: PolicySubject) -> None:
-    policy, kv, one = subject.policy, _prompt_kv(subject), subject.one[0]
+    policy, kv, observation = subject.policy, _prompt_kv(subject), subject.single[0]
     site = _of(kv, 0)[1]
     plain, source = (
-        _captured(subject, [own], [site])[site][0].float().cpu()
-        for own in (one, replace(one, image=255 - one.image))
+        _captured(subject, [picture], [site])[site][0].float().cpu()
+        for picture in (observation, replace(observation, image=255 - observation.image))
     )
-    own = Edit("replace", (site,), roles=("image",), vector=vector_hash(source.numpy()))
-    with apply_edits(policy, [own], [one], {own.vector: source.numpy()}) as edit_log:
-        edited = _captured(subject, [one], [site])[site][0].float().cpu()
-    image = torch.from_numpy(policy.token_roles([one])[kv.name][0].mask("image"))
-    wanted = torch.where(image[:, None], source, plain)
-    require(torch.equal(edited, wanted), f"{site} differs outside of the picture's tokens", "new values there")
+    replacement = Edit("replace", (site,), roles=("image",), vector=vector_hash(source.numpy()))
+    with apply_edits(policy, [replacement], [observation], {replacement.vector: source.numpy()}) as edit_log:
+        edited = _captured(subject, [observation], [site])[site][0].float().cpu()
+    image = torch.from_numpy(policy.token_roles([observation])[kv.name][0].mask("image"))
+    expected = torch.where(image[:, None], source, plain)
+    require(torch.equal(edited, expected), f"{site} differs outside of the picture's tokens", "new values there")
     tokens = [entry.tokens for entry in edit_log.entries]
     require(tokens == [int(image.sum())], f"edits of {tokens} tokens", f"[{int(image.sum())}]")
 
@@ -190,8 +194,8 @@ def values_of_one_role_are_replaced_in_that_role_only(subject: PolicySubject) ->
     "Correct `patch_order`: per token of the vision tower, the picture token it ends in.",
 )
 def every_token_of_the_picture_comes_of_the_patches_that_are_named(subject: PolicySubject) -> None:
-    """What leaves the vision tower at the patches of one token reaches that token's embedding and no other."""
-    policy, one = subject.policy, subject.one
+    """Change the tower's output at the patches of one token: that token's embedding moves, and no other."""
+    policy, observations = subject.policy, subject.single
     if not policy.interventions.tiles:
         with refused("patch_order()", UnknownSiteError, says=policy.card.family):
             policy.patch_order()
@@ -199,17 +203,19 @@ def every_token_of_the_picture_comes_of_the_patches_that_are_named(subject: Poli
     order, stream = policy.patch_order(), policy.every_stream()["vision"]
     last = next(site for site in stream.sites() if site.layer == stream.layers - 1)
     embedded = next(site for site in policy.sites() if policy.streams[site.stream].part == "backbone")
-    picture = np.flatnonzero(policy.roles(one)["backbone"][0].mask(f"image.{policy.card.cameras[0]}"))
-    named = set(order.tolist()) - {-1}
+    picture = np.flatnonzero(policy.roles(observations)["backbone"][0].mask(f"image.{policy.card.cameras[0]}"))
+    picture_tokens = set(order.tolist()) - {-1}
     require(
-        named == set(range(picture.size)), f"patch_order names {len(named)} tokens", f"0 to {picture.size - 1}"
+        picture_tokens == set(range(picture.size)),
+        f"patch_order names {len(picture_tokens)} tokens",
+        f"0 to {picture.size - 1}",
     )
-    plain = _captured(subject, one, [last, embedded])
+    plain = _captured(subject, observations, [last, embedded])
     tokens = plain[last].shape[-2]
     require(tokens == order.size, f"patch_order of length {order.size}", f"{tokens}, one per token of the tower")
     for token in (0, 1, picture.size // 2, picture.size - 1):
         with edit(policy, {last: _turned(np.flatnonzero(order == token))}):
-            changed = _captured(subject, one, [embedded])
+            changed = _captured(subject, observations, [embedded])
         moved = (changed[embedded] != plain[embedded])[0].any(dim=-1).cpu().numpy()
         reached = np.flatnonzero(moved).tolist()
         require(
@@ -225,27 +231,27 @@ def every_token_of_the_picture_comes_of_the_patches_that_are_named(subject: Poli
     "Record softmax weights over all tokens of the backbone, computed in addition where kernels return none.",
 )
 def attention_is_recorded_without_changing_an_action_bit_for_bit(subject: PolicySubject) -> None:
-    policy, seen = subject.policy, subject.seen
+    policy, observations = subject.policy, subject.batch
     if not policy.interventions.attention:
         with refused("recorded attention", UnsupportedInterventionError), capture_attention(policy):
             pass
         raise SkipTest(f"{policy.card.family} declares no attention, and refuses it by name")
-    plain = subject.run(seen)
+    plain = subject.run(observations)
     with capture_attention(policy) as mass:
-        recorded = subject.run(seen)
+        recorded = subject.run(observations)
     require_bits(recorded, plain, "actions with recorded attention", "those without")
     backbone = subject.probed_backbone
-    roles = policy.roles(seen)[backbone.name]
+    roles = policy.roles(observations)[backbone.name]
     valid = np.stack([row.valid for row in roles])
-    steps = max(own.iterations or 1 for own in policy.streams.values() if own.part == "action")
+    steps = max(stream.iterations or 1 for stream in policy.streams.values() if stream.part == "action")
     blocks, iterations = ({key[at] for key in mass.by_read} for at in (0, 1))
     require(iterations >= set(range(steps)), f"iterations {sorted(iterations)}", f"0 to {steps - 1}")
     require(blocks <= set(range(backbone.layers - 1)), f"blocks {sorted(blocks)}", f"below {backbone.layers - 1}")
     most = 1 + subject.attention_tolerance
-    for weights, whole in zip(mass.by_read.values(), mass.on(valid).values(), strict=True):
+    for weights, sums in zip(mass.by_read.values(), mass.on(valid).values(), strict=True):
         require(weights.shape == valid.shape, f"weights of shape {weights.shape}", f"{valid.shape}")
         require(bool((weights >= 0).all()), "negative weights", "weights from 0 on")
-        require(bool(((whole > 0) & (whole <= most)).all()), f"shares up to {whole.max():.6g}", "shares in (0, 1]")
+        require(bool(((sums > 0) & (sums <= most)).all()), f"shares up to {sums.max():.6g}", "shares in (0, 1]")
         require(np.abs(weights[~valid]).max(initial=0) == 0, "attention to padding", "none")
     shares = mass.of_role(roles, "image").values()
     require(all((share > 0).all() for share in shares), "no attention to the picture", "some, from softmax")
@@ -253,10 +259,10 @@ def attention_is_recorded_without_changing_an_action_bit_for_bit(subject: Policy
 
 def _turned(positions: NDArray[np.int64]) -> EditFunction:
     """An edit that changes the sign at some positions."""
-    own = torch.from_numpy(positions)
+    indices = torch.from_numpy(positions)
 
     def turn(passing: torch.Tensor) -> torch.Tensor:
-        passing[:, own] = -passing[:, own]
+        passing[:, indices] = -passing[:, indices]
         return passing
 
     return turn
@@ -268,10 +274,12 @@ def _prompt_kv(subject: PolicySubject) -> Stream:
     return subject.policy.prompt_kv
 
 
-def _captured(subject: PolicySubject, seen: Sequence[Observation], sites: Sequence[Site]) -> ActivationCache:
-    """What one inference leaves at `sites`."""
+def _captured(
+    subject: PolicySubject, observations: Sequence[Observation], sites: Sequence[Site]
+) -> ActivationCache:
+    """Return the activations of one inference at `sites`."""
     with capture(subject.policy, sites) as tape:
-        subject.run(seen)
+        subject.run(observations)
     return tape
 
 

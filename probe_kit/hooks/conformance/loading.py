@@ -30,8 +30,8 @@ def the_card_names_the_weights(subject: Subject) -> None:
     require(len(card.weights_sha256) == 64, f"weights_sha256 is {card.weights_sha256!r}", "64 hexadecimal digits")
     require(card.parameters > 0, f"{card.parameters} parameters", "the number of the network")
     require(bool(card.cameras), "no cameras", "the names of the cameras that the model reads")
-    others = {name for name, value in card.settings.items() if not isinstance(value, str)}
-    require(not others, f"settings {sorted(others)} are not text", "text values")
+    not_text = {name for name, value in card.settings.items() if not isinstance(value, str)}
+    require(not not_text, f"settings {sorted(not_text)} are not text", "text values")
 
 
 @check(
@@ -60,11 +60,11 @@ def every_file_that_is_read_reaches_the_card(subject: Subject) -> None:
     "Read the option in the loader and put its value into the card's settings.",
 )
 def every_option_reaches_the_card(subject: Subject) -> None:
-    checkpoint, others = subject.checkpoint, subject.other_options
-    if not others:
+    checkpoint, other_values = subject.checkpoint, subject.other_options
+    if not other_values:
         raise SkipTest("the family declares no option of which another value is known")
     plain = subject.load(checkpoint).card.settings
-    for name, values in sorted(others.items()):
+    for name, values in sorted(other_values.items()):
         reached = any(_settings(subject, checkpoint, name, value) != plain for value in values)
         require(reached, f"the same settings with {name}={' or '.join(map(repr, values))}", "other settings")
 
@@ -91,9 +91,9 @@ def an_option_that_is_not_declared_is_refused(subject: Subject) -> None:
     "Take `random_weights` and `weights_seed` in the loader; `models.initialisation.initialise` draws them.",
 )
 def random_twins_differ_by_their_seed_and_repeat_by_it(subject: Subject) -> None:
-    place, options = str(subject.checkpoint), subject.loading_options
+    checkpoint, options = str(subject.checkpoint), subject.loading_options
     cards = [
-        subject.family.load(place, random_weights=True, weights_seed=seed, options=options).card
+        subject.family.load(checkpoint, random_weights=True, weights_seed=seed, options=options).card
         for seed in (1, 1, 2)
     ]
     hashes = [card.weights_sha256 for card in cards]
@@ -132,12 +132,12 @@ def weights_that_are_not_exactly_the_models_are_refused(subject: Subject) -> Non
     "Correct the adapter where `probe-kit verify` lists an output as over.",
 )
 def recorded_outputs_are_reproduced(subject: Subject) -> None:
-    """Where a golden reference holds the checkpoint."""
+    """Compare with the golden reference that holds the checkpoint, if there is one."""
     folder = subject.checkpoint.parent
     if subject.checkpoint.name != CHECKPOINT_FOLDER or not (folder / REFERENCE_FILE).is_file():
         raise SkipTest(f"the checkpoint lies beside no {REFERENCE_FILE}")
     verification = verify_reference(subject.name, folder)
-    over = [own.output for own in verification.comparisons if own.status == "over"]
+    over = [comparison.output for comparison in verification.comparisons if comparison.status == "over"]
     require(
         verification.passed, f"other values of {', '.join(over) or 'nothing recorded'}", "those of the reference"
     )

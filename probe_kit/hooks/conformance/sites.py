@@ -42,10 +42,16 @@ def sites_are_complete_ordered_and_without_doubles(subject: Subject) -> None:
     sites = subject.model.sites()
     require(len(set(sites)) == len(sites) > 0, f"{len(sites)} sites, {len(set(sites))} different", "no doubles")
     for name, stream in subject.model.streams.items():
-        own = [site for site in sites if site.stream == name]
+        stream_sites = [site for site in sites if site.stream == name]
         many = stream.layers * (stream.iterations or 1)
-        require(own == stream.sites(), f"{name}: {len(own)} sites in another order", "those of Stream.sites()")
-        require(len(own) == many, f"{name}: {len(own)} sites", f"layers times iterations, {many}")
+        require(
+            stream_sites == stream.sites(),
+            f"{name}: {len(stream_sites)} sites in another order",
+            "those of Stream.sites()",
+        )
+        require(
+            len(stream_sites) == many, f"{name}: {len(stream_sites)} sites", f"layers times iterations, {many}"
+        )
 
 
 @check(
@@ -57,7 +63,7 @@ def every_site_of_every_quantity_fires_as_often_as_promised(subject: Subject) ->
         for quantity in stream.captured:
             sites = stream.sites(quantity)
             with capture(subject.model, sites) as tape:
-                subject.run(subject.seen)
+                subject.run(subject.batch)
             require(len(tape) == len(sites), f"{len(tape)} sites of {stream.name}.{quantity}", f"{len(sites)}")
 
 
@@ -66,18 +72,18 @@ def every_site_of_every_quantity_fires_as_often_as_promised(subject: Subject) ->
     "Correct the stream's width, the tap's `tokens` and `view`, or the number of positions in `roles`.",
 )
 def activations_have_the_shape_of_their_stream(subject: Subject) -> None:
-    model, seen = subject.model, subject.seen
-    roles = subject.roles_of(seen)
+    model, observations = subject.model, subject.batch
+    roles = subject.roles_of(observations)
     with capture(model, model.sites()) as tape:
-        subject.run(seen)
+        subject.run(observations)
     require(roles.keys() == model.streams.keys(), f"roles of {list(roles)}", f"roles of {list(model.streams)}")
     for name, stream in model.streams.items():
         lengths = {len(row) for row in roles[name]}
         require(len(lengths) == 1, f"rows of {name} with {sorted(lengths)} positions", "equally long rows")
-        wanted = (len(seen), *lengths, stream.width)
+        expected = (len(observations), *lengths, stream.width)
         for site in stream.sites():
             shape = tuple(tape[site].shape)
-            require(shape == wanted, f"{site} has the shape {shape}", f"{wanted}")
+            require(shape == expected, f"{site} has the shape {shape}", f"{expected}")
 
 
 @check(
@@ -85,20 +91,20 @@ def activations_have_the_shape_of_their_stream(subject: Subject) -> None:
     "Tap `attention` and `mlp` where they are added, or declare the stream with sums=False.",
 )
 def what_blocks_add_makes_the_next_residual(subject: Subject) -> None:
-    """Where a stream declares all three quantities."""
+    """Compare the sum in every stream that declares all three quantities."""
     subject.require_float32()
-    seen, roles = subject.seen, subject.roles_of(subject.seen)
+    observations, roles = subject.batch, subject.roles_of(subject.batch)
     for name, stream in subject.model.streams.items():
         if not (stream.sums and set(_SUM) <= set(stream.quantities)):
             continue
         with capture(subject.model, [site for quantity in _SUM for site in stream.sites(quantity)]) as tape:
-            subject.run(seen)
+            subject.run(observations)
         valid = torch.from_numpy(np.stack([row.valid for row in roles[name]]))
         for site in stream.sites("attention"):
             parts = [tape[replace(site, quantity=quantity)].double().cpu() for quantity in _SUM]
-            whole = tape[replace(site, layer=site.layer + 1, quantity="residual")].double().cpu()
-            apart = float((parts[0] + parts[1] + parts[2] - whole)[valid].abs().max())
-            limit = subject.tolerance * (1 + float(whole[valid].abs().max()))
+            following = tape[replace(site, layer=site.layer + 1, quantity="residual")].double().cpu()
+            apart = float((parts[0] + parts[1] + parts[2] - following)[valid].abs().max())
+            limit = subject.tolerance * (1 + float(following[valid].abs().max()))
             require(
                 apart <= limit, f"at block {site.layer} of {name} the sum is off by {apart:.3g}", f"≤ {limit:.3g}"
             )
@@ -109,18 +115,18 @@ def what_blocks_add_makes_the_next_residual(subject: Subject) -> None:
     "Take all randomness from the seeds, and keep no state between calls.",
 )
 def capturing_changes_no_output_bit_for_bit(subject: Subject) -> None:
-    seen = subject.seen
+    observations = subject.batch
 
     def captured() -> NDArray[np.float32]:
         with capture(subject.model, subject.model.sites()):
-            return subject.run(seen)
+            return subject.run(observations)
 
-    plain, hooked = subject.run(seen), captured()
+    plain, hooked = subject.run(observations), captured()
     if not same_bits(plain, hooked):
         raise CheckFailedError(
             f"the outputs with and without hooks differ by up to {np.abs(plain - hooked).max():.3g}",
             "no difference, bit for bit",
-            reason_of_change(lambda: subject.run(seen), plain, captured),
+            reason_of_change(lambda: subject.run(observations), plain, captured),
         )
 
 
@@ -129,11 +135,11 @@ def capturing_changes_no_output_bit_for_bit(subject: Subject) -> None:
     "Register no hooks of your own, and keep no state between calls.",
 )
 def hooks_are_gone_after_an_exception(subject: Subject) -> None:
-    model, seen = subject.model, subject.seen
-    plain = subject.run(seen)
+    model, observations = subject.model, subject.batch
+    plain = subject.run(observations)
     with refused("an exception in a capture", KeyError, says="body"), capture(model, model.sites()):
         raise KeyError("body")
-    require_bits(subject.run(seen), plain, "outputs after the exception", "those before it")
+    require_bits(subject.run(observations), plain, "outputs after the exception", "those before it")
     with refused("a capture without an inference", SiteNeverFiredError), capture(model, model.sites()[:1]):
         pass
 
@@ -147,7 +153,7 @@ def nested_captures_are_refused(subject: Subject) -> None:
     with capture(model, sites):
         with refused("a capture inside a capture", CaptureError), capture(model, sites):
             pass
-        subject.run(subject.seen)
+        subject.run(subject.batch)
 
 
 @check(

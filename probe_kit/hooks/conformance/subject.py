@@ -104,10 +104,10 @@ class Subject:
     @cached_property
     def checkpoint(self) -> Path:
         """A folder that may be copied and loaded. Raises SkipTest where there is none, or a large one."""
-        place = self.family.place(self.given_checkpoint, self.options.get(SIZE))
-        if place is None:
+        location = self.family.location(self.given_checkpoint, self.options.get(SIZE))
+        if location is None:
             raise SkipTest("the family brings its own weights; give --checkpoint to check how it loads")
-        folder = checkpoint_folder(place)
+        folder = checkpoint_folder(location)
         if (size := sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())) > LARGEST_COPY:
             raise SkipTest(
                 f"the checkpoint has {size / 1e9:.1f} GB and would be copied; check a tiny one of the same layout"
@@ -123,11 +123,13 @@ class Subject:
 
     @property
     def other_options(self) -> dict[str, tuple[Any, ...]]:
-        """Of every option the values that are not in use, as far as they are known."""
-        declared = [own for own in self.family.options if own.name != SIZE]
-        others = {own.name: _others(own, self.options.get(own.name, own.default)) for own in declared}
-        named = {name: (value,) for name, value in self._others.items()}
-        return {name: values for name, values in others.items() if values} | named
+        """The values of every option that are not in use, as far as they are known."""
+        declared = [option for option in self.family.options if option.name != SIZE]
+        declared_values = {
+            option.name: _others(option, self.options.get(option.name, option.default)) for option in declared
+        }
+        passed_values = {name: (value,) for name, value in self._others.items()}
+        return {name: values for name, values in declared_values.items() if values} | passed_values
 
     def load(self, checkpoint: Path, **options: Any) -> Model:
         """The model of another checkpoint."""
@@ -151,12 +153,12 @@ class Subject:
         return examples_for(self.model, *self.instructions)
 
     @property
-    def seen(self) -> list[Observation]:
-        """As many observations as one call takes."""
+    def batch(self) -> list[Observation]:
+        """The observations that one call takes."""
         return self.observations[: self.model.card.batch]
 
     @property
-    def one(self) -> list[Observation]:
+    def single(self) -> list[Observation]:
         """The first observation."""
         return self.observations[:1]
 
@@ -168,24 +170,24 @@ class Subject:
     @property
     def probed_backbone(self) -> Stream:
         """The stream in which knowledge is probed."""
-        streams = [own for own in self.model.streams.values() if own.part == "backbone" and own.probed]
+        streams = [stream for stream in self.model.streams.values() if stream.part == "backbone" and stream.probed]
         require(bool(streams), f"streams {list(self.model.streams)}", "a probed stream with part='backbone'")
         return streams[0]
 
     # -- how it is run ------------------------------------------------------------------------------------
 
-    def run(self, seen: Sequence[Observation]) -> NDArray[np.float32]:
+    def run(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
         """One inference: a row of numbers per observation."""
         raise NotImplementedError
 
     def run_row(self, observation: Observation, row: int) -> NDArray[np.float32]:
-        """What `run` gives for row `row` of a batch, alone."""
+        """Return the numbers that `run` gives for row `row` of a batch, of an inference of that row alone."""
         del row
         return np.asarray(self.run([observation])[0])
 
-    def roles_of(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles_of(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Roles of what `run` makes of these observations."""
-        return self.model.roles(seen)
+        return self.model.roles(observations)
 
 
 def _others(option: Option, used: Any) -> tuple[Any, ...]:
@@ -208,18 +210,18 @@ class PolicySubject(Subject):
         assert isinstance(model, Policy)
         return model
 
-    def run(self, seen: Sequence[Observation]) -> NDArray[np.float32]:
+    def run(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
         """Actions from the seeds 0, 1 …; what the network puts out where they do not fit this arm."""
-        return self._infer(seen, range(len(seen)))
+        return self._infer(observations, range(len(observations)))
 
     def run_row(self, observation: Observation, row: int) -> NDArray[np.float32]:
-        """With the row's own seed."""
+        """Return the actions of one observation, with the row's own seed."""
         return np.asarray(self._infer([observation], [row])[0])
 
-    def _infer(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def _infer(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         policy = self.policy
         infer = policy.act if policy.embodiment_mismatch() is None else policy.infer_without_acting
-        return infer(seen, seeds)
+        return infer(observations, seeds)
 
 
 class AnswerSubject(Subject):
@@ -241,25 +243,25 @@ class AnswerSubject(Subject):
 
     @property
     def questions(self) -> list[Prompt]:
-        """About all observations."""
+        """Questions about all observations."""
         return self.questions_of(self.observations)
 
     @property
-    def asked(self) -> list[Prompt]:
-        """About as many observations as one call takes."""
-        return self.questions_of(self.seen)
+    def questions_of_batch(self) -> list[Prompt]:
+        """Questions about the observations that one call takes."""
+        return self.questions_of(self.batch)
 
-    def questions_of(self, seen: Sequence[Observation]) -> list[Prompt]:
+    def questions_of(self, observations: Sequence[Observation]) -> list[Prompt]:
         """The observations' instructions as questions."""
-        return [Prompt(own, own.instruction, self.letters) for own in seen]
+        return [Prompt(observation, observation.instruction, self.letters) for observation in observations]
 
-    def run(self, seen: Sequence[Observation]) -> NDArray[np.float32]:
+    def run(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
         """The logits of the options."""
-        return self.ask(self.questions_of(seen))
+        return self.ask(self.questions_of(observations))
 
-    def roles_of(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Of the questions asked about them."""
-        return self.answer_model.asked_roles(self.led(self.questions_of(seen)))
+    def roles_of(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Roles of the questions about these observations."""
+        return self.answer_model.asked_roles(self.led(self.questions_of(observations)))
 
     def read(self, questions: Sequence[Prompt]) -> Reading:
         """One prefill of the questions."""
@@ -270,11 +272,13 @@ class AnswerSubject(Subject):
         return self.read(questions).option_logits
 
     def led(self, questions: Sequence[Prompt]) -> list[Prompt]:
-        """With options as they stand behind the frame."""
+        """Return questions whose options stand as they do behind the frame."""
         lead = self.answer_model.lead
         return [
-            own if own.begun else replace(own, options=tuple(lead + letter for letter in own.options))
-            for own in questions
+            question
+            if question.begun
+            else replace(question, options=tuple(lead + letter for letter in question.options))
+            for question in questions
         ]
 
 

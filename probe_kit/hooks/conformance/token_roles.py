@@ -19,11 +19,11 @@ from probe_kit.hooks.contract.views import PADDING, plays, view_names
     "Name every role of `roles` in `role_names`, and call no whole row padding.",
 )
 def roles_cover_every_position_and_are_the_declared_ones(subject: Subject) -> None:
-    for name, rows in subject.roles_of(subject.seen).items():
+    for name, rows in subject.roles_of(subject.batch).items():
         declared = set(subject.model.role_names[name])
         for row in rows:
-            found = {span.role for span in row.spans}
-            require(found <= declared, f"{name} has the roles {sorted(found)}", f"some of {sorted(declared)}")
+            roles = {span.role for span in row.spans}
+            require(roles <= declared, f"{name} has the roles {sorted(roles)}", f"some of {sorted(declared)}")
             require(bool(row.valid.any()), f"a row of {name} is padding only", "at least one token")
 
 
@@ -32,8 +32,8 @@ def roles_cover_every_position_and_are_the_declared_ones(subject: Subject) -> No
     "Correct the order and the numbers of positions in `roles`.",
 )
 def another_picture_moves_image_positions_only(subject: Subject) -> None:
-    one = subject.observations[0]
-    _require_moves(subject, one, replace(one, image=255 - one.image), "image")
+    observation = subject.observations[0]
+    _require_moves(subject, observation, replace(observation, image=255 - observation.image), "image")
 
 
 @check(
@@ -41,33 +41,37 @@ def another_picture_moves_image_positions_only(subject: Subject) -> None:
     "Correct the order and the numbers of positions in `roles`.",
 )
 def another_instruction_moves_language_positions_only(subject: Subject) -> None:
-    one, other = _alike(subject, subject.alike)
-    _require_moves(subject, one, replace(one, instruction=other.instruction), "language")
+    observation, other = _alike(subject, subject.alike)
+    _require_moves(subject, observation, replace(observation, instruction=other.instruction), "language")
 
 
 def _alike(subject: Subject, candidates: Sequence[Observation]) -> tuple[Observation, Observation]:
     """The first two whose instructions have equally many tokens."""
     name = subject.probed_backbone.name
-    for one, other in combinations(candidates, 2):
-        if subject.roles_of([one])[name] == subject.roles_of([replace(one, instruction=other.instruction)])[name]:
-            return one, other
+    for observation, other in combinations(candidates, 2):
+        if (
+            subject.roles_of([observation])[name]
+            == subject.roles_of([replace(observation, instruction=other.instruction)])[name]
+        ):
+            return observation, other
     raise CheckFailedError(
-        f"no two of the instructions {[own.instruction for own in candidates]} have equally many tokens",
+        f"no two of the instructions {[candidate.instruction for candidate in candidates]} "
+        "have equally many tokens",
         "two that have, so that positions can be compared",
         "Give such instructions: `--instruction` of the command, the fixture `alike` of the contract class.",
     )
 
 
-def _require_moves(subject: Subject, one: Observation, other: Observation, role: str) -> None:
+def _require_moves(subject: Subject, first: Observation, second: Observation, role: str) -> None:
     """Between two observations with the same roles, only the embeddings of `role` differ, and some do."""
     stream = subject.probed_backbone
-    before: Roles = subject.roles_of([one])[stream.name][0]
-    site, kept = stream.sites()[0], []
-    for observation in (one, other):
+    before: Roles = subject.roles_of([first])[stream.name][0]
+    site, embeddings = stream.sites()[0], []
+    for observation in (first, second):
         with capture(subject.model, [site]) as tape:
             subject.run([observation])
-        kept.append(tape[site][0].float().cpu())
-    moved = (kept[0] != kept[1]).any(dim=1).numpy() & before.valid
+        embeddings.append(tape[site][0].float().cpu())
+    moved = (embeddings[0] != embeddings[1]).any(dim=1).numpy() & before.valid
     require(bool(moved.any()), f"another {role} changes nothing at {site}", f"other embeddings of the {role}")
     labels = {span.role for span in before.spans if moved[span.start : span.stop].any()}
     require(
@@ -82,7 +86,7 @@ def _require_moves(subject: Subject, one: Observation, other: Observation, role:
     "Give padded positions the role `padding`.",
 )
 def padding_is_never_pooled(subject: Subject) -> None:
-    for name, rows in subject.roles_of(subject.seen).items():
+    for name, rows in subject.roles_of(subject.batch).items():
         for row in rows:
             tokens = torch.ones(len(row), 2)
             tokens[torch.from_numpy(row.mask(PADDING))] = 1e9

@@ -10,7 +10,7 @@ EMBEDDED = "embedded"
 
 @dataclass(frozen=True)
 class SourceWeights:
-    """What identifies the weights that a policy's network grew from; None for what is not known.
+    """The identity of the weights that a policy's network grew from; None for an unknown part.
 
     checkpoint: their hub id. sha256: as `ModelCard.weights_sha256`. parameters: their count in memory.
     """
@@ -22,11 +22,11 @@ class SourceWeights:
 
 @dataclass(frozen=True)
 class ModelCard:
-    """What was really loaded.
+    """The identity of a loaded model: weights, settings and shape.
 
     settings: everything outside the weights that actions, answers or activations depend on, such as the prompt and
     the contents of every file a loader reads; part of a run's identity.
-    weights_seed: of a untrained network; None for weights from a file.
+    weights_seed: of an untrained network; None for weights from a file.
     batch: the largest number of observations per call, None for any; 1 where batching changes the numbers.
     needs: what every observation must hold besides picture, state and instruction; see `Observation.lacks`.
     chunk, execute: actions per inference and how many of them are executed; 0 for a model that does not act.
@@ -63,7 +63,7 @@ class ModelCard:
     repositories: Mapping[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """As stored in a run's certificate: plain values only."""
+        """Return plain values, as stored in a run's certificate."""
         plain = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return {
             **plain,

@@ -33,10 +33,10 @@ def chosen_tokens(name: str, layers: int, width: int, iterations: int, sums: boo
 
 
 def expert(
-    layers: int, width: int, iterations: int, tokens: int, roles: tuple[str, ...], **further: Any
+    layers: int, width: int, iterations: int, tokens: int, roles: tuple[str, ...], **fields: Any
 ) -> DeclaredStream:
-    """A flow or diffusion transformer, with its tokens at every iteration. further: fields of `Stream`."""
-    shape = {"name": "expert", "part": "action", **further}
+    """A flow or diffusion transformer, with its tokens at every iteration. fields: those of `Stream`."""
+    shape = {"name": "expert", "part": "action", **fields}
     return DeclaredStream(Stream(layers=layers, width=width, iterations=iterations, **shape), tokens, roles)
 
 

@@ -35,7 +35,7 @@ _UNDECLARED = {
 
 @dataclass(frozen=True)
 class Interventions:
-    """What can be asked of a family when the question is whether a stream is used.
+    """The interventions that a family supports, to test whether a stream is used.
 
     Following, the comparison of actions on swapped images or words, every policy supports: it is two
     inferences.
@@ -71,32 +71,39 @@ class Interventions:
 
     def supports(self, kind: InterventionKind) -> bool:
         """Whether `kind` can be asked for."""
-        own = {"kv": self.prompt_kv, "attention": self.attention, "tiles": self.tiles, "gradients": self.gradients}
-        return own.get(kind, True)
+        declared = {
+            "kv": self.prompt_kv,
+            "attention": self.attention,
+            "tiles": self.tiles,
+            "gradients": self.gradients,
+        }
+        return declared.get(kind, True)
 
     def asked_as(self) -> dict[str, list[str]]:
-        """What is supported, as `probe-kit intervene` asks for it: values by option."""
-        found: dict[str, list[str]] = {}
+        """The options and values of `probe-kit intervene` that are supported."""
+        values_of: dict[str, list[str]] = {}
         for kind, (option, values) in ASKED_AS.items():
             if self.supports(kind):
-                found.setdefault(option, []).extend(values)
-        return found
+                values_of.setdefault(option, []).extend(values)
+        return values_of
 
     def check(self, kind: InterventionKind, family: str) -> None:
         """Raises UnsupportedInterventionError if `family`, whose declaration this is, does not support `kind`."""
         if not self.supports(kind):
             why = {**_UNDECLARED, **self.instead}[kind]
             option, values = ASKED_AS[kind]
-            asked = f"{option} {', '.join(values)}"
+            request = f"{option} {', '.join(values)}"
             raise UnsupportedInterventionError(
-                f"{family} does not support the intervention {kind!r} (`probe-kit intervene {asked}`): {why}"
+                f"{family} does not support the intervention {kind!r} (`probe-kit intervene {request}`): {why}"
             )
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, for listings and certificates."""
         return {
             "kinds": [kind for kind in get_args(InterventionKind) if self.supports(kind)],
-            "edits": None if self.edits is None else {name: list(own) for name, own in self.edits.items()},
+            "edits": None
+            if self.edits is None
+            else {name: list(quantities) for name, quantities in self.edits.items()},
             "unread": list(self.unread),
             "first_affected_token": self.first_affected_token,
             "readout": self.readout,

@@ -35,8 +35,8 @@ class Rows:
         """The block as a view: (B, …) of (B * blocks, …). Raises CaptureError if the rows do not divide."""
         if self.blocks == 1:
             return activation
-        rows, left = divmod(activation.shape[0], self.blocks)
-        if left:
+        rows, remainder = divmod(activation.shape[0], self.blocks)
+        if remainder:
             raise CaptureError(
                 f"{activation.shape[0]} rows do not make {self.blocks} equal blocks; correct the tap"
             )
@@ -49,7 +49,7 @@ EVERY = slice(None)
 
 @dataclass(frozen=True)
 class Tap:
-    """Where a site is read and written: an input or output of `module`, called `fires` times per inference.
+    """An input or output of `module`, called `fires` times per inference, at which a site is read and written.
 
     tokens: the positions of that (B, T, D) tensor which belong to the site, where one call serves two streams.
     rows: the block of the batch which belongs to the site, where one call serves several.
@@ -77,8 +77,8 @@ class Tap:
 
     def select(self, passing: Tensor) -> Tensor:
         """The site's own (B, T, D), a view of what passes, or that itself where all of it is the site's."""
-        whole = self.rows.of(passing if self.view is None else self.view(passing))
-        return whole if self.tokens == EVERY else whole[:, self.tokens]
+        activation = self.rows.of(passing if self.view is None else self.view(passing))
+        return activation if self.tokens == EVERY else activation[:, self.tokens]
 
     def write(self, passing: Tensor, new: Tensor) -> None:
         """Put `new` (B, T, D) where `select` reads."""
@@ -87,7 +87,7 @@ class Tap:
 
 @dataclass(frozen=True)
 class HeadsTap(Tap):
-    """Where what passes has heads, (B, H, T, E), as keys and values do; a site sees them as (B, T, H · E)."""
+    """A tap of a tensor with heads, (B, H, T, E), such as keys and values; a site has them as (B, T, H · E)."""
 
     def select(self, passing: Tensor) -> Tensor:
         """The site's own (B, T, H · E); to write it, use `write`."""
@@ -95,8 +95,8 @@ class HeadsTap(Tap):
 
     def write(self, passing: Tensor, new: Tensor) -> None:
         """Put `new` (B, T, H · E) where `select` reads."""
-        own = self._by_token(passing)
-        own.copy_(new.reshape(own.shape))
+        by_token = self._by_token(passing)
+        by_token.copy_(new.reshape(by_token.shape))
 
     def _by_token(self, passing: Tensor) -> Tensor:
         """(B, T, H, E), a view."""
@@ -126,16 +126,16 @@ class Model(ABC):
         return model_html(self.card, self.streams)
 
     @abstractmethod
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Per stored stream, the roles of every token position of every row, from the model's own packing."""
 
     @abstractmethod
     def tap(self, site: Site) -> Tap:
-        """Where `site` is read and written. Raises UnknownSiteError."""
+        """Return the tap at which `site` is read and written. Raises UnknownSiteError."""
 
     @property
     def unembedding(self) -> Unembedding | None:
-        """How its last residuals become tokens, for a logit lens; None for a model that puts out no tokens."""
+        """The modules that turn last residuals into tokens, for a logit lens; None for a model without tokens."""
         return None
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]] | None:
@@ -158,13 +158,13 @@ class Model(ABC):
         return [site for stream in having for site in stream.sites(quantity)]
 
     def every_stream(self) -> dict[str, Stream]:
-        """What is stored, what is captured by name only, and `kv`."""
+        """The streams that are stored, those captured by name only, and `kv`."""
         kv = {} if self.prompt_kv is None else {self.prompt_kv.name: self.prompt_kv}
         return {**self.streams, **self.further_streams, **kv}
 
-    def token_roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """As `roles`, and those of the tokens of `kv`."""
-        roles = self.roles(seen)
+    def token_roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Return `roles`, and those of the tokens of `kv`."""
+        roles = self.roles(observations)
         if self.prompt_kv is not None:
             roles[self.prompt_kv.name] = roles[self.tokens_of(self.prompt_kv.name)]
         return roles
@@ -189,30 +189,30 @@ class Model(ABC):
         """The stream `site` lies in. Raises UnknownSiteError, naming what there is."""
         stream = self.streams.get(site.stream) or self.every_stream().get(site.stream)
         if stream is None or not stream.holds(site):
-            there = "; ".join(
-                f"{own.name}: {own.layers} layers"
-                + (f" x {own.iterations} iterations" if own.iterations else "")
-                + f" of {', '.join(own.captured)}"
-                for own in self.every_stream().values()
+            available = "; ".join(
+                f"{existing.name}: {existing.layers} layers"
+                + (f" x {existing.iterations} iterations" if existing.iterations else "")
+                + f" of {', '.join(existing.captured)}"
+                for existing in self.every_stream().values()
             )
-            raise UnknownSiteError(f"{self.card.family} has no site {site}; it has {there}")
+            raise UnknownSiteError(f"{self.card.family} has no site {site}; it has {available}")
         return stream
 
-    def check(self, seen: Sequence[Observation], seeds: Sequence[int] | None = None) -> None:
+    def check(self, observations: Sequence[Observation], seeds: Sequence[int] | None = None) -> None:
         """Refuse what the card rules out; adapters call it first.
 
         Raises ObservationError for a batch over `card.batch`, an observation without what `card.needs` names, and
         another number of seeds than of observations.
         """
-        if seeds is not None and len(seeds) != len(seen):
-            raise ObservationError(f"{len(seen)} observations but {len(seeds)} seeds; give each its own")
+        if seeds is not None and len(seeds) != len(observations):
+            raise ObservationError(f"{len(observations)} observations but {len(seeds)} seeds; give each its own")
         limit = self.card.batch
-        if limit is not None and len(seen) > limit:
+        if limit is not None and len(observations) > limit:
             raise ObservationError(
-                f"{len(seen)} observations in one call; {self.card.family} takes at most {limit}: a larger "
-                "batch changes its numbers"
+                f"{len(observations)} observations in one call; {self.card.family} takes at most {limit}: a "
+                "larger batch changes its numbers"
             )
-        for observation in seen:
+        for observation in observations:
             if lacking := observation.lacks(self.card.needs):
                 raise ObservationError(
                     f"the observation has no {', '.join(lacking)}, which {self.card.family} reads; choose a scene "
@@ -240,19 +240,21 @@ class Policy(Model):
         return None
 
     def configured_mismatch(self) -> str | None:
-        """As `embodiment_mismatch`, from the configuration alone: its statistics may not be here yet."""
+        """Return the mismatch as far as the configuration alone shows it: statistics may not be here yet."""
         return None
 
     def zero_filled_inputs(self) -> tuple[str, ...]:
         """Inputs that `infer_without_acting` replaces by zeros, because the checkpoint expects others there."""
         return ()
 
-    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(
+        self, observations: Sequence[Observation], seeds: Sequence[int]
+    ) -> NDArray[np.float32]:
         """One inference as `act` makes it, whatever its output means: (B, chunk, any width) float32.
 
         For a policy with an `embodiment_mismatch`, which `act` refuses.
         """
-        return self.act(seen, seeds)
+        return self.act(observations, seeds)
 
     def record_attention(self, note: Callable[[int, int, Tensor], None]) -> AbstractContextManager[None]:
         """A context in which `note` receives the attention of the acting stream; see `hooks.attention`.
@@ -266,14 +268,14 @@ class Policy(Model):
             f"{type(self).__name__} declares attention and does not implement `record_attention`"
         )
 
-    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
+    def differentiable(self, observations: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
         """The actions of `act` with a graph behind them: (B, chunk, 7) in metres and radians, as float32.
 
         For `hooks.gradients_at`. Weights need no gradient, no module is compiled, attention is eager, and numbers
         equal those of `act` to 1e-5 in float32. A number without a slope, such as a gripper that is open or
         closed, has gradient zero. Raises UnsupportedInterventionError.
         """
-        del seen, seeds
+        del observations, seeds
         self.interventions.check("gradients", self.card.family)
         raise NotImplementedError(
             f"{type(self).__name__} declares gradients and does not implement `differentiable`"
@@ -281,7 +283,7 @@ class Policy(Model):
 
     @property
     def state_numbers(self) -> int | None:
-        """How many numbers a recorded state must have; None for a policy that takes any, or reads none."""
+        """The count of numbers in a recorded state; None for a policy that takes any, or reads none."""
         return None
 
     def with_cameras(self, cameras: Sequence[str]) -> "Policy":
@@ -331,15 +333,15 @@ class Policy(Model):
         """Whether `predict` gives changes relative to the state, where a data set has the actions themselves."""
         return False
 
-    def predict(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def predict(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per recorded observation, in the checkpoint's own units and width.
 
         Returns (B, chunk, D) float32. It makes no claim that the actions fit an arm; states are taken as recorded.
         """
-        return self.act(seen, seeds)
+        return self.act(observations, seeds)
 
     @abstractmethod
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation.
 
         Returns (B, chunk, 7) float32: xyz delta in metres and roll-pitch-yaw delta in radians in the robot
@@ -359,7 +361,7 @@ class Prompt:
     pictured: whether the picture is shown; False asks in words alone.
     """
 
-    seen: Observation
+    observation: Observation
     text: str
     options: tuple[str, ...] = ()
     begun: str = ""
@@ -368,7 +370,7 @@ class Prompt:
 
 @dataclass(frozen=True)
 class Reading:
-    """What one prefill left.
+    """The result of one prefill.
 
     option_logits: (B, options) float32, one column per option of the questions, in their order.
     option_mass: (B,) float32 share of the next token's probability that lies on the options together.
@@ -383,7 +385,7 @@ class Reading:
 
     @classmethod
     def of(cls, logits: NDArray[np.float32], options: Sequence[Sequence[int]], state: Any = None) -> "Reading":
-        """Of the logits (B, V) behind every prompt and, per row, the ids of its options.
+        """Return the reading of the logits (B, V) behind every prompt. options: per row, the ids of its options.
 
         Raises UsageError for options of a question that have the same id, or another number than their neighbours.
         """
@@ -396,10 +398,10 @@ class Reading:
                     "Name options that differ in their first token, such as letters"
                 )
         ids = np.array(options, np.int64).reshape(len(logits), -1)
-        chosen = np.take_along_axis(logits, ids, axis=1)
+        option_logits = np.take_along_axis(logits, ids, axis=1)
         shares = np.exp(logits - logits.max(axis=1, keepdims=True))
-        peak = np.exp(chosen - logits.max(axis=1, keepdims=True))
-        return cls(chosen, peak.sum(axis=1) / shares.sum(axis=1), state, ids)
+        peak = np.exp(option_logits - logits.max(axis=1, keepdims=True))
+        return cls(option_logits, peak.sum(axis=1) / shares.sum(axis=1), state, ids)
 
 
 NEAR_TIE: Mapping[str, float] = MappingProxyType({"float32": 1e-4, "bfloat16": 0.1})
@@ -425,7 +427,7 @@ class AnswerModel(Model):
 
     @property
     def lead(self) -> str:
-        """What stands between the frame and the first word of an answer, such as a space; see `Prompt`."""
+        """The text between the frame and the first word of an answer, such as a space; see `Prompt`."""
         return ""
 
     @abstractmethod
@@ -446,17 +448,17 @@ class AnswerModel(Model):
     @staticmethod
     def shows_pictures(questions: Sequence[Prompt]) -> bool:
         """Whether the questions are asked about their pictures. Raises UsageError if only some are."""
-        shown = {question.pictured for question in questions}
-        if len(shown) > 1:
+        pictured = {question.pictured for question in questions}
+        if len(pictured) > 1:
             raise UsageError("some of these questions come with a picture and some without; ask them in two calls")
-        return shown != {False}
+        return pictured != {False}
 
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """Like `roles`, of the sequences that `read` makes of these questions.
 
         A family whose prompt depends on more than a question's text, or that also acts, says so itself.
         """
-        return self.roles([replace(question.seen, instruction=question.text) for question in questions])
+        return self.roles([replace(question.observation, instruction=question.text) for question in questions])
 
     @abstractmethod
     def speak(self, reading: Reading, tokens: int) -> list[str]:

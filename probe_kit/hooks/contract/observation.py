@@ -15,7 +15,7 @@ NEEDS = ("state", "intrinsics")
 
 @dataclass(frozen=True)
 class Observation:
-    """What the model sees at one moment.
+    """The inputs of a model at one moment.
 
     image: (H, W, 3) uint8, the third-person camera.
     state: (8,) float32: TCP x, y, z in metres in the robot base frame, roll, pitch, yaw in radians relative
@@ -35,11 +35,11 @@ class Observation:
         return Observation, (self.image, self.state, self.instruction, self.intrinsics, dict(self.cameras))
 
     def lacks(self, needs: frozenset[str]) -> tuple[str, ...]:
-        """What of `needs` this observation does not hold, sorted."""
-        held = {"state"} | {f"camera.{name}" for name in self.cameras}
+        """The parts of `needs` that this observation does not hold, sorted."""
+        available = {"state"} | {f"camera.{name}" for name in self.cameras}
         if self.intrinsics is not None:
-            held.add("intrinsics")
-        return tuple(sorted(needs - held))
+            available.add("intrinsics")
+        return tuple(sorted(needs - available))
 
 
 def checked_picture(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -30,51 +30,51 @@ class Option:
     default: str = ""
     choices: tuple[Any, ...] = ()
 
-    def value(self, given: Any) -> Any:
-        """`given`, text or already of the kind, as the loader gets it. Raises UsageError."""
-        value = self._read(given)
+    def value(self, raw: Any) -> Any:
+        """Return `raw`, text or already of the kind, as the loader gets it. Raises UsageError."""
+        value = self._read(raw)
         if self.choices and value not in self.choices:
             allowed = ", ".join(map(str, self.choices))
-            raise UsageError(f"model option {self.name} is {given!r}; expected one of {allowed}")
+            raise UsageError(f"model option {self.name} is {raw!r}; expected one of {allowed}")
         return value
 
-    def _read(self, given: Any) -> Any:
-        if self.kind is float and type(given) is int:
-            return float(given)
-        if type(given) is self.kind:
-            return given
+    def _read(self, raw: Any) -> Any:
+        if self.kind is float and type(raw) is int:
+            return float(raw)
+        if type(raw) is self.kind:
+            return raw
         try:
-            if not isinstance(given, str):
+            if not isinstance(raw, str):
                 raise ValueError
-            value = _WORDS[given.lower()] if self.kind is bool else self.kind(given)
+            value = _WORDS[raw.lower()] if self.kind is bool else self.kind(raw)
             if isinstance(value, int | float) and not abs(value) <= LARGEST:
                 raise ValueError
             return value
         except (ValueError, KeyError, OverflowError):
-            raise UsageError(f"model option {self.name} is {given!r}; expected {_EXPECTED[self.kind]}") from None
+            raise UsageError(f"model option {self.name} is {raw!r}; expected {_EXPECTED[self.kind]}") from None
 
 
 def read_pairs(pairs: Sequence[str]) -> dict[str, str]:
     """`key=value` texts as a dict. Raises UsageError for another form and for a key given twice."""
-    found: dict[str, str] = {}
+    options: dict[str, str] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not equals or not key.strip():
             raise UsageError(f"model option {pair!r} is not KEY=VALUE, such as -M unnorm_key=bridge_orig")
         name = key.strip().replace("-", "_")
-        if name in found:
-            raise UsageError(f"model option {name} is given twice: {found[name]!r} and {value!r}")
-        found[name] = value
-    return found
+        if name in options:
+            raise UsageError(f"model option {name} is given twice: {options[name]!r} and {value!r}")
+        options[name] = value
+    return options
 
 
-def check_options(family: str, declared: Sequence[Option], given: Mapping[str, Any]) -> dict[str, Any]:
+def check_options(family: str, declared: Sequence[Option], options: Mapping[str, Any]) -> dict[str, Any]:
     """The given options as the loader gets them. Raises UsageError for one that the family does not declare."""
-    known = {option.name: option for option in declared}
-    for name in sorted(given):
-        if name not in known:
-            near = get_close_matches(name, known, n=1)
+    by_name = {option.name: option for option in declared}
+    for name in sorted(options):
+        if name not in by_name:
+            near = get_close_matches(name, by_name, n=1)
             hint = f" Did you mean {near[0]}?" if near else ""
-            there = f"it has {', '.join(sorted(known))}" if known else "it has none"
-            raise UsageError(f"{family} has no model option {name}; {there}.{hint}")
-    return {name: known[name].value(value) for name, value in given.items()}
+            available = f"it has {', '.join(sorted(by_name))}" if by_name else "it has none"
+            raise UsageError(f"{family} has no model option {name}; {available}.{hint}")
+    return {name: by_name[name].value(value) for name, value in options.items()}

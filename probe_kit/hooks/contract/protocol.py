@@ -13,13 +13,13 @@ PLAIN: Rotation = "roll-pitch-yaw"
 
 @dataclass(frozen=True)
 class ProtocolRow:
-    """What a protocol uses a family with.
+    """The settings with which a protocol uses a family.
 
     execute: actions executed per inference. options: of the family, whatever the checkpoint. of_checkpoint: the
     ones that only the protocol's own checkpoint needs. rotation: `roll-pitch-yaw` passes the angles of an action
     on; `axis-angle` passes axis times angle of the same turn on, which the controller then reads as angles.
     unmatched: what of the protocol cannot be done here. variant: which of several checkpoints it is, as in labels.
-    further: rows of the others; without a checkpoint, the row that holds them is used.
+    alternatives: rows of the others; without a checkpoint, the row that holds them is used.
     """
 
     checkpoint: str
@@ -30,12 +30,12 @@ class ProtocolRow:
     rotation: Rotation = PLAIN
     unmatched: tuple[str, ...] = ()
     variant: str = ""
-    further: "tuple[ProtocolRow, ...]" = ()
+    alternatives: "tuple[ProtocolRow, ...]" = ()
 
     @property
     def rows(self) -> "tuple[ProtocolRow, ...]":
-        """This row and the further ones."""
-        return (self, *self.further)
+        """This row and its alternatives."""
+        return (self, *self.alternatives)
 
     def of(self, checkpoint: str | None) -> "ProtocolRow":
         """The row of `checkpoint`, at any revision.
@@ -46,8 +46,8 @@ class ProtocolRow:
 
     def options_for(self, checkpoint: str | None) -> dict[str, Any]:
         """The options with `checkpoint`, None for the protocol's own."""
-        own = self.of_checkpoint if _bare(checkpoint) in (None, self.checkpoint) else {}
-        return {**own, **self.options}
+        checkpoint_options = self.of_checkpoint if _bare(checkpoint) in (None, self.checkpoint) else {}
+        return {**checkpoint_options, **self.options}
 
     def settings(self) -> dict[str, str]:
         """Every setting by name, as text; those of the family with -M in front."""

@@ -88,11 +88,11 @@ def prepare_pool(roles: Iterable[Roles], views: Sequence[str], device: torch.dev
 
     Raises EmptyRoleError and UnknownSiteError as `pool` does.
     """
-    place = torch.device(device)
-    if place.type == "cuda" and place.index is None:
-        place = torch.device("cuda", torch.cuda.current_device())  # as its tensors say
-    for own in roles:
-        _matrix(own, tuple(views), place)
+    indexed_device = torch.device(device)
+    if indexed_device.type == "cuda" and indexed_device.index is None:
+        indexed_device = torch.device("cuda", torch.cuda.current_device())  # as its tensors say
+    for row_roles in roles:
+        _matrix(row_roles, tuple(views), indexed_device)
 
 
 @lru_cache(maxsize=1024)
@@ -109,11 +109,11 @@ def _weights(roles: Roles, view: str) -> NDArray[np.float64]:
         weights[np.flatnonzero(valid)[-1]] = 1
         return weights
     if view == "mean":
-        chosen = valid
+        mask = valid
     elif view.startswith("mean:"):
-        chosen = roles.mask(view.removeprefix("mean:"))
+        mask = roles.mask(view.removeprefix("mean:"))
     else:
         raise UnknownSiteError(f"unknown view {view!r}; expected mean, last or mean:<role>")
-    if not chosen.any():
+    if not mask.any():
         raise EmptyRoleError(f"no token for view {view!r}; roles present: {sorted({s.role for s in roles.spans})}")
-    return np.asarray(chosen / chosen.sum(), np.float64)
+    return np.asarray(mask / mask.sum(), np.float64)

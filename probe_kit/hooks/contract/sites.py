@@ -135,8 +135,8 @@ class Stream:
 
     def holds(self, site: Site) -> bool:
         """Whether `site` is one of its `sites`; none are listed for it, as it is asked at every edit."""
-        named = site.stream == self.name and site.quantity in self.captured
-        return named and site.iteration in self._steps and site.layer in self._layers_of(site.quantity)
+        has_quantity = site.stream == self.name and site.quantity in self.captured
+        return has_quantity and site.iteration in self._steps and site.layer in self._layers_of(site.quantity)
 
     @property
     def _steps(self) -> "Sequence[int | None]":
@@ -161,7 +161,7 @@ def part_of(stream: str) -> Part:
 
 
 def label_of(stream: str) -> str:
-    """What people call a stream of which only the name is left."""
+    """The label of a stream of which only the name is left."""
     return _LABELS.get(stream, stream.replace("_", " "))
 
 

@@ -1,4 +1,4 @@
-"""From a residual stream to the logits of tokens: the final norm and the head of a model that puts out tokens."""
+"""The final norm and the head of a model that puts out tokens: from a residual stream to logits."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class Unembedding:
-    """What a model makes of the last residual of its decoder.
+    """The modules that turn the last residual of a decoder into logits.
 
     streams: whose last residual it reads; the positions that choose tokens come last. norm, head: modules, called
     one after the other. softcap: the logits l become softcap · tanh(l / softcap), as in Gemma 2.
@@ -22,7 +22,7 @@ class Unembedding:
 
     @classmethod
     def of_decoder(cls, streams: tuple[str, ...], language_model: Any, norm: nn.Module) -> "Unembedding":
-        """Of transformers' causal language model: its `lm_head`, and the soft cap of its configuration."""
+        """Return the `lm_head` of transformers' causal language model, with the soft cap of its configuration."""
         config = language_model.config
         cap = getattr(getattr(config, "text_config", config), "final_logit_softcapping", None)
         return cls(streams, norm, language_model.lm_head, None if cap is None else float(cap))
@@ -33,5 +33,5 @@ class Unembedding:
             return self.capped(self.head(self.norm(residual)))
 
     def capped(self, logits: Tensor) -> Tensor:
-        """What leaves the model, of what leaves its head."""
+        """Return the logits that leave the model, of those that leave its head."""
         return logits if self.softcap is None else torch.tanh(logits / self.softcap) * self.softcap

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 PADDING = "padding"
 
 
-def plays(role: str, asked: str) -> bool:
-    """Whether a token of `role` is meant by `asked`: `image.wrist` is by `image.wrist` and by `image`."""
-    return role == asked or role.startswith(f"{asked}.")
+def plays(role: str, group: str) -> bool:
+    """Whether a token of `role` belongs to `group`: `image.wrist` belongs to `image.wrist` and to `image`."""
+    return role == group or role.startswith(f"{group}.")
 
 
 def view_names(roles: Sequence[str]) -> tuple[str, ...]:
@@ -16,8 +16,13 @@ def view_names(roles: Sequence[str]) -> tuple[str, ...]:
     With several cameras also `mean:image` over all of them; with one, `resolve_view` finds it under that name.
     """
     images = [role for role in roles if plays(role, "image")]
-    named = [role for role in roles if role not in (PADDING, "special")]
-    return ("mean", "last", *(f"mean:{role}" for role in named), *(["mean:image"] if len(images) > 1 else []))
+    content_roles = [role for role in roles if role not in (PADDING, "special")]
+    return (
+        "mean",
+        "last",
+        *(f"mean:{role}" for role in content_roles),
+        *(["mean:image"] if len(images) > 1 else []),
+    )
 
 
 def resolve_view(view: str, stored: Sequence[str]) -> str:

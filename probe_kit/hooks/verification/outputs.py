@@ -1,4 +1,4 @@
-"""What a family compares with a golden reference, and the arrays that its captures and modules give."""
+"""The quantities that a family compares with a golden reference, from its captures and modules."""
 
 from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
@@ -59,7 +59,11 @@ def compared_sites(model: Model) -> list[Site]:
     """Return the residuals and final norms of every stream, and the prompt's keys and values."""
     streams = model.every_stream().values()
     return [
-        site for own in streams for name in (*_COMPARED, *KV) if name in own.quantities for site in own.sites(name)
+        site
+        for stream in streams
+        for name in (*_COMPARED, *KV)
+        if name in stream.quantities
+        for site in stream.sites(name)
     ]
 
 
@@ -172,7 +176,9 @@ def _inputs_of(module: nn.Module, stack: ExitStack) -> list[Any]:
     inputs: list[Any] = []
 
     def keep(_module: nn.Module, positional: tuple[Any, ...], keywords: dict[str, Any]) -> None:
-        inputs.append((tuple(map(_copied, positional)), {name: _copied(own) for name, own in keywords.items()}))
+        inputs.append(
+            (tuple(map(_copied, positional)), {name: _copied(value) for name, value in keywords.items()})
+        )
 
     stack.callback(module.register_forward_pre_hook(keep, with_kwargs=True).remove)
     return inputs

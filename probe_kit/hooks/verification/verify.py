@@ -52,7 +52,7 @@ class Verification:
         return "ok" in statuses and "over" not in statuses
 
     def to_json(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return plain values for `--json`."""
         return {**asdict(self), "passed": self.passed}
 
 
@@ -100,23 +100,23 @@ def verify_reference(family: str, folder: Path) -> Verification:
     Raises UnknownModelError, UsageError for a folder without a reference or a family that compares nothing, and
     whatever checking and loading raise.
     """
-    own, file = find_family(family), folder / REFERENCE_FILE
+    declared, file = find_family(family), folder / REFERENCE_FILE
     if not file.is_file():
         raise UsageError(
             f"{folder} is not a golden reference: it has no {REFERENCE_FILE}. Give a folder that has one, and the "
             f"recorded model in {CHECKPOINT_FOLDER}/"
         )
-    own.check_purpose("outputs")
+    declared.check_purpose("outputs")
     recorded = _read_arrays(file)
-    own.check(str(folder / CHECKPOINT_FOLDER))
-    outputs = own.function("outputs")
+    declared.check(str(folder / CHECKPOINT_FOLDER))
+    outputs = declared.function("outputs")
     with while_loading(family, str(folder)):
-        produced = outputs(imported(own.loader), folder, recorded)
+        produced = outputs(imported(declared.loader), folder, recorded)
         return Verification(family, str(folder), compare(recorded, produced))
 
 
 def _read_arrays(file: Path) -> dict[str, NDArray[Any]]:
-    """What an .npz file holds. Raises UsageError if it is damaged or holds something else than numbers."""
+    """The arrays of an .npz file. Raises UsageError if it is damaged or holds something else than numbers."""
     try:
         with open_arrays(file) as arrays:
             return {name: arrays[name] for name in arrays.files}
@@ -134,16 +134,18 @@ def verify_keys(family: str, file: Path) -> Verification:
     as not compared. A name that stands for another one's tensor, such as tied output weights, may be absent. Of
     several released sizes the one that the list differs least from is meant.
     """
-    known = find_family(family)
-    known.check_purpose("full_size")
+    declared = find_family(family)
+    declared.check_purpose("full_size")
     recorded = _read_key_list(file)
-    build, renames = known.function("full_size"), known.renames()
+    build, renames = declared.function("full_size"), declared.renames()
     theirs = {renamed(name, renames): (tuple(entry["shape"]), entry["dtype"]) for name, entry in recorded.items()}
-    sizes: list[str | None] = [name for name, _ in known.sizes] or [None]
-    found = {size: _differences(build(size) if size else build(), theirs, known.unstored) for size in sizes}
-    size = min(found, key=lambda name: len(found[name]))
-    wrong, unstored = found[size], sorted(name for name in theirs if _is_declared(name, known.unstored))
-    whole = Comparison(
+    sizes: list[str | None] = [name for name, _ in declared.sizes] or [None]
+    differences = {
+        size: _differences(build(size) if size else build(), theirs, declared.unstored) for size in sizes
+    }
+    size = min(differences, key=lambda name: len(differences[name]))
+    wrong, unstored = differences[size], sorted(name for name in theirs if _is_declared(name, declared.unstored))
+    comparison = Comparison(
         f"{len(theirs) - len(unstored)} keys{f' of {size}' if size else ''}",
         "over" if wrong else "ok", float(len(wrong)), 0.0, "; ".join(wrong[:8]),
     )  # fmt: skip
@@ -151,14 +153,14 @@ def verify_keys(family: str, file: Path) -> Verification:
         f"{len(unstored)} keys the network does not have", "not compared", None, 0.0,
         f"declared by the family as never read: {', '.join(unstored)}",
     )  # fmt: skip
-    return Verification(family, str(file), (whole, left_out) if unstored else (whole,))
+    return Verification(family, str(file), (comparison, left_out) if unstored else (comparison,))
 
 
 Described = tuple[tuple[int, ...], str]
 
 
 def _differences(network: Any, theirs: Mapping[str, Described], unstored: tuple[str, ...]) -> list[str]:
-    """What is wrong with a list of keys; nothing if it is this network's."""
+    """The differences between a list of keys and this network's; empty if there are none."""
     state = network.state_dict(keep_vars=True)
     ours = {name: _described(tensor) for name, tensor in state.items()}
     present = {id(state[name]) for name in ours.keys() & theirs.keys()}

@@ -250,15 +250,15 @@ class ApplyEraser:
 
     eraser: Eraser
 
-    def __call__(self, site: Site, own: "Tensor", where: TokenIndex) -> "Tensor":
+    def __call__(self, site: Site, activation: "Tensor", where: TokenIndex) -> "Tensor":
         """Computed in float64, as it was fitted."""
         import torch
 
         del site, where
-        known = min(own.shape[1], self.eraser.fitted.size)
-        after = own.clone()
-        erased = self.eraser(own[:, :known].double().cpu().numpy())
-        after[:, :known] = torch.from_numpy(erased).to(own)
+        fitted = min(activation.shape[1], self.eraser.fitted.size)
+        after = activation.clone()
+        erased = self.eraser(activation[:, :fitted].double().cpu().numpy())
+        after[:, :fitted] = torch.from_numpy(erased).to(activation)
         return after
 
 

@@ -34,14 +34,14 @@ def test_a_failure_has_what_was_seen_expected_and_to_be_changed() -> None:
 def test_whatever_an_adapter_raises_is_a_failure_that_names_its_line(error: BaseException) -> None:
     found = of(error)
     assert (found.state, found.change) == ("failed", "Do it.")
-    assert "sys.exit(3)" in found.seen or type(error).__name__ in found.seen
-    assert f"{Path(__file__).name}:" in found.seen
+    assert "sys.exit(3)" in found.actual or type(error).__name__ in found.actual
+    assert f"{Path(__file__).name}:" in found.actual
 
 
 def test_an_error_of_ours_is_told_whole_with_its_notes() -> None:
     error = CheckpointError("the file is torn")
     error.add_note("part 2 of 3")
-    assert of(error).seen.startswith("CheckpointError: the file is torn; part 2 of 3 (")
+    assert of(error).actual.startswith("CheckpointError: the file is torn; part 2 of 3 (")
 
 
 def test_what_a_loader_raised_is_told_in_place_of_the_advice_to_download_again() -> None:
@@ -50,7 +50,7 @@ def test_what_a_loader_raised_is_told_in_place_of_the_advice_to_download_again()
         raise ValueError("width 3")
     except ValueError as cause:
         error.__cause__ = cause
-    assert of(error).seen.startswith("ValueError: width 3 (")
+    assert of(error).actual.startswith("ValueError: width 3 (")
 
 
 def test_ctrl_c_ends_the_command() -> None:

@@ -58,7 +58,7 @@ def test_transformers_reads_the_same_network_from_the_same_folder(vlm: PaliGemma
     with torch.inference_mode():
         logits = theirs(
             input_ids=ids,
-            pixel_values=vlm.shown([picture])["pixel_values"],
+            pixel_values=vlm.picture_inputs([picture])["pixel_values"],
             attention_mask=torch.ones_like(ids),
             token_type_ids=torch.zeros_like(ids),
         ).logits[0, -1]

@@ -119,16 +119,20 @@ class Eo1(DenoisingPolicy):
         """The vision-language model's, with the tokens of states and actions."""
         return self.packing.tokenizer
 
-    def batch(self, seen: Sequence[Observation], state: NDArray[np.float32] | None = None) -> dict[str, Tensor]:
+    def batch(
+        self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
+    ) -> dict[str, Tensor]:
         """In lerobot's keys. state: (B, numbers) as the network reads them."""
-        numbers = torch.from_numpy(self.state(seen) if state is None else state)
-        packed = {**self._packed_of(seen), STATE: numbers}
+        numbers = torch.from_numpy(self.state(observations) if state is None else state)
+        packed = {**self._packed_of(observations), STATE: numbers}
         return {name: own.to(self.config.device) for name, own in packed.items()}
 
-    def _packed_of(self, seen: Sequence[Observation]) -> dict[str, Tensor]:
+    def _packed_of(self, observations: Sequence[Observation]) -> dict[str, Tensor]:
         """The chats of observations; see `_packed`."""
-        pictures = {f"{IMAGES}{camera}": self._pictures(camera, seen).cpu() for camera in self.shown}
-        return self._packed(pictures, [one.instruction for one in seen])
+        pictures = {
+            f"{IMAGES}{camera}": self._pictures(camera, observations).cpu() for camera in self.shown_cameras
+        }
+        return self._packed(pictures, [one.instruction for one in observations])
 
     def _packed(self, pictures: Mapping[str, Tensor], tasks: Sequence[str]) -> dict[str, Tensor]:
         """Raises InstructionError for a text that holds one of the chat's own marks, or none."""
@@ -155,7 +159,7 @@ class Eo1(DenoisingPolicy):
         rows = []
         for ids, valid in zip(packed["input_ids"].tolist(), packed["attention_mask"].tolist(), strict=True):
             row: list[tuple[int, str]] = []
-            words, cameras = False, iter(self.shown)
+            words, cameras = False, iter(self.shown_cameras)
             for one, real in zip(ids[: ids.index(action)], valid, strict=False):
                 if one == picture and (not row or row[-1][0] != picture):
                     camera = next(cameras)
@@ -171,9 +175,9 @@ class Eo1(DenoisingPolicy):
         """Raise InstructionError as `batch` would, from configuration and tokenizer alone."""
         cls._text_reader(checkpoint, evaluation).token_ids(instructions)
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """From the packing itself."""
-        rows = self._labelled(self._packed_of(seen))
+        rows = self._labelled(self._packed_of(observations))
         prompts = [Roles.from_labels([label for _, label in row]) for row in rows]
         return {"backbone": prompts, "expert": [Roles.from_labels(self.suffix_labels())] * len(rows)}
 
@@ -198,7 +202,7 @@ class Eo1(DenoisingPolicy):
         return self.config.chunk_size, self.config.max_action_dim
 
     def _show(self, cameras: tuple[str, ...]) -> None:
-        self.shown, self.further_streams = cameras, {}
+        self.shown_cameras, self.further_streams = cameras, {}
         images = tuple(f"image.{camera}" for camera in cameras)
         self.role_names = {"backbone": (*images, *self.other_roles, PADDING), "expert": self.suffix_roles}
 

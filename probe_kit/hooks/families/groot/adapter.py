@@ -228,9 +228,11 @@ class Groot(DenoisingPolicy):
     def _action_numbers(self) -> int:
         return int(self.config.output_features["action"].shape[0])
 
-    def batch(self, seen: Sequence[Observation], state: NDArray[np.float32] | None = None) -> dict[str, Tensor]:
+    def batch(
+        self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
+    ) -> dict[str, Tensor]:
         """What lerobot's processors pack of one observation. state: (1, numbers) as the network reads them."""
-        (row,) = self._rows(seen, self.state(seen) if state is None else state)
+        (row,) = self._rows(observations, self.state(observations) if state is None else state)
         return {name: tensor.to(self.config.device) for name, tensor in row.inputs.items()}
 
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
@@ -254,18 +256,18 @@ class Groot(DenoisingPolicy):
         """The vision-language model's."""
         return self.packing.tokenizer
 
-    def _rows(self, seen: Sequence[Observation], state: NDArray[np.float32]) -> list[PackedRow]:
+    def _rows(self, observations: Sequence[Observation], state: NDArray[np.float32]) -> list[PackedRow]:
         pictures = [
             {camera: checked_picture(one.image if camera == self.cameras[0] else one.cameras[camera])
-             for camera in self.shown}
-            for one in seen
+             for camera in self.shown_cameras}
+            for one in observations
         ]  # fmt: skip
-        rows = zip(pictures, seen, state, strict=True)
+        rows = zip(pictures, observations, state, strict=True)
         return [self.packing.row(shown, one.instruction, own) for shown, one, own in rows]
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """From the packing itself; the bridge has the backbone's tokens."""
-        rows = self._rows(seen, np.zeros((len(seen), self._state_numbers), np.float32))
+        rows = self._rows(observations, np.zeros((len(observations), self._state_numbers), np.float32))
         prompt = [Roles.from_labels(labels) for labels in padded_labels(rows)]
         suffix = [Roles.from_labels(self.suffix_labels())] * len(rows)
         found = {"backbone": prompt, "bridge": prompt, "expert": suffix}
@@ -289,7 +291,7 @@ class Groot(DenoisingPolicy):
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each instruction, as the chat holds it."""
         size = tuple(self.config.image_features[f"{IMAGES}{self.cameras[0]}"].shape[-2:])
-        blank = {camera: np.zeros((*size, 3), np.uint8) for camera in self.shown}
+        blank = {camera: np.zeros((*size, 3), np.uint8) for camera in self.shown_cameras}
         rows = [self.packing.row(blank, text, np.zeros(self._state_numbers, np.float32)) for text in instructions]
         return [
             tuple(
@@ -303,7 +305,7 @@ class Groot(DenoisingPolicy):
     # -- capture -----------------------------------------------------------------------------------------
 
     def _show(self, cameras: tuple[str, ...]) -> None:
-        self.shown = cameras
+        self.shown_cameras = cameras
         self.further_streams = {"vision": self.stacks["vision"].stream("vision")}
         prompt = (*(f"image.{camera}" for camera in cameras), *self.other_roles, PADDING)
         self.role_names = {"backbone": prompt, "bridge": prompt, "expert": self.suffix_roles}

@@ -59,6 +59,6 @@ class InternVL(VisionLanguageModel):
         joined = int(patches * float(config.downsample_ratio)) ** 2
         return [int(config.image_token_id)] * (joined * self.pictures.tiles(height, width))
 
-    def shown(self, pictures: Pictures) -> dict[str, Tensor]:
+    def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
         """pixel_values (tiles of all pictures, 3, S, S)."""
         return {"pixel_values": self.pictures.pixels(pictures).to(self.loaded.device)}

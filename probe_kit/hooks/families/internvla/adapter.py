@@ -163,31 +163,31 @@ class InternVLA(QwenVLA):
         """Qwen's chat around the prompt the run was trained with."""
         return prompt(instruction, self.config.cot)
 
-    def look(self, seen: Observation) -> NDArray[np.uint8]:
+    def look(self, observation: Observation) -> NDArray[np.uint8]:
         """The whole picture, squeezed to a square."""
-        return look(seen.image, self.config.picture)
+        return look(observation.image, self.config.picture)
 
-    def shown(self, seen: Observation) -> NDArray[np.uint8]:
+    def patched_picture(self, observation: Observation) -> NDArray[np.uint8]:
         """Qwen's utilities bring the picture to whole patches with PIL, before its processor sees it."""
-        picture = self.look(seen)
+        picture = self.look(observation)
         rows, columns = self.pictures.grid(*picture.shape[:2])
         size = (columns * self.pictures.patch, rows * self.pictures.patch)
         if picture.shape[:2] == size[::-1]:
             return picture
         return np.array(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC))
 
-    def views(self, seen: Sequence[Observation]) -> Tensor:
+    def views(self, observations: Sequence[Observation]) -> Tensor:
         """(B, 3, H, W) float32 for DINOv2."""
-        rows = [dino_pixels(self.look(observation), self.config.dino.side) for observation in seen]
+        rows = [dino_pixels(self.look(observation), self.config.dino.side) for observation in observations]
         return torch.stack(rows).to(self.device)
 
     # -- acting ------------------------------------------------------------------------------------------
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation; see the contract."""
         if (reason := self.embodiment_mismatch()) is not None:
             raise CheckpointError(reason)
-        actions = self.units.restore(self.infer_without_acting(seen, seeds))
+        actions = self.units.restore(self.infer_without_acting(observations, seeds))
         actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
         return actions.astype(np.float32)
 
@@ -203,12 +203,16 @@ class InternVLA(QwenVLA):
             "needs a 7-DoF end-effector delta. Choose another -M unnorm_key"
         )
 
-    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(
+        self, observations: Sequence[Observation], seeds: Sequence[int]
+    ) -> NDArray[np.float32]:
         """(B, A, action numbers) as the head puts them out, without units."""
-        self.check(seen, seeds)
+        self.check(observations, seeds)
         head = self.config.head
         noise = seeded_noise(seeds, (head.length, head.action_dim), self.device)
-        output: NDArray[np.float32] = self.infer(self.inputs(seen), self.views(seen), noise).cpu().numpy()
+        output: NDArray[np.float32] = (
+            self.infer(self.inputs(observations), self.views(observations), noise).cpu().numpy()
+        )
         return output
 
     def infer(self, inputs: QwenInputs, views: Tensor, noise: Tensor) -> Tensor:
@@ -220,12 +224,12 @@ class InternVLA(QwenVLA):
 
     # -- capture -----------------------------------------------------------------------------------------
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """The chat; the queries; conditions and actions."""
         queries, length = self.config.query.queries, self.config.head.length
-        expert = [Roles.from_labels([*["condition"] * queries, *["action"] * length])] * len(seen)
-        roles = {"backbone": self.backbone_roles(seen), "expert": expert}
-        roles["bridge"] = [Roles.from_labels(["query"] * queries)] * len(seen)
+        expert = [Roles.from_labels([*["condition"] * queries, *["action"] * length])] * len(observations)
+        roles = {"backbone": self.backbone_roles(observations), "expert": expert}
+        roles["bridge"] = [Roles.from_labels(["query"] * queries)] * len(observations)
         if _UNCONDITIONAL in self.streams:
             roles[_UNCONDITIONAL] = expert
         return {name: roles[name] for name in self.streams}

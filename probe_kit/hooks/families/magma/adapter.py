@@ -197,16 +197,16 @@ class Magma(Policy, AnswerModel):
         with torch.inference_mode():
             return self.network.decode(prompts, pictures, self.steps, choose)
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One action per observation; a row that put out no action holds still, see `flagged` and the contract."""
         if (reason := self.embodiment_mismatch()) is not None:
             raise CheckpointError(reason)
-        ids = self._tokens(seen, seeds)
+        ids = self._tokens(observations, seeds)
         assert self.flagged is not None
         actions = self.statistics.restore(self.action_tokens.values(ids))
         actions[:, -1] = actions[:, -1] > _GRIPPER_OPEN
         for row in np.flatnonzero(self.flagged):
-            actions[row] = [0] * (STEPS - 1) + [seen[row].state[-1] > _GRIPPER_OPEN]
+            actions[row] = [0] * (STEPS - 1) + [observations[row].state[-1] > _GRIPPER_OPEN]
         return actions[:, None].astype(np.float32)
 
     @property
@@ -227,16 +227,18 @@ class Magma(Policy, AnswerModel):
             f"{self.steps} tokens; Act2Answer needs {STEPS} of both. Choose another -M unnorm_key"
         )
 
-    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(
+        self, observations: Sequence[Observation], seeds: Sequence[int]
+    ) -> NDArray[np.float32]:
         """(B, 1, tokens): the middle of the bin that each token names, without units."""
-        return np.asarray(self.action_tokens.values(self._tokens(seen, seeds))[:, None], np.float32)
+        return np.asarray(self.action_tokens.values(self._tokens(observations, seeds))[:, None], np.float32)
 
-    def _tokens(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.int64]:
+    def _tokens(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.int64]:
         """(B, tokens) ids; one inference. Rows that put out something else than one action are flagged."""
-        self.check(seen, seeds)
+        self.check(observations, seeds)
         choose = chooser(self.temperature, seeds, self.top)
-        prompts = [self.prompt(observation.instruction).ids for observation in seen]
-        decoded = self.generate(prompts, [self.picture(observation.image) for observation in seen], choose)
+        prompts = [self.prompt(observation.instruction).ids for observation in observations]
+        decoded = self.generate(prompts, [self.picture(observation.image) for observation in observations], choose)
         ids: NDArray[np.int64] = decoded.ids.cpu().numpy()
         self.flagged = ~self._whole(ids, decoded, choose)
         return ids
@@ -267,14 +269,14 @@ class Magma(Policy, AnswerModel):
 
     def read(self, questions: Sequence[Prompt]) -> Reading:
         """One inference: the prefill, whose logits compare the options, and six steps into the answer."""
-        self.check([question.seen for question in questions])
+        self.check([question.observation for question in questions])
         prompts = [self._question(question).ids for question in questions]
         options = [
             [self.text.option(own.text, own.begun, option, own.pictured) for option in own.options]
             for own in questions
         ]
         shown = self.shows_pictures(questions)
-        pictures = [self.picture(question.seen.image) for question in questions] if shown else None
+        pictures = [self.picture(question.observation.image) for question in questions] if shown else None
         decoded = self.generate(prompts, pictures)
         return Reading.of(decoded.logits[:, 0].float().cpu().numpy(), options, Answer(decoded))
 
@@ -294,15 +296,15 @@ class Magma(Policy, AnswerModel):
 
     # -- capture -----------------------------------------------------------------------------------------
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Frames are `special`, the question is `language`; the ends of a picture's rows stand apart from it."""
-        return self._roles([self._labels(self.prompt(one.instruction), one.image) for one in seen])
+        return self._roles([self._labels(self.prompt(one.instruction), one.image) for one in observations])
 
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """As `roles`, of other questions than what to do; how an answer has begun is `special`."""
         shown = self.shows_pictures(questions)
         return self._roles(
-            [self._labels(self._question(own), own.seen.image if shown else None) for own in questions]
+            [self._labels(self._question(own), own.observation.image if shown else None) for own in questions]
         )
 
     def _roles(self, rows: Sequence[list[str]]) -> dict[str, list[Roles]]:

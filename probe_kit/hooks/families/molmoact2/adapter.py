@@ -160,9 +160,11 @@ class MolmoAct2(DenoisingPolicy):
 
     # -- acting ------------------------------------------------------------------------------------------
 
-    def batch(self, seen: Sequence[Observation], state: NDArray[np.float32] | None = None) -> dict[str, Tensor]:
+    def batch(
+        self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
+    ) -> dict[str, Tensor]:
         """In lerobot's keys; see `Packing`. state: (B, numbers) as the network reads them."""
-        packed = self.packing.batch(self._rows(seen, self.state(seen) if state is None else state))
+        packed = self.packing.batch(self._rows(observations, self.state(observations) if state is None else state))
         return {name: tensor.to(self.config.device) for name, tensor in packed.items()}
 
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
@@ -204,19 +206,22 @@ class MolmoAct2(DenoisingPolicy):
         """The VLM's."""
         return self.packing.tokenizer
 
-    def _rows(self, seen: Sequence[Observation], state: NDArray[np.float32]) -> list[PackedRow]:
+    def _rows(self, observations: Sequence[Observation], state: NDArray[np.float32]) -> list[PackedRow]:
         pictures = [
             {camera: checked_picture(one.image if camera == self.cameras[0] else one.cameras[camera])
-             for camera in self.shown}
-            for one in seen
+             for camera in self.shown_cameras}
+            for one in observations
         ]  # fmt: skip
-        rows = zip(pictures, seen, state, strict=True)
+        rows = zip(pictures, observations, state, strict=True)
         return [self.packing.row(shown, one.instruction, own) for shown, one, own in rows]
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """From the packing itself."""
-        state = self.read_state(seen)
-        rows = self._rows(seen, np.zeros((len(seen), self._state_numbers), np.float32) if state is None else state)
+        state = self.read_state(observations)
+        rows = self._rows(
+            observations,
+            np.zeros((len(observations), self._state_numbers), np.float32) if state is None else state,
+        )
         suffix = Roles.from_labels(self.suffix_labels())
         return {
             "backbone": [Roles.from_labels(labels) for labels in padded_labels(rows)],
@@ -241,7 +246,7 @@ class MolmoAct2(DenoisingPolicy):
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each prompt, without pictures and without the state, which change at every inference."""
         size = tuple(self.config.image_features[f"{IMAGES}{self.cameras[0]}"].shape[-2:])
-        blank = {camera: np.zeros((*size, 3), np.uint8) for camera in self.shown}
+        blank = {camera: np.zeros((*size, 3), np.uint8) for camera in self.shown_cameras}
         state = np.zeros(self._state_numbers, np.float32)
         rows = [self.packing.row(blank, text, state) for text in instructions]
         return [
@@ -256,7 +261,7 @@ class MolmoAct2(DenoisingPolicy):
     # -- capture -----------------------------------------------------------------------------------------
 
     def _show(self, cameras: tuple[str, ...]) -> None:
-        self.shown = cameras
+        self.shown_cameras = cameras
         self.further_streams = {"vision": self.stacks["vision"].stream("vision")}
         images = tuple(f"image.{camera}" for camera in cameras)
         self.role_names = {"backbone": (*images, *self.other_roles, PADDING), "expert": self.suffix_roles}

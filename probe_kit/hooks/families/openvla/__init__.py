@@ -11,7 +11,7 @@ BRIDGE = "bridge_orig"
 """The data set of the WidowX arm that Act2Answer imitates."""
 
 
-def _row(variant: str, checkpoint: str, unnorm_key: str, *further: ProtocolRow) -> ProtocolRow:
+def _row(variant: str, checkpoint: str, unnorm_key: str, *alternatives: ProtocolRow) -> ProtocolRow:
     """One of the three that the evaluation compares; they differ in checkpoint and units only."""
     return ProtocolRow(
         checkpoint,
@@ -21,7 +21,7 @@ def _row(variant: str, checkpoint: str, unnorm_key: str, *further: ProtocolRow) 
         of_checkpoint={"unnorm_key": unnorm_key},
         unmatched=(OWN_SEEDS, "another filter than the checkpoint's own would not be noticed"),
         variant=variant,
-        further=further,
+        alternatives=alternatives,
     )
 
 

@@ -106,11 +106,11 @@ class OpenVLA(PrismaticModel, Policy):
 
     # -- acting ------------------------------------------------------------------------------------------
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One action per observation; seeds count only at a temperature. See the contract."""
         if (reason := self.embodiment_mismatch()) is not None:
             raise CheckpointError(reason)
-        ids = self._tokens(seen, seeds)
+        ids = self._tokens(observations, seeds)
         if self.flagged is not None and self.flagged.any():
             self._say_unknown()
         actions = self.statistics.restore(self.action_tokens.values(ids))
@@ -126,15 +126,17 @@ class OpenVLA(PrismaticModel, Policy):
             "delta. Choose another -M unnorm_key"
         )
 
-    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(
+        self, observations: Sequence[Observation], seeds: Sequence[int]
+    ) -> NDArray[np.float32]:
         """(B, 1, tokens): the middle of the bin that each token names, without units."""
-        return np.asarray(self.action_tokens.values(self._tokens(seen, seeds))[:, None], np.float32)
+        return np.asarray(self.action_tokens.values(self._tokens(observations, seeds))[:, None], np.float32)
 
-    def _tokens(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.int64]:
+    def _tokens(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.int64]:
         """(B, tokens) ids; one inference."""
-        self.check(seen, seeds)
-        rows = [self.prompt(observation.instruction) for observation in seen]
-        pixels = self.pixel_values(self._look(observation.image) for observation in seen)
+        self.check(observations, seeds)
+        rows = [self.prompt(observation.instruction) for observation in observations]
+        pixels = self.pixel_values(self._look(observation.image) for observation in observations)
         tokens = self.action_tokens
         named = range(tokens.vocabulary - tokens.bins, tokens.vocabulary)
         choose = chooser(self.temperature, seeds, self.top, named)

@@ -77,7 +77,7 @@ class Ovis25(VisionLanguageModel):
         """As many as the picture's size demands, between the marks of its beginning and end."""
         return [PICTURE_BEGINS, *[PICTURE] * self.pictures.tokens(height, width), PICTURE_ENDS]
 
-    def shown(self, pictures: Pictures) -> dict[str, Tensor]:
+    def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
         """pixel_values (N, 3 x patch x patch) and image_grid_thw (B, 3)."""
         pixels, self._grid = self.pictures.patches(pictures)
         device = self.loaded.device
@@ -91,7 +91,7 @@ class Ovis25(VisionLanguageModel):
 
         @torch.inference_mode()
         def words() -> NDArray[Any]:
-            shown = self.shown([first.seen.image])
+            shown = self.picture_inputs([first.observation.image])
             probabilities = self.network.visual_tokenizer(shown["pixel_values"], shown["image_grid_thw"])
             missing = self.network.config.words - probabilities.shape[1]
             return np.pad(numpy_of(probabilities), ((0, 0), (0, missing)))

@@ -51,7 +51,7 @@ class PaliGemma(VisionLanguageModel):
         vision = self.network.config.vision_config
         return [int(self.network.config.image_token_id)] * (vision.image_size // vision.patch_size) ** 2
 
-    def shown(self, pictures: Pictures) -> dict[str, Tensor]:
+    def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
         """pixel_values (B, 3, S, S)."""
         return {"pixel_values": self.pictures.pixels(pictures).to(self.loaded.device)}
 
@@ -60,7 +60,7 @@ class PaliGemma(VisionLanguageModel):
         del shown
         return packed.positions(_FIRST_POSITION)
 
-    def further(self, packed: LeftPacked) -> dict[str, Tensor]:
+    def other_inputs(self, packed: LeftPacked) -> dict[str, Tensor]:
         """token_type_ids: zero says that a position belongs to the prompt, which attends both ways."""
         return {"token_type_ids": torch.zeros_like(packed.ids)}
 

@@ -97,7 +97,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
                 raise UsageError(f"captured_tokens is {evaluation.captured}; expected 1 to {most}")
             chooser(evaluation.temperature or 0, ())
             self.stacks |= self._stacks()
-            self._show(self.shown)
+            self._show(self.shown_cameras)
             self.streams = {name: self.stacks[name].stream(name) for name in ("backbone", "action")}
 
     @property

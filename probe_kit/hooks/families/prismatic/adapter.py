@@ -153,9 +153,9 @@ class PrismaticModel(Model):
 
     # -- capture -----------------------------------------------------------------------------------------
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Beginning of sequence, patches, text; padding behind it where another prompt is longer."""
-        rows = [self.prompt(observation.instruction) for observation in seen]
+        rows = [self.prompt(observation.instruction) for observation in observations]
         longest, special, patches = max(map(len, rows)), self.tokenizer.special, self.network.patches
         image = [f"image.{CAMERA}"] * patches
         backbone = []
@@ -242,10 +242,10 @@ class Prismatic(PrismaticModel, AnswerModel):
 
     def prefill(self, questions: Sequence[Prompt]) -> Prefill:
         """One pass over all questions."""
-        self.check([question.seen for question in questions])
+        self.check([question.observation for question in questions])
         pixels = None
         if self.shows_pictures(questions):
-            pixels = self.pixel_values(question.seen.image for question in questions)
+            pixels = self.pixel_values(question.observation.image for question in questions)
         decoded = self.generate(pixels, [self.tokenizer.encode(self._asked(question)) for question in questions])
         return Prefill(
             self.network.language_model, decoded.mask.long(), decoded.last, decoded.logits[:, 0], decoded.cache
@@ -254,9 +254,9 @@ class Prismatic(PrismaticModel, AnswerModel):
     def _asked(self, question: Prompt) -> str:
         return self.frame.around(question.text) + question.begun
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Of the observations' instructions as questions."""
-        return self.asked_roles([Prompt(one, one.instruction) for one in seen])
+        return self.asked_roles([Prompt(one, one.instruction) for one in observations])
 
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """Everything around picture and question is `special`, how an answer has begun too."""

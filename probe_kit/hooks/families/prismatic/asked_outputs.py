@@ -62,7 +62,7 @@ class _Asked:
     @cached_property
     def pixels(self) -> torch.Tensor:
         """The pictures of all rows."""
-        return self.model.pixel_values(question.seen.image for question in self.questions)
+        return self.model.pixel_values(question.observation.image for question in self.questions)
 
     def produced(self) -> dict[str, Produce]:
         """How to make every output the adapter can make."""

@@ -26,8 +26,8 @@ def recording_weights(attentions: Sequence[nn.Module], note: Note, weights: Weig
     def hook_of(block: int) -> Callable[..., None]:
         calls = count()
 
-        def hook(module: nn.Module, inputs: tuple[Any, ...], given: dict[str, Any], output: Any) -> None:
-            note(block, next(calls), weights(module, inputs, given, output))
+        def hook(module: nn.Module, inputs: tuple[Any, ...], keywords: dict[str, Any], output: Any) -> None:
+            note(block, next(calls), weights(module, inputs, keywords, output))
 
         return hook
 
@@ -45,7 +45,7 @@ def returned(_: Any, __: tuple[Any, ...], ___: dict[str, Any], output: Any) -> T
     return weights
 
 
-def recomputed(attention: Any, inputs: tuple[Any, ...], given: dict[str, Any], _: Any) -> Tensor:
+def recomputed(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any], _: Any) -> Tensor:
     """(B, H, 1, K) of the last position, of Llama's kind of attention, whose fast kernels return no weights.
 
     Computed once more from the module's inputs and the keys it left. Raises UnsupportedInterventionError for an
@@ -56,22 +56,24 @@ def recomputed(attention: Any, inputs: tuple[Any, ...], given: dict[str, Any], _
             f"{type(attention).__name__} rotates and projects in a way of its own, and its attention cannot be "
             "computed once more here. Patch `kv` instead"
         )
-    states: Tensor = (inputs[0] if inputs else given["hidden_states"])[:, -1:]
-    cosines, sines = (part[:, None, -1:] for part in given["position_embeddings"])
+    states: Tensor = (inputs[0] if inputs else keywords["hidden_states"])[:, -1:]
+    cosines, sines = (part[:, None, -1:] for part in keywords["position_embeddings"])
     queries = attention.q_proj(states).unflatten(-1, (-1, attention.head_dim)).transpose(1, 2)
     below, above = queries.chunk(2, dim=-1)
     queries = queries * cosines + torch.cat([-above, below], dim=-1) * sines
-    return shares(queries, given["past_key_values"].layers[attention.layer_idx].keys, attention.scaling, given)
+    return shares(
+        queries, keywords["past_key_values"].layers[attention.layer_idx].keys, attention.scaling, keywords
+    )
 
 
-def shares(queries: Tensor, keys: Tensor, scale: float, given: dict[str, Any]) -> Tensor:
+def shares(queries: Tensor, keys: Tensor, scale: float, keywords: dict[str, Any]) -> Tensor:
     """(B, H, S, K) float32 softmax of queries (B, H, S, E) on keys (B, G, K, E), H a multiple of G.
 
-    given: may hold `attention_mask` (B, 1, S or more, K or more): True where a key is seen, or what is added.
+    keywords: may hold `attention_mask` (B, 1, S or more, K or more): True where a key is seen, or what is added.
     """
     keys = keys.repeat_interleave(queries.shape[1] // keys.shape[1], dim=1)
     logits = queries.float() @ keys.float().transpose(2, 3) * scale
-    mask: Tensor | None = given.get("attention_mask")
+    mask: Tensor | None = keywords.get("attention_mask")
     if mask is not None:
         rows = mask[:, :, -queries.shape[2] :, : logits.shape[-1]]
         logits = logits.masked_fill(~rows, -torch.inf) if rows.dtype == torch.bool else logits + rows
@@ -79,15 +81,15 @@ def shares(queries: Tensor, keys: Tensor, scale: float, given: dict[str, Any]) -
 
 
 def on_the_prompt(note: Note) -> Note:
-    """For one decoder that puts out tokens: the last position acts, and the prompt's last token is its own.
+    """Return a note for one decoder that puts out tokens: the last position acts, and the prompt has its own.
 
     At iteration k there are k tokens and that one behind the backbone's.
     """
 
-    def own(block: int, iteration: int, weights: Tensor) -> None:
+    def note_prompt(block: int, iteration: int, weights: Tensor) -> None:
         note(block, iteration, weights[:, :, -1:, : weights.shape[-1] - 1 - iteration])
 
-    return own
+    return note_prompt
 
 
 def of_decoder(layers: Sequence[Any], note: Note, eager: bool = False) -> AbstractContextManager[None]:

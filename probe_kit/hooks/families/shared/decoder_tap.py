@@ -1,4 +1,4 @@
-"""Where the sites of a decoder of pre-norm blocks are read, in every family that has one."""
+"""The taps of a decoder of pre-norm blocks, for every family that has one."""
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType

@@ -29,24 +29,24 @@ def fill[Network: nn.Module](
     read: Callable[[], Weights],
     dtype: str | None,
     tied: Callable[[Network], tuple[str, ...]],
-    named: Callable[[str], str] = str,
+    name_in_module: Callable[[str], str] = str,
 ) -> Filled[Network]:
     """The network that `build(dtype, device)` makes, with exactly the weights that `read()` gives.
 
     dtype: float32 or bfloat16; default that of the tensors in the file. tied: parameters that are another one's
-    double, which a file may leave out; called with the network. named: the network's name of a tensor in the file.
-    Raises UsageError for another dtype, WeightsError for weights that are not exactly the network's.
+    double, which a file may leave out; called with the network. name_in_module: the network's name of a tensor in
+    the file. Raises UsageError for another dtype, WeightsError for weights that are not exactly the network's.
     """
     weights = read()
     name = checked_dtype(dtype or _stored_dtype(weights))
     network = build(DTYPES[name], "meta")
     tensors = {
-        named(key): value.to(DTYPES[name]) if value.is_floating_point() else value
+        name_in_module(key): value.to(DTYPES[name]) if value.is_floating_point() else value
         for key, value in weights.tensors.items()
     }
     if len(tensors) < len(weights.tensors):
         raise WeightsError(f"{weights.source}: two tensors have the same name here; nothing was run")
-    audit = load_weights(network, weights, tensors, tied(network), assign=True, named=named)
+    audit = load_weights(network, weights, tensors, tied(network), assign=True, name_in_module=name_in_module)
     tie: Any = getattr(network, "vlm", network)
     tie.tie_weights()
     for double in set(tied(network)) & set(tensors):

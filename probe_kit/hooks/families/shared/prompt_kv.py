@@ -14,7 +14,7 @@ ALL_BUT_LAST = slice(None, -1)
 
 
 def kv_tap(kv: PromptKV, site: Site, tokens: slice = ALL_TOKENS) -> HeadsTap:
-    """Where the keys or values of one block pass. tokens: of the prompt, those of the backbone."""
+    """Return the tap of the keys or values of one block. tokens: of the prompt, those of the backbone."""
     passages: nn.ModuleList = getattr(kv, site.quantity)
     return HeadsTap(passages[site.layer], 1, tokens=tokens)
 
@@ -32,8 +32,8 @@ def attach_prompt_kv(joint: Any, blocks: int) -> PromptKV:
     lerobot calls its `forward` by name, past all hooks, so the instance gets one that sends the cache through.
     """
     if isinstance(getattr(joint, "prompt_kv", None), PromptKV):
-        kept: PromptKV = joint.prompt_kv
-        return kept
+        attached: PromptKV = joint.prompt_kv
+        return attached
     kv, forward = PromptKV(blocks), joint.forward
     joint.prompt_kv = kv
 

@@ -43,7 +43,9 @@ def chooser(temperature: float, seeds: Sequence[int], top: int | None = TOP, amo
     def draw(logits: Tensor) -> Tensor:
         first, end = (0, logits.shape[-1]) if among is None else (among.start, among.stop)
         offered = logits[:, first:end].float().cpu()
-        rows = [_draw(row, temperature, top, own) for row, own in zip(offered, generators, strict=True)]
+        rows = [
+            _draw(row, temperature, top, generator) for row, generator in zip(offered, generators, strict=True)
+        ]
         return (torch.stack(rows) + first).to(logits.device)
 
     return draw
@@ -56,41 +58,43 @@ def seeded_noise(seeds: Sequence[int], shape: tuple[int, ...], device: str) -> T
 
 
 def _draw(logits: Tensor, temperature: float, top: int | None, generator: torch.Generator) -> Tensor:
-    kept = logits.shape[0]
-    if top is not None and top < kept:
-        kept = int((logits >= logits.topk(top).values[-1]).sum())
-    best, ids = logits.topk(kept)
-    place = torch.multinomial(torch.softmax(best / temperature, dim=0), 1, generator=generator)
-    return ids[place[0]]
+    count = logits.shape[0]
+    if top is not None and top < count:
+        count = int((logits >= logits.topk(top).values[-1]).sum())
+    best, ids = logits.topk(count)
+    drawn = torch.multinomial(torch.softmax(best / temperature, dim=0), 1, generator=generator)
+    return ids[drawn[0]]
 
 
-def top_of(asked: str, folders: Sequence[Path]) -> int | None:
-    """How many of the likeliest ids are drawn from; None for all.
+def top_of(top_k: str, folders: Sequence[Path]) -> int | None:
+    """The number of likeliest ids to draw from; None for all.
 
-    asked: a number, `all`, or `checkpoint`: what its generation_config.json says, else `TOP`, as `generate` of
+    top_k: a number, `all`, or `checkpoint`: what its generation_config.json says, else `TOP`, as `generate` of
     transformers 4 does it. folders: where that file may lie, the first one before the others.
     Raises UsageError for another word, CheckpointError for a file that shapes the draw by other settings too.
     """
-    if asked == ALL:
+    if top_k == ALL:
         return None
-    if asked == CHECKPOINT:
+    if top_k == CHECKPOINT:
         file = next(
             (folder / _GENERATION_FILE for folder in folders if (folder / _GENERATION_FILE).is_file()), None
         )
         return TOP if file is None else _stored_top(file)
-    if not asked.isdecimal() or int(asked) < 1:
-        raise UsageError(f"top_k is {asked!r}; expected a number from 1 on, {ALL} or {CHECKPOINT}")
-    return int(asked)
+    if not top_k.isdecimal() or int(top_k) < 1:
+        raise UsageError(f"top_k is {top_k!r}; expected a number from 1 on, {ALL} or {CHECKPOINT}")
+    return int(top_k)
 
 
 def _stored_top(file: Path) -> int | None:
     values = read_json_object(file, CheckpointError, "Download the checkpoint again")
-    others = {name: values[name] for name, neutral in _NEUTRAL.items() if values.get(name) not in (None, neutral)}
+    unfollowed = {
+        name: values[name] for name, neutral in _NEUTRAL.items() if values.get(name) not in (None, neutral)
+    }
     top = values.get("top_k", TOP)
-    if others or not (top is None or (isinstance(top, int) and not isinstance(top, bool) and top >= 0)):
-        said = ", ".join(f"{name} {value!r}" for name, value in (others or {"top_k": top}).items())
+    if unfollowed or not (top is None or (isinstance(top, int) and not isinstance(top, bool) and top >= 0)):
+        settings = ", ".join(f"{name} {value!r}" for name, value in (unfollowed or {"top_k": top}).items())
         raise CheckpointError(
-            f"{file} asks for {said}; only a whole top_k is followed here. Use temperature 0, or another -M top_k "
-            "where the family has that option"
+            f"{file} asks for {settings}; only a whole top_k is followed here. Use temperature 0, or another -M "
+            "top_k where the family has that option"
         )
     return top or None

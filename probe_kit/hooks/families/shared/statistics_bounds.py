@@ -48,9 +48,9 @@ class Bounds:
 
     def slope(self, numbers: int) -> NDArray[np.float32]:
         """(D,) of `restore`; 0 of the gripper, which is open or closed."""
-        found = np.asarray((self.high - self.low) / 2, np.float32) * np.ones(numbers, np.float32)
-        found[-1] = 0
-        return found
+        slopes = np.asarray((self.high - self.low) / 2, np.float32) * np.ones(numbers, np.float32)
+        slopes[-1] = 0
+        return slopes
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(..., D): `slope` everywhere."""
@@ -70,14 +70,14 @@ class StatisticsFile:
     content: dict[str, Any]
 
     @classmethod
-    def read(cls, named: str) -> "StatisticsFile":
-        """`named` is a file, or one of `SHIPPED`. Raises CheckpointError if it is neither or no JSON."""
-        if named in SHIPPED:
-            return cls._of(f"{named} statistics shipped with probe_kit", _shipped(named))
-        path = Path(named).expanduser()
+    def read(cls, name: str) -> "StatisticsFile":
+        """Read a file, or one of `SHIPPED`. Raises CheckpointError if `name` is neither or the file is no JSON."""
+        if name in SHIPPED:
+            return cls._of(f"{name} statistics shipped with probe_kit", _shipped(name))
+        path = Path(name).expanduser()
         if not path.is_file():
             raise CheckpointError(
-                f"no statistics at {named}: there is no such file, and shipped are only {', '.join(SHIPPED)}"
+                f"no statistics at {name}: there is no such file, and shipped are only {', '.join(SHIPPED)}"
             )
         return cls._of(path.name, read_regular(path))
 
@@ -98,9 +98,9 @@ class StatisticsFile:
                 for name in ("p01", "p99")]  # fmt: skip
         low, high = rows
         if low is None or high is None or low.shape != (numbers,) or high.shape != (numbers,):
-            found = "none" if low is None or high is None else f"{low.shape} and {high.shape}"
+            shapes = "none" if low is None or high is None else f"{low.shape} and {high.shape}"
             raise CheckpointError(
-                f"the statistics {self.name} give p01 and p99 of {part} as {found}; this checkpoint needs "
+                f"the statistics {self.name} give p01 and p99 of {part} as {shapes}; this checkpoint needs "
                 f"{numbers} numbers each"
             )
         if not np.isfinite([low, high]).all() or (high < low).any():

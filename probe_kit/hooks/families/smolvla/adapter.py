@@ -97,11 +97,11 @@ class SmolVLA(LerobotFlow):
     @property
     def masked_cameras(self) -> int:
         """Of the cameras that are not shown, `empty_cameras` are masked and the rest left out, as lerobot does."""
-        return min(len(self.config.image_features) - len(self.shown), int(self.config.empty_cameras))
+        return min(len(self.config.image_features) - len(self.shown_cameras), int(self.config.empty_cameras))
 
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
         """Pictures, masked pictures, language and state, filled up to `prefix_length`."""
-        images = [label for camera in self.shown for label in self._camera_labels(f"image.{camera}")]
+        images = [label for camera in self.shown_cameras for label in self._camera_labels(f"image.{camera}")]
         labels = [*images, *self._camera_labels(PADDING) * self.masked_cameras, *language, "state"]
         return labels + [PADDING] * (self.config.prefix_length - len(labels))
 

@@ -181,23 +181,23 @@ class SpatialVLA(Policy):
         """How pictures are resized."""
         return PictureSettings.of(self.config, self.loaded.folder)
 
-    def pictures(self, seen: Sequence[Observation]) -> Tensor:
+    def pictures(self, observations: Sequence[Observation]) -> Tensor:
         """(B, 3, S, S) float32 in [0, 1]. Raises ObservationError."""
-        rows = [prepare_picture(checked_picture(one.image), self.picture_settings) for one in seen]
+        rows = [prepare_picture(checked_picture(one.image), self.picture_settings) for one in observations]
         return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
 
-    def cameras(self, seen: Sequence[Observation]) -> Tensor:
+    def cameras(self, observations: Sequence[Observation]) -> Tensor:
         """(B, 3, 3) float32 intrinsics for the pictures as the model sees them. Raises ObservationError."""
-        rows = [self._camera(one).at(self.config.side) for one in seen]
+        rows = [self._camera(one).at(self.config.side) for one in observations]
         return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
 
-    def _camera(self, seen: Observation) -> Intrinsics:
+    def _camera(self, observation: Observation) -> Intrinsics:
         if self._preset is not None:
             return self._preset
-        height, width = seen.image.shape[:2]
-        if seen.intrinsics is None:  # only a model without depth gets this far
+        height, width = observation.image.shape[:2]
+        if observation.intrinsics is None:  # only a model without depth gets this far
             return Intrinsics(np.eye(3), width, height)
-        matrix = np.asarray(seen.intrinsics)
+        matrix = np.asarray(observation.intrinsics)
         if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or np.linalg.det(matrix) == 0:
             raise ObservationError(f"intrinsics are {matrix.tolist()}; expected an invertible 3 × 3 matrix")
         return Intrinsics(matrix, width, height)
@@ -220,15 +220,15 @@ class SpatialVLA(Policy):
 
     # -- acting ------------------------------------------------------------------------------------------
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """A chunk per observation; decoding is greedy, so the seeds change nothing. See the contract.
 
         A row is flagged if a token of its first step, the one that is executed, names no action.
         """
-        self.check(seen, seeds)
-        rows = [self.prompt(observation.instruction) for observation in seen]
-        ids = self.generate(self.pictures(seen), self.cameras(seen), rows).ids.cpu().numpy()
-        ids = ids.reshape(len(seen), -1, STEP_TOKENS)
+        self.check(observations, seeds)
+        rows = [self.prompt(observation.instruction) for observation in observations]
+        ids = self.generate(self.pictures(observations), self.cameras(observations), rows).ids.cpu().numpy()
+        ids = ids.reshape(len(observations), -1, STEP_TOKENS)
         self.flagged = ~np.asarray(self.bins.known(ids[:, 0]).all(axis=-1))
         if self.flagged.any():
             _say_unknown()
@@ -261,9 +261,9 @@ class SpatialVLA(Policy):
 
     # -- capture -----------------------------------------------------------------------------------------
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Patches, beginning of sequence, text; padding behind it where another prompt is longer."""
-        rows = [self.prompt(observation.instruction)[:-1] for observation in seen]
+        rows = [self.prompt(observation.instruction)[:-1] for observation in observations]
         longest = max(map(len, rows))
         return {
             "backbone": [Roles.from_labels(self._labels(row) + [PADDING] * (longest - len(row))) for row in rows],

@@ -165,9 +165,9 @@ class Xiaomi(QwenVLA):
         """The released prompt."""
         return prompt(instruction, self.robot.heading)
 
-    def look(self, seen: Observation) -> NDArray[np.uint8]:
+    def look(self, observation: Observation) -> NDArray[np.uint8]:
         """The middle of the picture, at the size the robot's pictures have."""
-        return look(seen.image, self.robot)
+        return look(observation.image, self.robot)
 
     @property
     def unguarded_state(self) -> str | None:
@@ -176,10 +176,10 @@ class Xiaomi(QwenVLA):
 
     # -- acting ------------------------------------------------------------------------------------------
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation; see the contract."""
         units = self.units
-        actions = units.restore(self.infer_without_acting(seen, seeds))[..., :_USED]
+        actions = units.restore(self.infer_without_acting(observations, seeds))[..., :_USED]
         actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
         return actions.astype(np.float32)
 
@@ -188,21 +188,25 @@ class Xiaomi(QwenVLA):
         units = self._units_or_reason()
         return units if isinstance(units, str) else None
 
-    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(
+        self, observations: Sequence[Observation], seeds: Sequence[int]
+    ) -> NDArray[np.float32]:
         """(B, chunk, action numbers) as the flow puts them out, without units; all where nothing says which."""
-        self.check(seen, seeds)
+        self.check(observations, seeds)
         units = self._units_or_reason()
         numbers = self.config.action_dim
         used = np.ones((self.card.chunk, numbers), np.float32) if isinstance(units, str) else units.used
         noise = seeded_noise(seeds, (self.card.chunk, numbers), self.device)
         meant = torch.from_numpy(used).expand_as(noise.cpu()).to(self.device)
-        output: NDArray[np.float32] = self.infer(self.inputs(seen), self.state(seen), meant, noise).cpu().numpy()
+        output: NDArray[np.float32] = (
+            self.infer(self.inputs(observations), self.state(observations), meant, noise).cpu().numpy()
+        )
         return output
 
-    def state(self, seen: Sequence[Observation]) -> Tensor:
+    def state(self, observations: Sequence[Observation]) -> Tensor:
         """(B, 1, state numbers) float32: the robot's own layout, filled up with zeros. Raises ObservationError."""
-        rows = torch.zeros(len(seen), self.config.state_length, self.config.state_dim)
-        for row, observation in zip(rows, seen, strict=True):
+        rows = torch.zeros(len(observations), self.config.state_length, self.config.state_dim)
+        for row, observation in zip(rows, observations, strict=True):
             own = laid_out(np.asarray(observation.state, np.float32), ARM_NUMBERS, self.openness)
             numbers = self.robot.state(own)
             if len(numbers) > self.config.state_dim:
@@ -221,11 +225,11 @@ class Xiaomi(QwenVLA):
 
     # -- capture -----------------------------------------------------------------------------------------
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """The chat; then sink, state, actions."""
         states = ["state"] * self.config.state_length
         expert = Roles.from_labels(["special", *states, *["action"] * self.card.chunk])
-        return {"backbone": self.backbone_roles(seen), "expert": [expert] * len(seen)}
+        return {"backbone": self.backbone_roles(observations), "expert": [expert] * len(observations)}
 
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Computed once more from what a layer of the expert is given, under the block whose keys it reads."""

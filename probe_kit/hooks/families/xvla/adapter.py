@@ -187,11 +187,13 @@ class Xvla(DenoisingPolicy):
 
     # -- acting ------------------------------------------------------------------------------------------
 
-    def batch(self, seen: Sequence[Observation], state: NDArray[np.float32] | None = None) -> dict[str, Tensor]:
+    def batch(
+        self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
+    ) -> dict[str, Tensor]:
         """In lerobot's keys, as its processors leave them. state: (B, numbers) as the network reads them."""
-        batch = super().batch(seen, state)
+        batch = super().batch(observations, state)
         mean, deviation = (torch.tensor(IMAGENET_STATS[name]).view(3, 1, 1) for name in ("mean", "std"))
-        for camera in self.shown:
+        for camera in self.shown_cameras:
             picture = batch[f"{IMAGES}{camera}"]
             expected = tuple(self.config.image_features[f"{IMAGES}{camera}"].shape[-2:])
             if self.config.resize_imgs_with_padding is None and tuple(picture.shape[-2:]) != expected:
@@ -203,7 +205,7 @@ class Xvla(DenoisingPolicy):
                 batch[f"{IMAGES}{camera}"] = (picture - mean.to(picture)) / deviation.to(picture)
         if not self.config.use_proprio:
             del batch[STATE]
-        batch["domain_id"] = torch.full((len(seen),), self.steps.domain, device=self.config.device)
+        batch["domain_id"] = torch.full((len(observations),), self.steps.domain, device=self.config.device)
         return batch
 
     @property
@@ -225,7 +227,7 @@ class Xvla(DenoisingPolicy):
     @property
     def masked_cameras(self) -> int:
         """Views without a picture, whose zeros the expert attends to: their role is `special`."""
-        return int(self.config.num_image_views) - len(self.shown)
+        return int(self.config.num_image_views) - len(self.shown_cameras)
 
     @cached_property
     def tokens_per_camera(self) -> int:
@@ -248,7 +250,7 @@ class Xvla(DenoisingPolicy):
 
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
         """The first camera's picture, then the text."""
-        return [*[f"image.{self.shown[0]}"] * self.tokens_per_camera, *language]
+        return [*[f"image.{self.shown_cameras[0]}"] * self.tokens_per_camera, *language]
 
     def suffix_labels(self) -> list[str]:
         """The chunk; what follows depends on the text."""
@@ -260,7 +262,7 @@ class Xvla(DenoisingPolicy):
             self.prefix_labels(self.text_labels(row, valid))
             for row, valid in zip(tokens.tolist(), mask.tolist(), strict=True)
         ]
-        further = [f"image.{camera}" for camera in self.shown[1:]] + ["special"] * self.masked_cameras
+        further = [f"image.{camera}" for camera in self.shown_cameras[1:]] + ["special"] * self.masked_cameras
         views = [label for label in further for _ in range(self.tokens_per_camera)]
         ends = [*views, *[SOFT_PROMPT] * int(self.config.len_soft_prompts)]
         return {
@@ -269,7 +271,7 @@ class Xvla(DenoisingPolicy):
         }
 
     def _show(self, cameras: tuple[str, ...]) -> None:
-        self.shown, self.further_streams = cameras, {}
+        self.shown_cameras, self.further_streams = cameras, {}
         views = tuple(f"image.{camera}" for camera in cameras)
         self.role_names = {
             "backbone": (views[0], *self.other_roles),

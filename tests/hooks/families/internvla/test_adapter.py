@@ -128,7 +128,7 @@ def test_a_picture_that_is_no_whole_patches_is_resized_with_pil_for_qwen_and_not
     picture = policy.look(observation)
     assert picture.shape == (200, 200, 3)
     by_hand = np.array(Image.fromarray(picture).resize((196, 196), Image.Resampling.BICUBIC))
-    np.testing.assert_array_equal(policy.shown(observation), by_hand)
+    np.testing.assert_array_equal(policy.patched_picture(observation), by_hand)
     expected, grid = policy.pictures.patches([by_hand])
     seen = policy.inputs([observation])
     assert torch.equal(seen.pixel_values, expected)

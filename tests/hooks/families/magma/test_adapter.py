@@ -199,7 +199,7 @@ def test_options_are_compared_by_the_logits_behind_the_prompt(unsteered: Magma) 
     for row, question in enumerate(asked):
         ids = unsteered.text.prompt(question.text).ids
         with torch.inference_mode():
-            logits = unsteered.network([ids], [unsteered.picture(question.seen.image)]).logits[0, -1]
+            logits = unsteered.network([ids], [unsteered.picture(question.observation.image)]).logits[0, -1]
         expected = logits[[unsteered.text.option(question.text, "", letter) for letter in "AB"]]
         np.testing.assert_allclose(reading.option_logits[row], expected.numpy(), rtol=0, atol=2e-5)
         share = torch.softmax(logits, dim=0)[[65 - 33, 66 - 33]].sum()
@@ -214,7 +214,7 @@ def test_speaking_goes_on_greedily_and_can_be_asked_again(unsteered: Magma) -> N
     assert unsteered.speak(reading, 0) == ["", ""]
     for row, question in enumerate(asked):
         ids = unsteered.text.prompt(question.text).ids
-        picture = [unsteered.picture(question.seen.image)]
+        picture = [unsteered.picture(question.observation.image)]
         with torch.inference_mode():
             whole = unsteered.network.decode([ids], picture, steps=12).ids[0].tolist()
         assert long[row] == unsteered.text.decode(whole)

@@ -14,7 +14,7 @@ _DELTAS = "observation_delta_indices"
 
 def known_values(
     values: Mapping[str, Any],
-    known: Collection[str],
+    read_fields: Collection[str],
     inert: Inert,
     unread: Collection[str],
     source: Path,
@@ -22,23 +22,25 @@ def known_values(
 ) -> dict[str, Any]:
     """`values` without the fields that do nothing here.
 
-    known: fields that the installed lerobot reads. inert: of a newer one. unread: those that the caller says
+    read_fields: fields that the installed lerobot reads. inert: of a newer one. unread: those that the caller says
     change nothing. waived: whether users can say so, with -M unread.
     Raises CheckpointError naming every other field that lerobot does not know, and its value.
     """
-    others = {name: value for name, value in values.items() if name not in known and name not in unread}
+    extra = {name: value for name, value in values.items() if name not in read_fields and name not in unread}
     changing = {
-        name: inert[name] for name, value in others.items() if name in inert and not _is_inert(value, inert[name])
+        name: inert[name] for name, value in extra.items() if name in inert and not _is_inert(value, inert[name])
     }
     if changing:
-        asked = ", ".join(f"{name}: {others[name]!r}" for name in changing)
-        plain = ", ".join(f"{name}: {' or '.join(map(repr, own or ()))}" for name, own in changing.items())
+        requested = ", ".join(f"{name}: {extra[name]!r}" for name in changing)
+        plain = ", ".join(
+            f"{name}: {' or '.join(map(repr, inert_values or ()))}" for name, inert_values in changing.items()
+        )
         raise CheckpointError(
-            f"{source} asks for {asked}, which a newer lerobot does in its inference and probe_kit does not. "
+            f"{source} asks for {requested}, which a newer lerobot does in its inference and probe_kit does not. "
             f"Supported is {plain}: take a checkpoint that was trained so"
         )
-    if unknown := sorted(set(others) - set(inert)):
-        listed = ", ".join(f"{name}: {others[name]!r}" for name in unknown)
+    if unknown := sorted(set(extra) - set(inert)):
+        listed = ", ".join(f"{name}: {extra[name]!r}" for name in unknown)
         way_out = (
             f"accept them with -M unread={','.join(unknown)}" if waived else "remove them from a copy of the file"
         )
@@ -46,12 +48,12 @@ def known_values(
             f"{source} has unknown settings: {listed}. lerobot {version('lerobot')} does not read them. If they "
             f"change nothing that a picture, a state or an action depends on, {way_out}"
         )
-    return {name: value for name, value in values.items() if name in known}
+    return {name: value for name, value in values.items() if name in read_fields}
 
 
 def _is_inert(value: Any, plain: tuple[Any, ...] | None) -> bool:
     """Whether a value is one of these; True is not 1 here."""
-    return plain is None or any(value == one and type(value) is type(one) for one in plain)
+    return plain is None or any(value == candidate and type(value) is type(candidate) for candidate in plain)
 
 
 def check_one_frame(config: Any, folder: Path) -> None:

@@ -30,7 +30,7 @@ EVALUATION_OPTIONS = (
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How observations and actions are treated around the network.
+    """The treatment of observations and actions around the network.
 
     statistics: a file, the name of a shipped one, `none` for numbers that are units already, or None for what the
     checkpoint says. picture: how a picture comes to the network's resolution; None for what the layout of the

@@ -50,19 +50,19 @@ class DenoisingPolicy(LerobotPolicy):
         chunk: NDArray[np.float32] = self.infer(batch, self.noise(seeds)).float().cpu().numpy()
         return chunk
 
-    def differentiable(self, seen: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
+    def differentiable(self, observations: Sequence[Observation], seeds: Sequence[int]) -> Tensor:
         """The actions of `act`, bit for bit, with a graph of every step; see the contract."""
         self.interventions.check("gradients", self.card.family)
-        self.check_acting(seen, seeds)
+        self.check_acting(observations, seeds)
         with frozen(self.network):
-            return self.restored(self.denoise(self.batch(seen), self.noise(seeds)))
+            return self.restored(self.denoise(self.batch(observations), self.noise(seeds)))
 
     def noise(self, seeds: Sequence[int]) -> Tensor:
         """(B, *noise_shape) float32 noise, a row per seed, the same on every device."""
         return seeded_noise(seeds, self.noise_shape, self.config.device)
 
     def replay(self, batch: dict[str, Tensor], recorded: Arrays) -> dict[str, NDArray[Any]]:
-        """From the recorded noise."""
+        """Return the actions from the recorded noise."""
         return {"actions": numpy_of(self.infer(batch, torch.from_numpy(recorded["in_noise"])))}
 
 

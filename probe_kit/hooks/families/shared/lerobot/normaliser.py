@@ -157,14 +157,14 @@ def _statistics(
         arrays = load_file(path) if path is not None and path.is_file() else {}
     except (SafetensorError, OSError, ValueError) as error:
         raise CheckpointError(f"{folder / str(name)} cannot be read ({error}); download it again") from error
-    wanted = [f"{feature}.{statistic}" for statistic in _NEEDED[mode]]
-    missing = [key for key in wanted if key not in arrays]
+    keys = [f"{feature}.{statistic}" for statistic in _NEEDED[mode]]
+    missing = [key for key in keys if key not in arrays]
     if missing:
         raise CheckpointError(
             f"{folder} has no statistics {', '.join(missing)} (looked in {name}): its {feature} has no physical "
             "unit. Take the statistics of the data set it was trained on"
         )
-    return arrays[wanted[0]], arrays[wanted[1]]
+    return arrays[keys[0]], arrays[keys[1]]
 
 
 def read_buffers(folder: Path) -> dict[str, NDArray[np.float32]]:
@@ -172,15 +172,15 @@ def read_buffers(folder: Path) -> dict[str, NDArray[np.float32]]:
 
     Raises CheckpointError if a weights file cannot be read.
     """
-    found: dict[str, NDArray[np.float32]] = {}
+    buffers: dict[str, NDArray[np.float32]] = {}
     for path in sorted(folder.glob("model*.safetensors")):
         try:
             with safe_open(path, "pt") as file:
                 names = [name for name in file.keys() if name.startswith(STATISTICS)]  # noqa: SIM118
-                found |= {name: file.get_tensor(name).float().numpy() for name in names}
+                buffers |= {name: file.get_tensor(name).float().numpy() for name in names}
         except SafetensorError as error:
             raise CheckpointError(f"{path} cannot be read ({error}); download the checkpoint again") from error
-    return found
+    return buffers
 
 
 def from_buffers(
@@ -191,8 +191,8 @@ def from_buffers(
     modes: `normalization_mapping` of the configuration. source: whose weights they are, for messages.
     Raises CheckpointError if a buffer is missing, or was never filled.
     """
-    found = modes.get(kind, "IDENTITY")
-    mode = str(getattr(found, "value", found))
+    stored_mode = modes.get(kind, "IDENTITY")
+    mode = str(getattr(stored_mode, "value", stored_mode))
     if mode == "IDENTITY":
         return None
     if mode not in _NEEDED:

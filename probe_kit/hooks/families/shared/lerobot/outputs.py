@@ -41,10 +41,10 @@ def lerobot_outputs(load: Callable[..., LerobotPolicy], folder: Path, recorded: 
     )
     run = RecordedRun(batch, recorded, tape, calls)
     produced: dict[str, Produce] = {
-        **{name: partial(numpy_of, own) for name, own in batch.items()},
+        **{name: partial(numpy_of, values) for name, values in batch.items()},
         **stream_outputs(policy, tape),
         **{name: partial(run.outputs, name) for name in policy.watched() if calls[name]},
-        **{name: partial(np.asarray, own) for name, own in replayed.items()},
+        **{name: partial(np.asarray, values) for name, values in replayed.items()},
         "actions_unnormalized": lambda: policy.action_units.restore(np.asarray(replayed["actions"], np.float32)),
         **policy.further_outputs(run),
     }
@@ -55,7 +55,9 @@ def lerobot_outputs(load: Callable[..., LerobotPolicy], folder: Path, recorded: 
 
 
 def _prepared(policy: LerobotPolicy, recorded: Arrays) -> dict[str, Tensor]:
-    images = {f"{IMAGES}{camera}": torch.from_numpy(recorded[f"in_image_{camera}"]) for camera in policy.shown}
+    images = {
+        f"{IMAGES}{camera}": torch.from_numpy(recorded[f"in_image_{camera}"]) for camera in policy.shown_cameras
+    }
     return images | {
         STATE: torch.from_numpy(policy.state_units.normalise(recorded["in_raw_state"])),
         TOKENS: torch.from_numpy(recorded["in_lang_tokens"]),

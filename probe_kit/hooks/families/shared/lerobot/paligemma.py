@@ -1,4 +1,4 @@
-"""What lerobot's policies on PaliGemma share: sizes, tokenizer, pictures in the prompt."""
+"""The parts that lerobot's policies on PaliGemma share: sizes, tokenizer, pictures in the prompt."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -25,10 +25,10 @@ LEAST_BYTES = 1_000_000_000
 
 def _check_small_weights(folder: Path) -> None:
     """A small network that lost its `dims.json` would be built at full size, for minutes, before it is refused."""
-    found = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
-    if 0 < found < LEAST_BYTES:
+    size = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
+    if 0 < size < LEAST_BYTES:
         raise CheckpointError(
-            f"{folder} has {found / 1e6:,.1f} MB of weights and no dims.json; the released size has "
+            f"{folder} has {size / 1e6:,.1f} MB of weights and no dims.json; the released size has "
             "several GB. Put the dims.json beside its config.json, or download the checkpoint again"
         )
 
@@ -38,7 +38,7 @@ def sizes_file(folder: Path) -> Path | None:
 
     Raises CheckpointError for a small one that lost it.
     """
-    sizes = [place / "dims.json" for place in (folder, folder.parent) if (place / "dims.json").is_file()]
+    sizes = [parent / "dims.json" for parent in (folder, folder.parent) if (parent / "dims.json").is_file()]
     if not sizes:
         _check_small_weights(folder)
     return sizes[0] if sizes else None
@@ -50,15 +50,15 @@ class PaliGemmaPolicy(LerobotPolicy):
     @cached_property
     def tokenizer(self) -> Any:
         """PaliGemma's, from the checkpoint folder or the hub."""
-        if (place := self._tokenizer_folder()) is not None:
-            return load_pretrained(AutoTokenizer, place)
-        named = tokenizer_name(self.folder) or _TOKENIZER
+        if (folder := self._tokenizer_folder()) is not None:
+            return load_pretrained(AutoTokenizer, folder)
+        repository = tokenizer_name(self.folder) or _TOKENIZER
         try:
-            return load_pretrained(AutoTokenizer, checkpoint_folder(named, _TOKENIZER_FILES))
+            return load_pretrained(AutoTokenizer, checkpoint_folder(repository, _TOKENIZER_FILES))
         except (CheckpointError, OSError, ValueError) as error:
-            gated = "gated " if named == _TOKENIZER else ""
+            gated = "gated " if repository == _TOKENIZER else ""
             raise CheckpointError(
-                f"{self.folder} has no tokenizer.json and the {gated}{named} cannot be fetched. Run "
+                f"{self.folder} has no tokenizer.json and the {gated}{repository} cannot be fetched. Run "
                 "`hf auth login`, or put its tokenizer.json and tokenizer_config.json into the checkpoint folder"
             ) from error
 
@@ -66,26 +66,26 @@ class PaliGemmaPolicy(LerobotPolicy):
         if (saved := tokenizer_folder(self.folder)) is not None:
             return saved
         places = (self.folder, self.folder.parent / "tokenizer")
-        return next((place for place in places if (place / "tokenizer.json").is_file()), None)
+        return next((folder for folder in places if (folder / "tokenizer.json").is_file()), None)
 
     def side_files(self) -> dict[str, Path]:
         """Also the sizes and the tokenizer, where they lie beside the folder."""
-        found = super().side_files()
+        files = super().side_files()
         sizes, text = self.folder.parent / "dims.json", self._tokenizer_folder()
-        if "dims.json" not in found and sizes.is_file():
-            found["dims.json"] = sizes
+        if "dims.json" not in files and sizes.is_file():
+            files["dims.json"] = sizes
         if text is not None and text != self.folder:
-            found |= side_files(text, "tokenizer/")
-        return found
+            files |= side_files(text, "tokenizer/")
+        return files
 
     @property
     def masked_cameras(self) -> int:
         """All that are not shown."""
-        return len(self.config.image_features) - len(self.shown)
+        return len(self.config.image_features) - len(self.shown_cameras)
 
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
         """Cameras without a picture are masked and lie behind the shown ones."""
-        images = [f"image.{camera}" for camera in self.shown for _ in range(self.tokens_per_camera)]
+        images = [f"image.{camera}" for camera in self.shown_cameras for _ in range(self.tokens_per_camera)]
         return [*images, *[PADDING] * self.tokens_per_camera * self.masked_cameras, *language]
 
     def patch_order(self) -> NDArray[np.int64]:

@@ -113,18 +113,18 @@ def check_pipelines(folder: Path) -> None:
             raise CheckpointError(f"{path} is missing: without it pictures, state and actions have no meaning")
 
 
-def check_steps(folder: Path, pipeline: str, known: Collection[str]) -> None:
+def check_steps(folder: Path, pipeline: str, family_steps: Collection[str]) -> None:
     """Raise CheckpointError for a step or a field whose effect is unknown here, and for normalised pictures.
 
-    known: names of steps besides the harmless ones.
+    family_steps: names of steps besides the harmless ones.
     """
     steps = saved_steps(folder, pipeline)
     names = [step.name for step in steps]
     for step in steps:
-        if step.name not in _HARMLESS and step.name not in known:
+        if step.name not in _HARMLESS and step.name not in family_steps:
             raise CheckpointError(
                 f"{folder} has the processor step {step.name!r}, which changes numbers in a way probe_kit does "
-                f"not know. Known are {', '.join((*_HARMLESS, *known))}"
+                f"not know. Known are {', '.join((*_HARMLESS, *family_steps))}"
             )
         if step.name not in _HARMLESS and names.count(step.name) > 1:
             raise CheckpointError(
@@ -147,20 +147,22 @@ def check_fields(step: SavedStep, source: str) -> None:
     check_values(step.config, _FIELDS.get(step.name, {}), f"{source}: the step {step.name!r}")
 
 
-def check_values(values: Mapping[str, Any], known: Mapping[str, tuple[Any, ...] | None], subject: str) -> None:
+def check_values(values: Mapping[str, Any], honoured: Mapping[str, tuple[Any, ...] | None], subject: str) -> None:
     """Raise CheckpointError for a field whose effect is unknown here, and for a value that is not honoured.
 
-    known: fields with the values that are honoured; None for any. subject: the file and the part of it.
+    honoured: fields with the values that are honoured; None for any. subject: the file and the part of it.
     """
     for name, value in values.items():
-        if name not in known:
-            fields = ", ".join(known) or "none"
+        if name not in honoured:
+            fields = ", ".join(honoured) or "none"
             raise CheckpointError(
                 f"{subject} has the field {name}: {value!r}, which may change numbers in a way probe_kit does not "
                 f"know. Known are {fields}. If it changes nothing, remove it from a copy of the file"
             )
-        plain = known[name]
-        if plain is not None and not any(value == one and type(value) is type(one) for one in plain):
+        plain = honoured[name]
+        if plain is not None and not any(
+            value == candidate and type(value) is type(candidate) for candidate in plain
+        ):
             raise CheckpointError(
                 f"{subject} says {name}: {value!r}, which probe_kit does not repeat. Supported is "
                 f"{' or '.join(map(repr, plain))}: take a checkpoint that was trained so"
@@ -168,25 +170,27 @@ def check_values(values: Mapping[str, Any], known: Mapping[str, tuple[Any, ...] 
 
 
 def tokenizer_name(folder: Path) -> str | None:
-    """What the saved step names as its tokenizer; None where no step does."""
+    """The name of the tokenizer in the saved step; None where no step has one."""
     step = next((step for step in saved_steps(folder, PREPROCESSOR) if step.name == TOKENIZER), None)
-    named = None if step is None else step.config.get("tokenizer_name")
-    return named if isinstance(named, str) and named else None
+    name = None if step is None else step.config.get("tokenizer_name")
+    return name if isinstance(name, str) and name else None
 
 
 def tokenizer_folder(folder: Path) -> Path | None:
     """The folder of the tokenizer that lerobot saved into the checkpoint; None where the step names none there."""
-    named = tokenizer_name(folder)
-    if named is None or Path(named).is_absolute() or ".." in Path(named).parts:
+    name = tokenizer_name(folder)
+    if name is None or Path(name).is_absolute() or ".." in Path(name).parts:
         return None
-    return folder / named if (folder / named / "tokenizer.json").is_file() else None
+    return folder / name if (folder / name / "tokenizer.json").is_file() else None
 
 
 def _normalised_pictures(folder: Path, step: SavedStep) -> list[str]:
     """Features whose pictures lerobot would change: it does so where it has statistics of them."""
     if (step.config.get("norm_map") or {}).get("VISUAL", "IDENTITY") == "IDENTITY" or step.state is None:
         return []
-    pictures = [name for name, own in (step.config.get("features") or {}).items() if own.get("type") == "VISUAL"]
+    pictures = [
+        name for name, feature in (step.config.get("features") or {}).items() if feature.get("type") == "VISUAL"
+    ]
     try:
         with safe_open(folder / shard_name(step.state), "pt") as file:
             stored = {name.rpartition(".")[0] for name in file.keys()}  # noqa: SIM118

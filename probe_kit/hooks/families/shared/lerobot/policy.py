@@ -70,7 +70,8 @@ _DIMENSIONS = 7
 class LerobotPolicy(Policy):
     """A lerobot policy behind the Policy contract; subclasses say how it packs its sequence and puts out actions.
 
-    cameras: those that a picture can be given for. shown: those that get one, in the configuration's order.
+    cameras: those that a picture can be given for. shown_cameras: those that get one, in the configuration's
+    order.
     """
 
     family: ClassVar[str]
@@ -120,7 +121,7 @@ class LerobotPolicy(Policy):
         return other
 
     def _show(self, cameras: tuple[str, ...]) -> None:
-        self.shown = cameras
+        self.shown_cameras = cameras
         self.stacks["vision"] = replace(self.stacks["vision"], iterations=len(cameras) + self.masked_cameras)
         self.further_streams = {"vision": self.stacks["vision"].stream("vision")}
         images = tuple(f"image.{camera}" for camera in cameras)
@@ -202,7 +203,7 @@ class LerobotPolicy(Policy):
         else:
             weights = read_weights(folder)
         tensors = cls.current_keys(weights.tensors)
-        audit = load_weights(network, weights, tensors, cls.unread, named=cls._current_key)
+        audit = load_weights(network, weights, tensors, cls.unread, name_in_module=cls._current_key)
         config.device = device
         policy = cls(network.to(device), folder)
         policy.prepare(checkpoint, evaluation)
@@ -265,9 +266,9 @@ class LerobotPolicy(Policy):
                 f"{folder} holds a {kind!r} policy; expected {cls.config_type}. Pass the right --model"
             )
         config_class = PreTrainedConfig.get_choice_class(cls.config_type)
-        known = {field.name for field in fields(config_class)}
+        field_names = {field.name for field in fields(config_class)}
         values = known_values(
-            values, {*known, "type"}, cls.newer_fields, evaluation.unread, path, cls.takes_unread
+            values, {*field_names, "type"}, cls.newer_fields, evaluation.unread, path, cls.takes_unread
         )
         if "rtc_config" in values:
             values["rtc_config"] = None  # real-time chunking mixes in actions of the chunk before
@@ -281,11 +282,11 @@ class LerobotPolicy(Policy):
         return values
 
     def prepare(self, checkpoint: str, evaluation: Evaluation) -> None:
-        """What is looked at once, before the card is written. checkpoint: the name it was asked for by."""
+        """Look at files once, before the card is written. checkpoint: the name by which it was requested."""
         self.checkpoint, self.evaluation = checkpoint, evaluation
 
     def further_settings(self) -> dict[str, str]:
-        """What numbers depend on besides weights and side files; empty where a checkpoint says everything."""
+        """Settings that numbers depend on besides weights and side files; empty where a checkpoint holds all."""
         return {}
 
     def side_files(self) -> dict[str, Path]:
@@ -293,12 +294,12 @@ class LerobotPolicy(Policy):
         return side_files(self.folder)
 
     def _notes(self) -> tuple[str, ...]:
-        masked = self.cameras[len(self.shown) :]
+        masked = self.cameras[len(self.shown_cameras) :]
         cameras = (f"cameras without a picture: {', '.join(masked)}",) if masked else ()
         return (*cameras, f"units: {self._units()}")
 
     def _units(self) -> str:
-        """Where the statistics come from that turn actions into metres, or why there are none."""
+        """The source of the statistics that turn actions into metres, or the reason why there are none."""
         if self._lacks_state:
             return "actions are changes relative to the state, which nothing here adds"
         try:
@@ -309,20 +310,20 @@ class LerobotPolicy(Policy):
 
     # -- acting ------------------------------------------------------------------------------------------
 
-    def act(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation; see the contract."""
-        self.check_acting(seen, seeds)
-        return self.action_units.restore(self.put_out(self.batch(seen), seeds))
+        self.check_acting(observations, seeds)
+        return self.action_units.restore(self.put_out(self.batch(observations), seeds))
 
-    def check_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> None:
+    def check_acting(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
         """Also raise CheckpointError for a checkpoint whose actions the arm cannot execute."""
-        self.check(seen, seeds)
+        self.check(observations, seeds)
         if (reason := self._action_misfit()) is not None:
             raise CheckpointError(reason)
 
-    def restored(self, own: Tensor) -> Tensor:
-        """(..., D) float32 actions, bit for bit those of `act`, with the graph of the network's output `own`."""
-        values = own.float()
+    def restored(self, output: Tensor) -> Tensor:
+        """(..., D) float32 actions, bit for bit those of `act`, with the graph of the network's output."""
+        values = output.float()
         plain = values.detach().cpu().numpy()
         actions, slopes = (
             torch.from_numpy(of(plain)).to(values.device)
@@ -330,26 +331,30 @@ class LerobotPolicy(Policy):
         )
         return actions + slopes * (values - values.detach())
 
-    def infer_without_acting(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def infer_without_acting(
+        self, observations: Sequence[Observation], seeds: Sequence[int]
+    ) -> NDArray[np.float32]:
         """(B, chunk, action numbers) as the network puts them out, without units."""
-        self.check(seen, seeds)
-        zeros = np.zeros((len(seen), self._state_numbers), np.float32) if self.zero_filled_inputs() else None
-        return self.put_out(self.batch(seen, zeros), seeds)
+        self.check(observations, seeds)
+        zeros = (
+            np.zeros((len(observations), self._state_numbers), np.float32) if self.zero_filled_inputs() else None
+        )
+        return self.put_out(self.batch(observations, zeros), seeds)
 
-    def predict(self, seen: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
+    def predict(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk per recorded observation, by the checkpoint's own statistics; see the contract."""
-        self.check(seen, seeds)
-        states = np.stack([np.asarray(one.state, np.float32) for one in seen])
+        self.check(observations, seeds)
+        states = np.stack([np.asarray(observation.state, np.float32) for observation in observations])
         if states.shape[1] != self._state_numbers:
             raise ObservationError(
                 f"the recorded state has {states.shape[1]} numbers; this checkpoint reads {self._state_numbers}"
             )
         restore, normalised = self.action_units.restore, self.state_units.normalise(states)
-        return restore(self.put_out(self.batch(seen, normalised), seeds))
+        return restore(self.put_out(self.batch(observations, normalised), seeds))
 
     @property
     def state_numbers(self) -> int:
-        """As the checkpoint's configuration says."""
+        """The count of numbers in the checkpoint's configuration."""
         return self._state_numbers
 
     def with_cameras(self, cameras: Sequence[str]) -> Self:
@@ -358,7 +363,7 @@ class LerobotPolicy(Policy):
 
     @property
     def action_names(self) -> tuple[str, ...] | None:
-        """As the configuration has them (`action_feature_names`), if there is one for each number."""
+        """The names in the configuration (`action_feature_names`), if there is one for each number."""
         names = getattr(self.config, "action_feature_names", None)
         count = self.config.output_features["action"].shape[0]
         return tuple(map(str, names)) if names and len(names) == count else None
@@ -384,7 +389,7 @@ class LerobotPolicy(Policy):
 
     @property
     def predicts_relative(self) -> bool:
-        """As the configuration or a step says: lerobot then adds the state, which is not done here."""
+        """Whether the configuration or a step says so: lerobot then adds the state, which is not done here."""
         return self._lacks_state
 
     @cached_property
@@ -426,46 +431,49 @@ class LerobotPolicy(Policy):
 
         Its cameras must be those that are shown, in the configuration's order.
         """
-        given = [key.removeprefix(IMAGES) for key in batch if key.startswith(IMAGES)]
-        if given != list(self.shown):
+        batch_cameras = [key.removeprefix(IMAGES) for key in batch if key.startswith(IMAGES)]
+        if batch_cameras != list(self.shown_cameras):
             raise ObservationError(
-                f"cameras {given} given; this policy is shown {list(self.shown)} of {list(self.cameras)}, in order"
+                f"cameras {batch_cameras} given; this policy is shown "
+                f"{list(self.shown_cameras)} of {list(self.cameras)}, in order"
             )
-        for camera in given:
+        for camera in batch_cameras:
             picture = batch[f"{IMAGES}{camera}"]
             if not picture.is_floating_point() or picture.min() < 0 or picture.max() > 1:
                 raise ObservationError(
                     f"pictures of {camera} are {picture.dtype} outside [0, 1]; divide bytes by 255"
                 )
 
-    def batch(self, seen: Sequence[Observation], state: NDArray[np.float32] | None = None) -> dict[str, Tensor]:
+    def batch(
+        self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
+    ) -> dict[str, Tensor]:
         """The observations in lerobot's keys; the environment's picture goes to the first camera.
 
         state: (B, numbers) as the network reads them; None for that of the observations.
         """
         device = self.config.device
-        numbers = self.state(seen) if state is None else state
-        tokens, mask = self.tokenise([o.instruction for o in seen], numbers)
+        numbers = self.state(observations) if state is None else state
+        tokens, mask = self.tokenise([o.instruction for o in observations], numbers)
         return {
-            **{f"{IMAGES}{camera}": self._pictures(camera, seen) for camera in self.shown},
+            **{f"{IMAGES}{camera}": self._pictures(camera, observations) for camera in self.shown_cameras},
             STATE: torch.from_numpy(numbers).to(device),
             TOKENS: tokens.to(device),
             MASK: mask.to(device),
         }
 
-    def state(self, seen: Sequence[Observation]) -> NDArray[np.float32]:
+    def state(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
         """(B, numbers) as the network reads them. Raises ObservationError for another count of numbers."""
-        rows = self.laid_out(np.stack([np.asarray(o.state, np.float32) for o in seen]))
+        rows = self.laid_out(np.stack([np.asarray(o.state, np.float32) for o in observations]))
         if rows.shape[1] != self._state_numbers:
             raise ObservationError(
                 f"the state has {rows.shape[1]} numbers; this checkpoint reads {self._state_numbers}"
             )
         return self.state_units.normalise(rows)
 
-    def _pictures(self, camera: str, seen: Sequence[Observation]) -> Tensor:
+    def _pictures(self, camera: str, observations: Sequence[Observation]) -> Tensor:
         """(B, 3, H, W) in [0, 1]: each picture as this checkpoint looks at it."""
-        own = [o.image if camera == self.cameras[0] else o.cameras[camera] for o in seen]
-        return self.look(camera, [checked_picture(image) for image in own])
+        images = [o.image if camera == self.cameras[0] else o.cameras[camera] for o in observations]
+        return self.look(camera, [checked_picture(image) for image in images])
 
     def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:
         """(B, 3, H, W) in [0, 1]: the part of each picture (H, W, 3) that this checkpoint looks at."""
@@ -516,7 +524,9 @@ class LerobotPolicy(Policy):
         text = cls.__new__(cls)
         text.folder, text.evaluation = checkpoint_folder(checkpoint, patterns), evaluation
         text.config = cls._read_config(text.folder, evaluation)
-        text.cameras = text.shown = tuple(key.removeprefix(IMAGES) for key in text.config.image_features)[:1]
+        text.cameras = text.shown_cameras = tuple(key.removeprefix(IMAGES) for key in text.config.image_features)[
+            :1
+        ]
         return text
 
     def window(self, camera: str) -> PictureWindow:
@@ -537,33 +547,33 @@ class LerobotPolicy(Policy):
 
     @cached_property
     def action_units(self) -> Units:
-        """What the network writes to metres and radians. Raises CheckpointError if nothing says."""
+        """The units that turn the network's output into metres and radians. Raises CheckpointError."""
         return self.units_of("action", "ACTION")
 
     def units_of(self, feature: str, kind: str) -> Units:
         """The units of one feature, STATE or ACTION."""
-        if (own := self.own_units(feature, kind)) is not None:
-            return own
+        if (units := self.own_units(feature, kind)) is not None:
+            return units
         raise CheckpointError(
             f"{self.checkpoint} does not normalise its {feature} and no policy_preprocessor.json says so: "
             "its units are unknown"
         )
 
     def own_units(self, feature: str, kind: str) -> Units | None:
-        """What the checkpoint itself says: its processor files, or old buffers; None if it normalises nothing."""
+        """The units in the checkpoint's processor files or old buffers; None if it normalises nothing."""
         pipeline = PREPROCESSOR if kind == "STATE" else POSTPROCESSOR
         self._check_steps(self.folder, pipeline)  # behind the policy only actions depend on them
         if (self.folder / f"{pipeline}.json").is_file():
-            found: Normaliser | None = read_normaliser(self.folder, pipeline, feature, kind)
+            units: Normaliser | None = read_normaliser(self.folder, pipeline, feature, kind)
         else:
-            found = from_buffers(self._buffers, self.config.normalization_mapping, feature, kind, self.checkpoint)
+            units = from_buffers(self._buffers, self.config.normalization_mapping, feature, kind, self.checkpoint)
         numbers = self._state_numbers if kind == "STATE" else int(self.config.output_features["action"].shape[0])
-        if found is not None and found.mode != "IDENTITY" and found.low.shape != (numbers,):
+        if units is not None and units.mode != "IDENTITY" and units.low.shape != (numbers,):
             raise CheckpointError(
-                f"{self.checkpoint} has statistics of shape {found.low.shape} for its {feature}, which has "
-                f"{numbers} numbers ({found.source}). Take the statistics of the data set it was trained on"
+                f"{self.checkpoint} has statistics of shape {units.low.shape} for its {feature}, which has "
+                f"{numbers} numbers ({units.source}). Take the statistics of the data set it was trained on"
             )
-        return found
+        return units
 
     @cached_property
     def _buffers(self) -> dict[str, NDArray[np.float32]]:
@@ -571,19 +581,21 @@ class LerobotPolicy(Policy):
 
     # -- capture -----------------------------------------------------------------------------------------
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Prefix and suffix as the family packs them."""
-        return self.packed_roles(*self.tokenise([o.instruction for o in seen], self.read_state(seen)))
+        return self.packed_roles(
+            *self.tokenise([o.instruction for o in observations], self.read_state(observations))
+        )
 
-    def read_state(self, seen: Sequence[Observation]) -> NDArray[np.float32] | None:
+    def read_state(self, observations: Sequence[Observation]) -> NDArray[np.float32] | None:
         """(B, numbers) as the network reads them; None where it is given zeros in place of the arm's state.
 
         A recorded state of the checkpoint's own width is read, whatever the arm has.
         """
-        recorded = {np.shape(one.state) for one in seen} == {(self._state_numbers,)}
+        recorded = {np.shape(observation.state) for observation in observations} == {(self._state_numbers,)}
         if self.zero_filled_inputs() and not (recorded and _problem(lambda: self.state_units) is None):
             return None
-        return self.state(seen)
+        return self.state(observations)
 
     def packed_roles(self, tokens: Tensor, mask: Tensor) -> dict[str, list[Roles]]:
         """The roles for instructions as (B, tokenizer_max_length) ids and mask."""
@@ -599,8 +611,8 @@ class LerobotPolicy(Policy):
     def text_labels(self, ids: Sequence[int], valid: Sequence[bool]) -> list[str]:
         """The role of every position of a prompt."""
         special = frozenset(self.tokenizer.all_special_ids)
-        labels = ["special" if one in special else "language" for one in ids]
-        return [label if kept else PADDING for label, kept in zip(labels, valid, strict=True)]
+        labels = ["special" if number in special else "language" for number in ids]
+        return [label if is_text else PADDING for label, is_text in zip(labels, valid, strict=True)]
 
     def read_late_files(self) -> None:
         """The tokenizer."""
@@ -609,10 +621,10 @@ class LerobotPolicy(Policy):
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each instruction, without padding."""
         tokens, mask = self.tokenise(instructions)
-        return [tuple(row[kept].tolist()) for row, kept in zip(tokens, mask, strict=True)]
+        return [tuple(row[valid].tolist()) for row, valid in zip(tokens, mask, strict=True)]
 
     def tap(self, site: Site) -> Tap:
-        """Where its stack reads it; the prompt's keys and values pass once it is read."""
+        """Return the tap of the site's stack; the prompt's keys and values pass once it is read."""
         if self.stream_of(site) is self.prompt_kv:
             return kv_tap(self.passages, site, self.prompt_tokens)
         return self.stacks[site.stream].tap(site)
@@ -653,7 +665,7 @@ def checked_steps(steps: int, folder: Path) -> int:
 
 
 def _problem(read: Callable[[], object]) -> str | None:
-    """What is wrong with the checkpoint, as far as `read` finds out."""
+    """The message of the CheckpointError that `read` raises; None if it raises none."""
     try:
         read()
     except CheckpointError as error:

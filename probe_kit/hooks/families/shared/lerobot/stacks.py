@@ -22,11 +22,11 @@ class Stack:
     entry: str = "input_layernorm"
 
     def tap(self, site: Site) -> Tap:
-        """Where a site of this stack is read."""
+        """Return the tap of a site of this stack."""
         return decoder_tap(self.layers, self.norm, site, self.iterations or 1, entry=self.entry)
 
     def stream(self, name: str) -> Stream:
-        """What is stored of it: the input of every block, and of the final norm."""
+        """The stored stream: the input of every block, and of the final norm."""
         attention: Any = self.layers[0].self_attn
         heads = int(output_projection(attention).in_features) // int(attention.head_dim)
         return Stream(name, len(self.layers) + 1, self.width, self.iterations, heads=heads)

@@ -27,10 +27,10 @@ def label_groups(pieces: Sequence[str], pattern: re.Pattern[str]) -> list[str]:
     """A label per piece of a text: the named group of `pattern` that it has characters in, else `special`."""
     ends = np.cumsum([len(piece) for piece in pieces])
     labels = ["special"] * len(pieces)
-    if (found := pattern.search("".join(pieces))) is None:
+    if (match := pattern.search("".join(pieces))) is None:
         return labels
     for role in pattern.groupindex:
-        first, last = found.span(role)
+        first, last = match.span(role)
         for position, (piece, end) in enumerate(zip(pieces, ends, strict=True)):
             if piece and end - len(piece) < last and end > first:
                 labels[position] = role
@@ -45,22 +45,24 @@ class StatePrompt(LerobotPolicy):
     """What follows the state."""
 
     def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
-        """As lerobot's processor steps of these policies word it."""
+        """Return prompts as lerobot's processor steps of these policies word them."""
         tasks = [text.strip().replace("_", " ").replace("\n", " ") for text in instructions]
         return [
-            f"Task: {task}, State: {own};\n{self.prompt_end}"
-            for task, own in zip(tasks, digits(state), strict=True)
+            f"Task: {task}, State: {state_digits};\n{self.prompt_end}"
+            for task, state_digits in zip(tasks, digits(state), strict=True)
         ]
 
     def text_labels(self, ids: Sequence[int], valid: Sequence[bool]) -> list[str]:
         """The instruction is `language`, the digits are `state`, and the words around them are `special`."""
         special = frozenset(self.tokenizer.all_special_ids)
         pieces = [
-            "" if one in special or not kept else piece.replace("\u2581", " ")
-            for one, kept, piece in zip(ids, valid, self.tokenizer.convert_ids_to_tokens(list(ids)), strict=True)
+            "" if number in special or not is_text else piece.replace("\u2581", " ")
+            for number, is_text, piece in zip(
+                ids, valid, self.tokenizer.convert_ids_to_tokens(list(ids)), strict=True
+            )
         ]
         labels = label_groups(pieces, _PROMPT)
-        return [label if kept else PADDING for label, kept in zip(labels, valid, strict=True)]
+        return [label if is_text else PADDING for label, is_text in zip(labels, valid, strict=True)]
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each prompt without padding and without the digits, which change at every inference."""
@@ -68,7 +70,9 @@ class StatePrompt(LerobotPolicy):
         rows = zip(tokens.tolist(), mask.tolist(), strict=True)
         return [
             tuple(
-                one for one, label in zip(ids, self.text_labels(ids, valid), strict=True) if label not in _LEFT_OUT
+                number
+                for number, label in zip(ids, self.text_labels(ids, valid), strict=True)
+                if label not in _LEFT_OUT
             )
             for ids, valid in rows
         ]

@@ -36,13 +36,13 @@ class PictureWindow:
         if self.crop is not None:
             if self.camera is not None and self.camera != tuple(pictures.shape[-2:]):
                 pictures = resize_with_pad_torch(pictures, *self.camera)
-            top, left, height, width = self.crop
-            if top + height > pictures.shape[-2] or left + width > pictures.shape[-1]:
+            top, column, height, width = self.crop
+            if top + height > pictures.shape[-2] or column + width > pictures.shape[-1]:
                 raise ObservationError(
                     f"the picture is {pictures.shape[-1]} x {pictures.shape[-2]} pixels; this checkpoint looks at "
-                    f"columns {left} to {left + width} and rows {top} to {top + height}"
+                    f"columns {column} to {column + width} and rows {top} to {top + height}"
                 )
-            pictures = functional.crop(pictures, top, left, height, width)
+            pictures = functional.crop(pictures, top, column, height, width)
         if self.size is not None:
             pictures = functional.resize(pictures, list(self.size)).clamp(0.0, 1.0)
         return pictures
@@ -81,8 +81,8 @@ def padded_top_left(pictures: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.as_tensor(resize_with_pad(pictures, width, height, pad_value=0)).clamp(0.0, 1.0)
 
 
-def _crop(top: int, left: int, height: int, width: int) -> tuple[int, int, int, int]:
-    return int(top), int(left), int(height), int(width)
+def _crop(top: int, column: int, height: int, width: int) -> tuple[int, int, int, int]:
+    return int(top), int(column), int(height), int(width)
 
 
 def _size(height: int, width: int) -> tuple[int, int]:

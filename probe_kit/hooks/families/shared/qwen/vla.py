@@ -75,12 +75,12 @@ class QwenVLA(Policy):
         """The whole prompt with one image slot."""
 
     @abstractmethod
-    def look(self, seen: Observation) -> Any:
+    def look(self, observation: Observation) -> Any:
         """(H, W, 3) uint8 the processor gets."""
 
-    def shown(self, seen: Observation) -> Any:
+    def patched_picture(self, observation: Observation) -> Any:
         """(H, W, 3) uint8 that is cut into patches; another one where the authors resize once more before."""
-        return self.look(seen)
+        return self.look(observation)
 
     # -- inputs ------------------------------------------------------------------------------------------
 
@@ -91,7 +91,7 @@ class QwenVLA(Policy):
 
     @cached_property
     def pictures(self) -> QwenPictures:
-        """How pictures become patches. Raises CheckpointError naming the missing file."""
+        """The processor of pictures into patches. Raises CheckpointError naming the missing file."""
         vision = self.vlm.config.vision_config
         sizes = (int(vision.patch_size), int(vision.temporal_patch_size), int(vision.spatial_merge_size))
         return QwenPictures.from_folder(self.folder, *sizes, fast=self.fast_pictures)
@@ -104,14 +104,14 @@ class QwenVLA(Policy):
         """The ids of each whole prompt, one for the picture."""
         return [tuple(self.prompt(instruction)) for instruction in instructions]
 
-    def rows(self, seen: Sequence[Observation]) -> list[list[int]]:
+    def rows(self, observations: Sequence[Observation]) -> list[list[int]]:
         """Per observation the ids the backbone gets, the picture's as often as its size demands.
 
         Raises InstructionError for a prompt that is too long.
         """
         limit = int(self.vlm.config.text_config.max_position_embeddings)
         rows = []
-        for observation in seen:
+        for observation in observations:
             grid = self.pictures.grid(*self.look(observation).shape[:2])
             count = merged_tokens(grid, self.pictures.merge)
             row = image_slots(self.prompt(observation.instruction), self._image_token, [count])
@@ -120,14 +120,14 @@ class QwenVLA(Policy):
             rows.append(row)
         return rows
 
-    def inputs(self, seen: Sequence[Observation]) -> QwenInputs:
+    def inputs(self, observations: Sequence[Observation]) -> QwenInputs:
         """The observations as the backbone reads them, on the model's device. Raises ObservationError."""
-        for observation in seen:
+        for observation in observations:
             checked_picture(observation.image)
-        pixels, grid = self.pictures.patches([self.shown(observation) for observation in seen])
+        pixels, grid = self.pictures.patches([self.patched_picture(observation) for observation in observations])
         padding = self.vlm.config.text_config.pad_token_id
         packed = pack_inputs(
-            self.rows(seen), pixels, grid, self._image_token, 0 if padding is None else int(padding)
+            self.rows(observations), pixels, grid, self._image_token, 0 if padding is None else int(padding)
         )
         return packed.to(self.device)
 
@@ -137,9 +137,9 @@ class QwenVLA(Policy):
 
     # -- capture -----------------------------------------------------------------------------------------
 
-    def backbone_roles(self, seen: Sequence[Observation]) -> list[Roles]:
+    def backbone_roles(self, observations: Sequence[Observation]) -> list[Roles]:
         """Chat marks, picture, text; padding behind it where another prompt is longer."""
-        rows, special = self.rows(seen), self.tokenizer.special
+        rows, special = self.rows(observations), self.tokenizer.special
         longest = max(map(len, rows))
 
         def role(number: int) -> str:

@@ -47,33 +47,33 @@ class QwenVLM(VisionLanguageModel):
 
     @cached_property
     def pictures(self) -> QwenPictures:
-        """How pictures become patches. Raises CheckpointError naming the missing file."""
+        """The processor of pictures into patches. Raises CheckpointError naming the missing file."""
         vision = self.network.config.vision_config
         sizes = (int(vision.patch_size), int(vision.temporal_patch_size), int(vision.spatial_merge_size))
         return QwenPictures.from_folder(self.loaded.folder, *sizes, fast=True)
 
     def picture_ids(self, height: int, width: int) -> list[int]:
-        """As many as the picture's size demands."""
+        """Ids at a picture's positions, as many as its size demands."""
         count = merged_tokens(self.pictures.grid(height, width), self.pictures.merge)
         return [int(self.network.config.image_token_id)] * count
 
-    def shown(self, pictures: Pictures) -> dict[str, Tensor]:
+    def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
         """pixel_values (N, channels x time x patch x patch) and image_grid_thw (B, 3)."""
         pixels, self._grid = self.pictures.patches(pictures)
         device = self.loaded.device
         return {"pixel_values": pixels.to(device), "image_grid_thw": self._grid.to(device)}
 
-    def positions(self, packed: LeftPacked, shown: dict[str, Tensor]) -> Tensor:
+    def positions(self, packed: LeftPacked, picture_inputs: dict[str, Tensor]) -> Tensor:
         """(3, B, T) over time, height and width, as the native class counts them; 0 at padding."""
         counted, _ = self.network.model.get_rope_index(
             packed.ids,
-            image_grid_thw=shown.get("image_grid_thw"),
+            image_grid_thw=picture_inputs.get("image_grid_thw"),
             attention_mask=packed.mask,
-            **self.further(packed),
+            **self.other_inputs(packed),
         )
         positions: Tensor = counted
         return positions
 
-    def further(self, packed: LeftPacked) -> dict[str, Tensor]:
+    def other_inputs(self, packed: LeftPacked) -> dict[str, Tensor]:
         """mm_token_type_ids: 1 at positions of pictures. Left out, Qwen2.5-VL silently counts them as text."""
         return {"mm_token_type_ids": (packed.ids == int(self.network.config.image_token_id)).long()}

@@ -65,9 +65,9 @@ class VisionLanguageModel(AnswerModel):
             "backbone": Stream("backbone", layers, width, sums=self.sums, heads=heads),
             ANSWER: Stream(ANSWER, layers, width, 1, part="action", sums=self.sums, heads=heads),
         }
-        blocks, seen = self.vision_size
+        blocks, vision_width = self.vision_size
         self.further_streams = {
-            "vision": Stream("vision", blocks + 1, seen, part="vision", quantities=("residual",))
+            "vision": Stream("vision", blocks + 1, vision_width, part="vision", quantities=("residual",))
         }
         self.role_names = {"backbone": (IMAGE_ROLE, "language", "special", PADDING), ANSWER: (ANSWER,)}
         self.card = self._card({"tokenizer": tokenizer or "the checkpoint's", **settings})
@@ -122,23 +122,23 @@ class VisionLanguageModel(AnswerModel):
 
     @abstractmethod
     def vision_tap(self, layer: int) -> Tap:
-        """Where what enters block `layer` of the vision tower is read; the last is what leaves the tower."""
+        """Return the tap of the input of block `layer` of the vision tower; the last is the tower's output."""
 
     @abstractmethod
     def picture_ids(self, height: int, width: int) -> list[int]:
         """The ids at the positions of a picture of that size, `marks` at either end included."""
 
     @abstractmethod
-    def shown(self, pictures: Pictures) -> dict[str, Tensor]:
-        """What the network is called with for a batch of (H, W, 3) uint8 pictures, on the model's device."""
+    def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
+        """Keywords of the network for a batch of (H, W, 3) uint8 pictures, on the model's device."""
 
-    def positions(self, packed: LeftPacked, shown: dict[str, Tensor]) -> Tensor:
-        """(…, B, T) int64 positions. shown: of `shown`; empty without pictures."""
-        del shown
+    def positions(self, packed: LeftPacked, picture_inputs: dict[str, Tensor]) -> Tensor:
+        """(…, B, T) int64 positions. picture_inputs: of `picture_inputs`; empty without pictures."""
+        del picture_inputs
         return packed.positions()
 
-    def further(self, packed: LeftPacked) -> dict[str, Tensor]:
-        """What else the network is called with, with or without pictures."""
+    def other_inputs(self, packed: LeftPacked) -> dict[str, Tensor]:
+        """Further keywords of the network, with or without pictures."""
         del packed
         return {}
 
@@ -166,7 +166,7 @@ class VisionLanguageModel(AnswerModel):
 
     @cached_property
     def text(self) -> FramedText:
-        """How the model is spoken to. Raises CheckpointError naming the files that are missing."""
+        """The text side of the prompt. Raises CheckpointError naming the files that are missing."""
         text = FramedText.of(self._text_folder, self.frame, self.text_config, self.loaded.folder)
         if self.picture_token is not None:
             text.check_token(self.picture_token, int(self.network.config.image_token_id))
@@ -176,7 +176,7 @@ class VisionLanguageModel(AnswerModel):
         """The whole prompt of a question. Raises InstructionError or ObservationError for what does not fit in."""
         ids = None
         if question.pictured:
-            ids = self.picture_ids(*checked_picture(question.seen.image).shape[:2])
+            ids = self.picture_ids(*checked_picture(question.observation.image).shape[:2])
         prompt = self.text.prompt(question.text, question.begun, ids, self.marks)
         limit = int(self.text_config.max_position_embeddings)
         if len(prompt.ids) > limit:
@@ -194,14 +194,19 @@ class VisionLanguageModel(AnswerModel):
 
     def prefill(self, questions: Sequence[Prompt]) -> Prefill:
         """One pass over all questions."""
-        self.check([question.seen for question in questions])
-        shown: dict[str, Tensor] = {}
+        self.check([question.observation for question in questions])
+        picture_inputs: dict[str, Tensor] = {}
         if self.shows_pictures(questions):
-            shown = self.shown([checked_picture(question.seen.image) for question in questions])
+            picture_inputs = self.picture_inputs(
+                [checked_picture(question.observation.image) for question in questions]
+            )
         packed = self.packed([self.prompt(question) for question in questions])
         with torch.inference_mode():
             return Prefill.of(
-                self.network, packed, self.positions(packed, shown), {**shown, **self.further(packed)}
+                self.network,
+                packed,
+                self.positions(packed, picture_inputs),
+                {**picture_inputs, **self.other_inputs(packed)},
             )
 
     def packed(self, prompts: Sequence[TokenPrompt]) -> LeftPacked:
@@ -229,9 +234,9 @@ class VisionLanguageModel(AnswerModel):
 
     # -- capture -----------------------------------------------------------------------------------------
 
-    def roles(self, seen: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Of the observations' instructions as questions."""
-        return self.asked_roles([Prompt(one, one.instruction) for one in seen])
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Roles of the observations' instructions as questions."""
+        return self.asked_roles([Prompt(observation, observation.instruction) for observation in observations])
 
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """Everything around picture and question is `special`, how an answer has begun too."""
@@ -271,7 +276,7 @@ class VisionLanguageModel(AnswerModel):
 
 
 def _labels(prompt: TokenPrompt) -> list[str]:
-    labels = ["language" if asked else "special" for asked in prompt.question]
+    labels = ["language" if is_question else "special" for is_question in prompt.question]
     start, stop = prompt.picture
     labels[start:stop] = [IMAGE_ROLE] * (stop - start)
     return labels

@@ -16,7 +16,7 @@ from probe_kit.models.packing import LeftPacked
 
 @dataclass(frozen=True)
 class Prefill:
-    """What one pass over prompts left.
+    """The result of one pass over prompts.
 
     network: called like transformers' own classes. mask: (B, T). last: (…, B, 1), positions of the last tokens.
     logits: (B, V), choosing the first tokens of the answers. cache: keys and values of all prompts.
@@ -29,15 +29,17 @@ class Prefill:
     cache: Any
 
     @classmethod
-    def of(cls, network: Any, packed: LeftPacked, positions: Tensor, shown: Mapping[str, Tensor]) -> "Prefill":
-        """Read prompts once. positions: (…, B, T). shown: further keywords, such as pictures."""
+    def of(
+        cls, network: Any, packed: LeftPacked, positions: Tensor, picture_inputs: Mapping[str, Tensor]
+    ) -> "Prefill":
+        """Read prompts once. positions: (…, B, T). picture_inputs: further keywords, such as pictures."""
         output = network(
             input_ids=packed.ids,
             attention_mask=packed.mask,
             position_ids=positions,
             use_cache=True,
             logits_to_keep=1,
-            **shown,
+            **picture_inputs,
         )
         last = positions.amax(dim=-1, keepdim=True)
         return cls(network, packed.mask, last, output.logits[:, -1], output.past_key_values)
@@ -49,16 +51,16 @@ class Prefill:
         """
         length = self.mask.shape[1]
         mask, position, logits = self.mask, self.last, self.logits
-        said: list[Tensor] = []
+        tokens_out: list[Tensor] = []
         try:
-            while len(said) < tokens:
-                said.append(logits.argmax(dim=-1))
-                if len(said) == tokens or _all_over(said, ends):
+            while len(tokens_out) < tokens:
+                tokens_out.append(logits.argmax(dim=-1))
+                if len(tokens_out) == tokens or _all_over(tokens_out, ends):
                     break
                 position = position + 1
                 mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
                 logits = self.network(
-                    input_ids=said[-1][:, None],
+                    input_ids=tokens_out[-1][:, None],
                     attention_mask=mask,
                     position_ids=position,
                     past_key_values=self.cache,
@@ -67,9 +69,9 @@ class Prefill:
                 ).logits[:, -1]
         finally:
             self.cache.crop(length)
-        return torch.stack(said, dim=1) if said else torch.zeros(len(mask), 0, dtype=torch.long)
+        return torch.stack(tokens_out, dim=1) if tokens_out else torch.zeros(len(mask), 0, dtype=torch.long)
 
 
-def _all_over(said: list[Tensor], ends: Collection[int]) -> bool:
-    spoken = torch.stack(said, dim=1).cpu().numpy()
+def _all_over(tokens_out: list[Tensor], ends: Collection[int]) -> bool:
+    spoken = torch.stack(tokens_out, dim=1).cpu().numpy()
     return bool(np.isin(spoken, list(ends)).any(axis=1).all())

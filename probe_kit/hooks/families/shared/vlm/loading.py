@@ -26,7 +26,7 @@ _OF_VALUES = (ValueError, TypeError, LookupError, AttributeError, ArithmeticErro
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a family's network is made of the files of a checkpoint.
+    """The way from the files of a checkpoint to a family's network.
 
     config: of the values of config.json. build: an empty network of a configuration, dtype and device.
     names: from tensors in files to those of the network.
@@ -72,9 +72,9 @@ def load_vlm(
     with _describing(file):
         config = recipe.config(without_precision(load_json(file)))
 
-    def build(kind: torch.dtype, place: str) -> Any:
+    def build(kind: torch.dtype, device: str) -> Any:
         with _describing(file):
-            return recipe.build(config, kind, place)
+            return recipe.build(config, kind, device)
 
     if random_weights:
         filled = twin(build, checkpoint, dtype, weights_seed)
@@ -102,8 +102,8 @@ def _describing(file: Path) -> Iterator[None]:
 def doubles(network: nn.Module) -> tuple[str, ...]:
     """Parameters that are another one's double, such as tied output weights: files hold one of them."""
     first: dict[int, str] = {}
-    found = []
+    names = []
     for name, tensor in network.state_dict(keep_vars=True).items():
         if first.setdefault(id(tensor), name) != name:
-            found.append(name)
-    return tuple(found)
+            names.append(name)
+    return tuple(names)

@@ -74,10 +74,10 @@ def recorded_texts(folder: Path) -> list[str]:
 def questions_of(folder: Path, recorded: Arrays, model: VisionLanguageModel) -> list[Prompt]:
     """Return the recorded questions with their pictures. Raises UsageError as `recorded_texts` does."""
     letters = tuple(model.lead + letter for letter in LETTERS)
-    shown = [recorded[f"in_picture_{int(number)}"] for number in recorded["in_rows_picture"]]
+    pictures = [recorded[f"in_picture_{int(number)}"] for number in recorded["in_rows_picture"]]
     return [
         Prompt(Observation(picture, np.zeros(8, np.float32), ""), _between(text, model), letters)
-        for text, picture in zip(recorded_texts(folder), shown, strict=True)
+        for text, picture in zip(recorded_texts(folder), pictures, strict=True)
     ]
 
 
@@ -95,9 +95,9 @@ class Reference:
         self.model, self.questions, self.recorded = model, questions, recorded
 
     @cached_property
-    def shown(self) -> dict[str, torch.Tensor]:
+    def picture_inputs(self) -> dict[str, torch.Tensor]:
         """The pictures of all rows as the network gets them."""
-        return self.model.shown([question.seen.image for question in self.questions])
+        return self.model.picture_inputs([question.observation.image for question in self.questions])
 
     @cached_property
     def batch(self) -> LeftPacked:
@@ -121,7 +121,7 @@ class Reference:
         return replace(self.questions[0], pictured=False)
 
     def produced(self) -> dict[str, Produce]:
-        """How to make every output the adapter can make, whether recorded or not."""
+        """Functions that make every output the adapter can make, whether recorded or not."""
         return {**self._inputs(), **self._pixels(), **self._streams(), **self._answers()}
 
     def _inputs(self) -> dict[str, Produce]:
@@ -129,27 +129,29 @@ class Reference:
         return {
             "input_ids": lambda: self.batch.ids.numpy(),
             "attention_mask": lambda: self.batch.mask.numpy(),
-            "position_ids": lambda: model.positions(self.batch, self.shown).numpy(),
-            "image_grid_thw": lambda: self.shown["image_grid_thw"].numpy(),
-            "token_type_ids": lambda: model.further(self.batch)["token_type_ids"].numpy(),
-            "mm_token_type_ids": lambda: model.further(self.batch)["mm_token_type_ids"].numpy(),
+            "position_ids": lambda: model.positions(self.batch, self.picture_inputs).numpy(),
+            "image_grid_thw": lambda: self.picture_inputs["image_grid_thw"].numpy(),
+            "token_type_ids": lambda: model.other_inputs(self.batch)["token_type_ids"].numpy(),
+            "mm_token_type_ids": lambda: model.other_inputs(self.batch)["mm_token_type_ids"].numpy(),
             "textonly_input_ids": lambda: np.array([model.prompt(self.bare).ids]),
         }
 
     def _pixels(self) -> dict[str, Produce]:
         def values() -> NDArray[Any]:
-            return self.shown["pixel_values"].float().numpy()
+            return self.picture_inputs["pixel_values"].float().numpy()
 
         def sums() -> NDArray[Any]:
-            whole = values().astype(np.float64)
-            return np.array([whole.sum(), np.abs(whole).sum()])
+            pixels = values().astype(np.float64)
+            return np.array([pixels.sum(), np.abs(pixels).sum()])
 
         return {
             "pixel_values": values,
             "pixel_values_shape": lambda: np.array(values().shape),
             "pixel_values_at": lambda: values().ravel()[self.recorded["pixel_values_index"]],
             "pixel_values_sum": sums,
-            "pixel_values_row0": lambda: self.model.shown([self.questions[0].seen.image])["pixel_values"].numpy(),
+            "pixel_values_row0": lambda: self.model.picture_inputs([self.questions[0].observation.image])[
+                "pixel_values"
+            ].numpy(),
         }
 
     def _streams(self) -> dict[str, Produce]:
@@ -168,7 +170,7 @@ class Reference:
         }
 
     def vision(self) -> NDArray[Any]:
-        """What enters every block of the tower for the first row's picture."""
+        """The input of every block of the tower for the first row's picture."""
         sites = self.model.further_streams["vision"].sites()[:-1]
         with capture(self.model, sites) as tape:
             self.model.prefill(self.questions[:1])
@@ -193,19 +195,19 @@ class Reference:
         }
 
     def _greedy(self) -> NDArray[np.int64]:
-        """What is said behind every row, padded behind its end."""
+        """Greedy ids behind every row, padded behind its end."""
         length = self.recorded["greedy_ids"].shape[1]
         with torch.inference_mode():
-            said = self.captured[1].speak(length, self.model.text.ends).numpy()
-        return padded_answers(said, length, self.model.text.ends, self.model.text.padding)
+            answers = self.captured[1].speak(length, self.model.text.ends).numpy()
+        return padded_answers(answers, length, self.model.text.ends, self.model.text.padding)
 
 
 def padded_answers(
-    said: Sequence[NDArray[np.int64]] | NDArray[np.int64], length: int, ends: Collection[int], padding: int
+    answers: Sequence[NDArray[np.int64]] | NDArray[np.int64], length: int, ends: Collection[int], padding: int
 ) -> NDArray[np.int64]:
     """(B, length) ids, each row up to and with its end, padded behind it."""
-    padded = np.full((len(said), length), padding)
-    for row, ids in enumerate(said):
+    padded = np.full((len(answers), length), padding)
+    for row, ids in enumerate(answers):
         over = np.isin(ids, list(ends))
         stop = int(over.argmax()) + 1 if over.any() else len(ids)
         padded[row, :stop] = ids[:stop]

@@ -64,7 +64,7 @@ class FramedText:
 
     @classmethod
     def of(cls, folder: Path, frame: Frame, config: Any, generation: Path) -> "FramedText":
-        """From the files in `folder`.
+        """Read the files in `folder`.
 
         config: of the language model. generation: folder that may hold generation_config.json.
         Raises CheckpointError for missing files and for a tokenizer of another model.
@@ -89,17 +89,17 @@ class FramedText:
     @cached_property
     def padding(self) -> int:
         """The id that pads; it is masked."""
-        beside = self.folder / SETTINGS_FILE
-        named = _read(beside).get("pad_token")
-        content = named.get("content") if isinstance(named, dict) else named
-        found = self._tokenizer.token_to_id(content) if content else None
-        return 0 if found is None else int(found)
+        file = self.folder / SETTINGS_FILE
+        pad_token = _read(file).get("pad_token")
+        content = pad_token.get("content") if isinstance(pad_token, dict) else pad_token
+        number = self._tokenizer.token_to_id(content) if content else None
+        return 0 if number is None else int(number)
 
     def check_token(self, token: str, number: int) -> None:
         """Raise CheckpointError unless the tokenizer knows `token` by the id that the model expects."""
-        if (found := self._tokenizer.token_to_id(token)) != number:
+        if (tokenizer_id := self._tokenizer.token_to_id(token)) != number:
             raise CheckpointError(
-                f"{self.folder / TOKENIZER_FILE} has {token} as id {found}, config.json says {number}. "
+                f"{self.folder / TOKENIZER_FILE} has {token} as id {tokenizer_id}, config.json says {number}. "
                 "The tokenizer belongs to another checkpoint"
             )
 
@@ -118,12 +118,12 @@ class FramedText:
         before = [] if picture is None else [*self._encode(self.frame.before).ids, *picture]
         behind = self._encode(text)
         start, stop = len(lead), len(lead) + len(question)
-        asked = [
+        is_question = [
             first < stop and last > start and not special
             for (first, last), special in zip(behind.offsets, behind.special_tokens_mask, strict=True)
         ]
-        shown = (len(before) - len(picture or ()) + marks, len(before) - marks) if picture else (0, 0)
-        return TokenPrompt(text, (*before, *behind.ids), (*[False] * len(before), *asked), shown)
+        picture_span = (len(before) - len(picture or ()) + marks, len(before) - marks) if picture else (0, 0)
+        return TokenPrompt(text, (*before, *behind.ids), (*[False] * len(before), *is_question), picture_span)
 
     def _encode(self, text: str) -> Any:
         encoding = self._tokenizer.encode(text, add_special_tokens=False)
@@ -145,24 +145,24 @@ class FramedText:
 
     def option(self, prompt: TokenPrompt, option: str) -> int:
         """The first id of `option` behind a prompt. Raises UsageError if it changes the prompt's own ids."""
-        before, whole = self._encode(prompt.text).ids, self._encode(prompt.text + option).ids
-        if whole[: len(before)] != before or len(whole) == len(before):
+        before, extended = self._encode(prompt.text).ids, self._encode(prompt.text + option).ids
+        if extended[: len(before)] != before or len(extended) == len(before):
             raise UsageError(
-                f"the option {option!r} merges with the end of the prompt: {whole[len(before) - 2 :]} instead of "
-                f"{before[len(before) - 2 :]} and more. Give it as it stands behind the prompt"
+                f"the option {option!r} merges with the end of the prompt: {extended[len(before) - 2 :]} instead "
+                f"of {before[len(before) - 2 :]} and more. Give it as it stands behind the prompt"
             )
-        return int(whole[len(before)])
+        return int(extended[len(before)])
 
     def decode(self, ids: Sequence[int]) -> str:
         """The text of ids up to an end, without special tokens."""
-        said = list(takewhile(lambda number: number not in self.ends, ids))
-        return str(self._tokenizer.decode(said, skip_special_tokens=True)).strip()
+        answer = list(takewhile(lambda number: number not in self.ends, ids))
+        return str(self._tokenizer.decode(answer, skip_special_tokens=True)).strip()
 
 
 def _ends(folder: Path, config: Any) -> frozenset[int]:
-    """What generation_config.json says, or else the language model's configuration. Raises CheckpointError."""
-    found = _read(folder / GENERATION_FILE).get("eos_token_id", getattr(config, "eos_token_id", None))
-    numbers = found if isinstance(found, list) else [found]
+    """The end tokens in generation_config.json, or else in the language model's configuration."""
+    stored = _read(folder / GENERATION_FILE).get("eos_token_id", getattr(config, "eos_token_id", None))
+    numbers = stored if isinstance(stored, list) else [stored]
     if None in numbers or not numbers:
         raise CheckpointError(
             f"neither {folder / GENERATION_FILE} nor config.json names eos_token_id, the end of an answer. "
